@@ -41,7 +41,7 @@ _KNUCKLES: Final = np.array(
 # How each digit points at zero angles [deg]: turn about z, tip towards the palm, roll about its own length.
 # The rolls make flexed fingers converge on the scaphoid; the thumb's nail faces sideways.
 _BASE_ANGLES: Final = np.array(
-    [[28.0, 33.0, -87.0], [3.0, 0.0, -10.0], [0.0, 0.0, -3.0], [-5.0, 0.0, 4.0], [-12.0, 0.0, 12.0]]
+    [[28.0, 33.0, -87.0], [-1.5, -3.0, -10.0], [-5.0, -2.0, -3.0], [-10.0, -2.0, 4.0], [-18.0, -2.0, 12.0]]
 )
 # Skin radius [mm] at a digit's base, second and third joint and behind the tip: Greiner's girths over 2 pi.
 _RADII: Final = np.array(
@@ -145,7 +145,7 @@ class Population:
     """Log spread of a whole digit's length."""
     bone_spread: float = 0.045
     """Log spread of a single bone's length."""
-    knuckle_spread: float = 0.0015
+    knuckle_spread: float = 0.001
     """Spread of each knuckle's place [m]."""
     angle_spread: float = 3.0
     """Spread of each finger's base angles [deg]; twice this for the thumb."""

@@ -1,0 +1,112 @@
+"""Which camera sees which marker: rays against the hand's capsules, facing, and field of view."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numba
+import numpy as np
+
+from handsim.cameras import CameraRig
+from handsim.segments import segment_distance_squared
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy.typing import NDArray
+
+MAX_FACING: Final = np.deg2rad(85.0)
+"""Largest angle between a marker's outward direction and the ray to a camera that still sees it [rad]."""
+
+
+def free_rays(
+    markers: Float[np.ndarray, "T M 3"],
+    cameras: Float[np.ndarray, "C 3"],
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+) -> Bool[np.ndarray, "T M C"]:
+    """Which straight lines from marker to camera meet no capsule.
+
+    A ray meets a capsule exactly when the segment marker-camera comes nearer to the capsule's axis than
+    its radius, so one distance between two segments decides it; MuJoCo's `mj_multiRay` is the test's oracle.
+    """
+    free: NDArray[np.bool_] = _free(markers, cameras, segments, radii)
+    return free
+
+
+def visible_cameras(
+    markers: Float[np.ndarray, "T M 3"],
+    normals: Float[np.ndarray, "T M 3"],
+    rig: CameraRig,
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+) -> Bool[np.ndarray, "T M C"]:
+    """Which cameras see each marker: in view, facing, and with nothing of the hand between.
+
+    Args:
+        markers: Marker centres in the world [m].
+        normals: Unit directions in which the markers look away from the skin.
+        rig: The cameras.
+        segments: Both ends of every capsule's axis in the world [m].
+        radii: Capsule radii [m].
+    """
+    to_camera = rig.positions - markers[:, :, None]
+    ahead = np.einsum("tmci,tmi->tmc", to_camera, normals)
+    facing = ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
+    return rig.in_view(markers) & facing & free_rays(markers, rig.positions, segments, radii)
+
+
+def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
+    """One bit a camera: bit c is set where camera c sees."""
+    bits = visible.astype(np.uint32) << np.arange(visible.shape[-1], dtype=np.uint32)
+    packed: NDArray[np.uint32] = bits.sum(axis=-1, dtype=np.uint32)
+    return packed
+
+
+def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndarray, "*batch C"]:
+    """Inverse of `pack_cameras`."""
+    bits: NDArray[np.bool_] = (packed[..., None] >> np.arange(num_cameras, dtype=np.uint32)) & 1 == 1
+    return bits
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
+    frames, count = markers.shape[:2]
+    free = np.ones((frames, count, len(cameras)), dtype=np.bool_)
+    capsules = len(radii)
+    centres, reach = np.empty((capsules, 3)), np.empty(capsules)
+    near = np.empty(capsules, dtype=np.int64)
+    for t in range(frames):
+        _bound(segments[t], radii, centres, reach)
+        for m in range(count):
+            marker = markers[t, m]
+            for c in range(len(cameras)):
+                dx, dy, dz = (cameras[c, 0] - marker[0], cameras[c, 1] - marker[1], cameras[c, 2] - marker[2])
+                inverse = 1.0 / (dx * dx + dy * dy + dz * dz)
+                found = 0
+                for k in range(capsules):  # a capsule whose bounding sphere the ray misses cannot be met
+                    wx = centres[k, 0] - marker[0]
+                    wy = centres[k, 1] - marker[1]
+                    wz = centres[k, 2] - marker[2]
+                    share = min(1.0, max(0.0, (wx * dx + wy * dy + wz * dz) * inverse))
+                    ex, ey, ez = wx - share * dx, wy - share * dy, wz - share * dz
+                    near[found] = k
+                    found += ex * ex + ey * ey + ez * ez < reach[k] * reach[k]
+                for n in range(found):
+                    k = near[n]
+                    squared = segment_distance_squared(marker, cameras[c], segments[t, k, 0], segments[t, k, 1])
+                    if squared < radii[k] * radii[k]:
+                        free[t, m, c] = False
+                        break
+    return free
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _bound(segments: Any, radii: Any, centres: Any, reach: Any) -> None:
+    """Bounding spheres of the capsules, written into `centres` and `reach`."""
+    for k in range(len(radii)):
+        squared = 0.0
+        for i in range(3):
+            centres[k, i] = 0.5 * (segments[k, 0, i] + segments[k, 1, i])
+            half = 0.5 * (segments[k, 1, i] - segments[k, 0, i])
+            squared += half * half
+        reach[k] = np.sqrt(squared) + radii[k]

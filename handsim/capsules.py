@@ -1,0 +1,85 @@
+"""The hand's flesh as capsules: what touches, and what stands between a marker and a camera.
+
+A capsule's radius is a share of the skin's, because flesh gives way where bone does not: fingers side by side
+press into each other, and a marker on the skin must stay outside the capsule it sits on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.shape import HandShape
+from handsim.topology import BONES, DIGITS, PALM
+from handsim.transforms import MIRROR
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+FIRMNESS: Final = 0.8
+"""Capsule radius over skin radius."""
+_CARPUS_SPREAD: Final = 0.42  # where the metacarpals begin: their sideways place at the carpus over the knuckles'
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Capsules:
+    """Capsules fixed to bones: K segments with a radius each."""
+
+    bones: Int[np.ndarray, "K"]
+    """The bone each one moves with, a place in `topology.BONES`."""
+    starts: Float[np.ndarray, "K 3"]
+    """One end of each axis in its bone's frame [m]."""
+    ends: Float[np.ndarray, "K 3"]
+    """The other end [m]."""
+    radii: Float[np.ndarray, "K"]
+    """Radius of each one [m]."""
+
+    def posed(self, T_world_bone: Float[np.ndarray, "T L 4 4"]) -> NDArray[np.float64]:
+        """Both ends of every axis in the world (T, K, 2, 3) [m]."""
+        frames = T_world_bone[:, self.bones]
+        ends = np.stack([self.starts, self.ends], axis=1)
+        posed: NDArray[np.float64] = (
+            np.einsum("tkij,kej->tkei", frames[..., :3, :3], ends) + frames[..., None, :3, 3]
+        )
+        return posed
+
+    def touching_pairs(self) -> NDArray[np.int64]:
+        """Pairs (P, 2) that may collide: of different bones that do not share a joint, as MuJoCo filters them."""
+        parents = np.array([bone.parent for bone in BONES])
+        first, second = np.triu_indices(len(self.bones), 1)
+        a, b = self.bones[first], self.bones[second]
+        apart = (a != b) & (parents[a] != b) & (parents[b] != a)
+        return np.stack([first[apart], second[apart]], axis=1)
+
+
+def build_capsules(shape: HandShape) -> Capsules:
+    """Capsules of a hand: one a phalanx, one a metacarpal, two for the wrist; mirrored for a left hand."""
+    rows: list[tuple[int, NDArray[np.float64], NDArray[np.float64], float]] = []
+    firm = FIRMNESS * shape.radii
+    for number, bone in enumerate(BONES):
+        if bone.digit < 0:
+            continue
+        place = (number - 1) % 3
+        length, tip = shape.bone_lengths[bone.digit, place], shape.radii[bone.digit, 3]
+        far = length - tip if place == 2 else length
+        radius = float(firm[bone.digit, place : place + 2].mean())
+        rows.append((number, np.zeros(3), np.array([far, 0.0, 0.0]), radius))
+    thickness = FIRMNESS * shape.palm_thickness / 2
+    for digit in range(1, len(DIGITS)):
+        knuckle = shape.knuckles[digit]
+        carpus = np.array([0.2 * shape.knuckles[2, 0], _CARPUS_SPREAD * knuckle[1], -0.002])
+        rows.append((PALM, carpus, knuckle, min(thickness, float(firm[digit, 0]) * 1.1)))
+    for sideways in (-0.1, 0.1):
+        place_across = sideways * shape.breadth
+        wrist = np.array([[-0.15 * shape.length, place_across, 0.0], [0.05 * shape.length, place_across, 0.0]])
+        rows.append((PALM, wrist[0], wrist[1], FIRMNESS * 0.2 * shape.breadth))
+    mirror = MIRROR if shape.side == "left" else np.eye(3)
+    return Capsules(
+        bones=np.array([row[0] for row in rows]),
+        starts=np.array([row[1] for row in rows]) @ mirror,
+        ends=np.array([row[2] for row in rows]) @ mirror,
+        radii=np.array([row[3] for row in rows]),
+    )

@@ -1,0 +1,40 @@
+"""How deep a hand digs into itself."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+
+from handsim.capsules import Capsules
+from handsim.segments import segment_distance_squared
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+
+def penetration_depth(
+    capsules: Capsules, T_world_bone: Float[np.ndarray, "T L 4 4"]
+) -> Float[np.ndarray, "T"]:
+    """Deepest overlap of any two capsules that may collide [m], a frame each; 0 where nothing touches."""
+    depth: NDArray[np.float64] = _deepest(
+        capsules.posed(T_world_bone), capsules.radii, capsules.touching_pairs()
+    )
+    return depth
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
+    depth = np.zeros(len(segments))
+    for frame in range(len(segments)):
+        for pair in range(len(pairs)):
+            i, j = pairs[pair, 0], pairs[pair, 1]
+            reach = radii[i] + radii[j] - depth[frame]
+            squared = segment_distance_squared(
+                segments[frame, i, 0], segments[frame, i, 1], segments[frame, j, 0], segments[frame, j, 1]
+            )
+            if reach > 0.0 and squared < reach * reach:
+                depth[frame] = radii[i] + radii[j] - np.sqrt(squared)
+    return depth

@@ -1,0 +1,43 @@
+"""Distance between two straight segments, compiled: the one geometric test of contact and of sight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+def segment_distance_squared(p: Any, q: Any, a: Any, b: Any) -> float:
+    """Squared distance [m^2] between the segments p-q and a-b (each point three floats).
+
+    Ericson, Real-Time Collision Detection (2005), section 5.1.9; degenerate segments are points.
+    """
+    ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    wx, wy, wz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
+    uu = ux * ux + uy * uy + uz * uz
+    vv = vx * vx + vy * vy + vz * vz
+    uv = ux * vx + uy * vy + uz * vz
+    uw = ux * wx + uy * wy + uz * wz
+    vw = vx * wx + vy * wy + vz * wz
+    tiny = 1e-18
+    s = 0.0
+    if uu > tiny:
+        determinant = uu * vv - uv * uv
+        if determinant > 1e-12 * uu * vv:
+            s = min(1.0, max(0.0, (uv * vw - vv * uw) / determinant))
+    t = (uv * s + vw) / vv if vv > tiny else 0.0
+    if t < 0.0 or t > 1.0 or vv <= tiny:
+        t = min(1.0, max(0.0, t))
+        s = min(1.0, max(0.0, (uv * t - uw) / uu)) if uu > tiny else 0.0
+    dx, dy, dz = wx + s * ux - t * vx, wy + s * uy - t * vy, wz + s * uz - t * vz
+    return float(dx * dx + dy * dy + dz * dz)
+
+
+def segment_distance(
+    p: np.ndarray[Any, Any], q: np.ndarray[Any, Any], a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]
+) -> float:
+    """Distance [m] between the segments p-q and a-b, each point an array (3,)."""
+    return float(np.sqrt(segment_distance_squared(p, q, a, b)))

@@ -1,0 +1,104 @@
+"""What training does to a clean row before the labeler sees it: jitter, occlusion, ghosts, a shuffled order.
+
+Half of the rows keep what the simulated rig saw of them, the other half go through the paper's recipe (Han et
+al. 2018, section 3.3): zero to five draws of markers to drop, zero to two ghosts anywhere in the sample's box.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Corruption:
+    """The paper's corruption, as it is drawn for training and for tests."""
+
+    occlude: int = 5
+    """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio tells."""
+    ghosts: int = 2
+    """Most ghosts added, uniform in the sample's box grown by `margin`."""
+    jitter: float = 0.0
+    """Half width of the uniform noise on each coordinate [m]."""
+    margin: float = 0.1
+    """Growth of the box [share of its sides]."""
+
+
+class Cloud(NamedTuple):
+    """Clouds of points, padded to one length, in random order."""
+
+    points: Float[np.ndarray, "B N 3"]
+    present: Bool[np.ndarray, "B N"]
+    truth: Int[np.ndarray, "B N"]
+    """Marker of each point, -1 for a ghost."""
+
+
+def corrupt(
+    markers: Float[np.ndarray, "B M 3"],
+    corruption: Corruption,
+    *,
+    seen: Bool[np.ndarray, "B M"] | None = None,
+    ghosts: Float[np.ndarray, "B G 3"] | None = None,
+    rng: np.random.Generator,
+) -> Cloud:
+    """Corrupted, shuffled clouds of clean markers [m].
+
+    Args:
+        markers: Marker positions; NaN rows are missing already.
+        corruption: How much is drawn at random on top.
+        seen: Markers that the rig saw; all when not given.
+        ghosts: Ghosts that the rig saw, NaN where none.
+        rng: Source of all randomness.
+    """
+    batch, count = markers.shape[:2]
+    present = np.isfinite(markers).all(-1)
+    if seen is not None:
+        present &= seen
+    positions = markers + rng.uniform(-corruption.jitter, corruption.jitter, markers.shape)
+    present &= ~_draw_drops(batch, count, corruption.occlude, rng)
+    drawn = _draw_ghosts(positions, np.isfinite(markers).all(-1), corruption, rng)
+    parts = [positions, drawn] if ghosts is None else [positions, drawn, ghosts]
+    points = np.concatenate(parts, axis=1)
+    present = np.concatenate([present, *(np.isfinite(part).all(-1) for part in parts[1:])], axis=1)
+    truth = np.full(present.shape, -1)
+    truth[:, :count] = np.arange(count)
+    order = rng.random(present.shape).argsort(axis=1)
+    order = np.take_along_axis(order, np.take_along_axis(~present, order, 1).argsort(axis=1, kind="stable"), 1)
+    width = max(1, int(present.sum(1).max()))
+    order = order[:, :width]
+    present = np.take_along_axis(present, order, 1)
+    points = np.where(present[..., None], np.take_along_axis(points, order[..., None], 1), 0.0)
+    return Cloud(points, present, np.take_along_axis(truth, order, 1))
+
+
+def _draw_drops(batch: int, count: int, most: int, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Zero to `most` draws with replacement, a row each."""
+    dropped = np.zeros((batch, count), dtype=bool)
+    if most:
+        wanted = rng.integers(0, most + 1, size=batch)
+        draws = rng.integers(0, count, size=(batch, most))
+        taken = np.arange(most) < wanted[:, None]
+        rows = np.broadcast_to(np.arange(batch)[:, None], draws.shape)
+        dropped[rows[taken], draws[taken]] = True
+    return dropped
+
+
+def _draw_ghosts(
+    positions: NDArray[np.float64], known: NDArray[np.bool_], corruption: Corruption, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Zero to `ghosts` points uniform in each sample's box, NaN where none."""
+    batch, most = len(positions), corruption.ghosts
+    low = np.where(known[..., None], positions, np.inf).min(1)
+    high = np.where(known[..., None], positions, -np.inf).max(1)
+    side = np.where(np.isfinite(high - low), high - low, np.nan)
+    uniform = rng.uniform(-corruption.margin / 2, 1 + corruption.margin / 2, size=(batch, most, 3))
+    ghosts = low[:, None] + uniform * side[:, None]
+    wanted = rng.integers(0, most + 1, size=batch)
+    ghosts[np.arange(most) >= wanted[:, None]] = np.nan
+    return ghosts
