@@ -17,6 +17,7 @@ _INTEL, _DEC, _SGI = 84, 85, 86
 INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
 FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
+_LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
 
 
 def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
@@ -62,13 +63,16 @@ class Parameters:
                 if group < 0:
                     groups[-group] = name
                 else:
-                    found.append((group, name, data[offset_place + 2 :]))
+                    record = data[offset_place + 2 : offset_place + 2 + _LONGEST_RECORD]
+                    found.append((group, name, record))
                 if offset == 0:
                     break
                 if offset_place + offset > len(data):
                     raise ValueError(name)
                 place = offset_place + offset
-            values = {(groups.get(group, ""), name): _read_values(raw, processor) for group, name, raw in found}
+            values = {
+                (groups.get(group, ""), name): _read_values(raw, processor) for group, name, raw in found
+            }
         except (ValueError, IndexError) as error:
             raise CaptureError("damaged: the parameter section cannot be read") from error
         return Parameters(processor, values)
@@ -77,10 +81,12 @@ class Parameters:
         """The first number of a parameter.
 
         Raises:
-            CaptureError: There is none, and no default.
+            CaptureError: It is not finite, or there is none and no default.
         """
         values = self.values.get((group, name), [])
         if values and isinstance(values[0], float):
+            if not math.isfinite(values[0]):
+                raise CaptureError(f"damaged: {group}:{name} is {values[0]}")
             return values[0]
         if default is None:
             raise CaptureError(f"damaged: the file states no number {group}:{name}")
@@ -104,7 +110,11 @@ def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
     count = math.prod(dimensions)
     size = abs(kind)
     body = raw[2 + raw[1] : 2 + raw[1] + count * size]
-    if kind not in {_CHARACTER, _BYTE, _INTEGER, _FLOAT} or len(body) < count * size or len(dimensions) < raw[1]:
+    if (
+        kind not in {_CHARACTER, _BYTE, _INTEGER, _FLOAT}
+        or len(body) < count * size
+        or len(dimensions) < raw[1]
+    ):
         raise ValueError("not a parameter")
     if kind == _CHARACTER:
         width = dimensions[0] if dimensions else 1

@@ -120,9 +120,7 @@ def _check_whole(numbered: list[tuple[int, bytes]], delimiter: bytes, num_column
     usual = min(numbered[0][1].count(delimiter) + 1, num_columns + 1)
     wanted, got = max(usual, num_columns), line.count(delimiter) + 1
     if got < wanted:
-        raise CaptureError(
-            f"truncated: line {number}, the last, has {got} of {wanted} cells and no line end"
-        )
+        raise CaptureError(f"truncated: line {number}, the last, has {got} of {wanted} cells and no line end")
 
 
 def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], str]) -> list[float]:

@@ -42,7 +42,9 @@ def read_c3d(data: bytes) -> Capture:
     missing = points[..., 3] < 0.0
     positions = points[..., :3] * metres_per(units[0])
     positions[missing] = np.nan
-    return Capture(_labels(parameters, points.shape[1]), positions, positive_rate(f"{rate:g}", name="POINT:RATE"))
+    return Capture(
+        _labels(parameters, points.shape[1]), positions, positive_rate(repr(rate), name="POINT:RATE")
+    )
 
 
 def write_c3d(path: Path, capture: Capture) -> None:
@@ -59,7 +61,9 @@ def write_c3d(path: Path, capture: Capture) -> None:
 
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:
-            raise CaptureError(f"marker name '{name[:40]}...' is longer than the {_MOST_LABEL_BYTES} bytes of a label")
+            raise CaptureError(
+                f"marker name '{name[:40]}...' is longer than the {_MOST_LABEL_BYTES} bytes of a label"
+            )
     path.touch()  # ezc3d says nothing about a folder it may not write to
     missing = np.isnan(capture.positions[..., 0])
     points = np.ones((4, *missing.T.shape))
@@ -93,7 +97,7 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
     )
     num_points = int(parameters.number("POINT", "USED", default=header[1])) & 0xFFFF
     scale = parameters.number("POINT", "SCALE")
-    if not np.isfinite(scale) or scale == 0.0:
+    if scale == 0.0:
         raise CaptureError(f"POINT:SCALE is {scale:g}, wanted a number that is not 0")
     dtype = FLOAT_DTYPES[parameters.processor] if scale < 0.0 else INTEGER_DTYPES[parameters.processor]
     words = 4 * num_points + int(header[2])  # points, then the analog samples of the frame

@@ -27,10 +27,9 @@ def read_motive_csv(data: bytes) -> Capture:
         CaptureError: Not a Motive export, without marker columns, cut, or with a cell that is no number.
     """
     lines, ended = split_lines(data)
-    rows = list(csv.reader(line.decode("utf-8", "replace") for line in lines[:_MOST_HEADER_LINES]))
-    rows = [[cell.strip() for cell in row] for row in rows]
-    if rows[0][:1] != ["Format Version"]:
+    if not lines[0].startswith(b"Format Version,"):
         raise CaptureError("not a Motive CSV export: line 1 does not begin with 'Format Version'")
+    rows = [_cells(line) for line in lines[:_MOST_HEADER_LINES]]
     stated = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
     rate = positive_rate(stated.get(rate_key, ""), name=rate_key)
@@ -55,6 +54,14 @@ def read_motive_csv(data: bytes) -> Capture:
     positions = table[:, np.array(columns)[:, None] + np.arange(3)]
     labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns, 1))
     return Capture(labels, positions * scale, rate)
+
+
+def _cells(line: bytes) -> list[str]:
+    """Cells of a header line, where names may be quoted."""
+    try:
+        return [cell.strip() for cell in next(csv.reader([line.decode("utf-8", "replace")]), [])]
+    except csv.Error as error:
+        raise CaptureError(f"a header line cannot be read: {error}") from error
 
 
 def _labelled_row(rows: list[list[str]], label: str, width: int) -> list[str]:
@@ -86,5 +93,7 @@ def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) ->
         )
     for place in columns:
         if axes[place : place + 3] != _AXES:
-            raise CaptureError(f"column {place + 1}: wanted the axes X, Y, Z, got {', '.join(axes[place : place + 3])}")
+            raise CaptureError(
+                f"column {place + 1}: wanted the axes X, Y, Z, got {', '.join(axes[place : place + 3])}"
+            )
     return columns

@@ -112,7 +112,9 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
         return tuple(cell or f"*{number}" for number, cell in enumerate(cells[::3], 1))
     names = tuple(cell for cell in cells if cell)
     if num_axes != 3 * len(names):
-        raise CaptureError(f"line 4 has {len(names)} marker names and line 5 {num_axes} axes, wanted three a name")
+        raise CaptureError(
+            f"line 4 has {len(names)} marker names and line 5 {num_axes} axes, wanted three a name"
+        )
     return names
 
 
