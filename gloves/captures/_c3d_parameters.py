@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -21,12 +21,13 @@ _LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the l
 
 
 def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
-    """Floats of a file in this machine's doubles; a DEC float has its halves swapped and its exponent 2 higher."""
+    """Floats of a file in this machine's doubles; a DEC float has its halves swapped and is 4 times too big."""
     if processor != _DEC:
-        return values.astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+            return values.astype(np.float64)
     bits = values.astype(np.uint32)
     swapped = ((bits >> np.uint32(16)) | (bits << np.uint32(16))).astype("<u4")
-    return swapped.view("<f4").astype(np.float64) / 4.0
+    return to_native(swapped.view("<f4"), _INTEL) / 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ class Parameters:
                     break
                 offset_place = place + 2 + name_length
                 name = data[place + 2 : offset_place].decode("ascii").upper().strip()
-                order = "big" if processor == _SGI else "little"
+                order: Literal["little", "big"] = "big" if processor == _SGI else "little"
                 offset = int.from_bytes(data[offset_place : offset_place + 2], order)
                 if group < 0:
                     groups[-group] = name
@@ -122,8 +123,8 @@ def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
     if kind == _BYTE:
         return [float(value) for value in body]
     if kind == _INTEGER:
-        return np.frombuffer(body, INTEGER_DTYPES[processor]).astype(np.float64).tolist()
-    return to_native(np.frombuffer(body, FLOAT_DTYPES[processor]), processor).tolist()
+        return [float(value) for value in np.frombuffer(body, INTEGER_DTYPES[processor])]
+    return [float(value) for value in to_native(np.frombuffer(body, FLOAT_DTYPES[processor]), processor)]
 
 
 def _text(raw: bytes) -> str:

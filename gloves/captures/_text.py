@@ -35,7 +35,7 @@ def metres_per(unit: str) -> float:
     """
     scale = METRES.get(unit.strip().lower())
     if scale is None:
-        raise CaptureError(f"unknown unit of length '{unit.strip()}'; valid units: mm, cm, m")
+        raise CaptureError(f"unknown unit of length {unit.strip()[:20]!r}; valid units: mm, cm, m")
     return scale
 
 
@@ -74,8 +74,8 @@ def parse_table(
 ) -> Float[np.ndarray, "T columns"]:
     """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is no row.
 
-    A row may lack cells at its end, because some writers leave out what was not seen, and may have blank cells
-    too many. Only the last line of a file can have been cut: it counts as cut if it has no line end and
+    A row may lack cells at its end, because some writers leave out what was not seen, and may have blank
+    cells too many. Only the last line of a file can have been cut: it counts as cut if it has no line end and
     fewer cells than `num_columns` or than the first row, which tells whether rows end in a delimiter. (A cut
     inside the last cell of a row that is not followed by a delimiter leaves no trace and is not noticed.)
 
@@ -146,6 +146,6 @@ def _check_finite(
     if len(infinite):
         row, column = (int(place) for place in infinite[0])
         raise CaptureError(
-            f"line {numbered[row][0]}, column {column + 1} ({column_name(column)}): infinite, wanted a finite "
-            "number or a blank cell"
+            f"line {numbered[row][0]}, column {column + 1} ({column_name(column)}): infinite, wanted a "
+            "finite number or a blank cell"
         )

@@ -1,7 +1,7 @@
 """C3D, the binary format of motion capture: read here, written through ezc3d.
 
-Reading does not go through ezc3d because that library (1.7) can end the whole process on a damaged file, fills
-a cut one up in silence, and stops at 65,535 frames. Only what a capture needs is read: the points, their
+Reading does not go through ezc3d because that library (1.7) can end the whole process on a damaged file,
+fills a cut one up in silence, and stops at 65,535 frames. Only what a capture needs is read: the points, their
 labels, units and rate; analog channels, events and force plates are passed over.
 """
 
@@ -19,6 +19,7 @@ from handsim.errors import CaptureError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
+    from numpy.typing import NDArray
 
 _BLOCK: Final = 512
 _MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state the rest in TRIAL:ACTUAL_END_FIELD
@@ -117,7 +118,8 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
     points = frames[:, : 4 * num_points].reshape(stated, num_points, 4)
     if scale < 0.0:
         return to_native(points, parameters.processor)
-    return points * np.array([scale, scale, scale, 1.0])
+    scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
+    return scaled
 
 
 def _stated_frames(parameters: Parameters, in_header: int) -> int:

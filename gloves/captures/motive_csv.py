@@ -1,7 +1,7 @@
 """The CSV that OptiTrack Motive exports (format versions 1.2x and 1.3x).
 
-Line 1 is a list of keys and values; then rows led by a label (Type, Name, ID, in newer files Parent), a row of
-quantities, a row of axes that begins with 'Frame', and one row a frame. Labels and types decide, not places:
+Line 1 is a list of keys and values; then rows led by a label (Type, Name, ID, in newer files Parent), a row
+of quantities, a row of axes that begins with 'Frame', and one row a frame. Labels and types decide, not places:
 newer exports add rows and a TimeCode column.
 """
 
@@ -21,7 +21,7 @@ _AXES: Final = ["X", "Y", "Z"]
 
 
 def read_motive_csv(data: bytes) -> Capture:
-    """The markers, labelled or not, in the bytes of a Motive CSV; rigid bodies, bones and their models are left out.
+    """The markers, labelled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
     Raises:
         CaptureError: Not a Motive export, without marker columns, cut, or with a cell that is no number.

@@ -1,8 +1,8 @@
 """TRC, the tab-separated text of marker trajectories.
 
-Five header lines (file type, keys, their values, marker names, axes), then one line a frame: number, time, and
-three cells a marker. Frame counts and frame numbers are often wrong in the wild, so only names, units, rate and
-the rows themselves are believed.
+Five header lines (file type, keys, their values, marker names, axes), then one line a frame: number, time,
+and three cells a marker. Frame counts and frame numbers are often wrong in the wild, so only names, units,
+rate and the rows themselves are believed.
 """
 
 from __future__ import annotations
