@@ -21,7 +21,7 @@ _LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the l
 
 
 def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
-    """Floats of a file in this machine's doubles; a DEC float has its halves swapped and is 4 times too big."""
+    """Floats of a file as doubles; a DEC float has its halves swapped and is four times too big."""
     if processor != _DEC:
         with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
             return values.astype(np.float64)

@@ -1,8 +1,8 @@
 """C3D, the binary format of motion capture: read here, written through ezc3d.
 
 Reading does not go through ezc3d because that library (1.7) can end the whole process on a damaged file,
-fills a cut one up in silence, and stops at 65,535 frames. Only what a capture needs is read: the points, their
-labels, units and rate; analog channels, events and force plates are passed over.
+fills a cut one up in silence, and stops at 65,535 frames. Only what a capture needs is read: the points,
+their labels, units and rate; analog channels, events and force plates are passed over.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The CSV that OptiTrack Motive exports (format versions 1.2x and 1.3x).
 
 Line 1 is a list of keys and values; then rows led by a label (Type, Name, ID, in newer files Parent), a row
-of quantities, a row of axes that begins with 'Frame', and one row a frame. Labels and types decide, not places:
-newer exports add rows and a TimeCode column.
+of quantities, a row of axes that begins with 'Frame', and one row a frame. Labels and types decide, not
+places: newer exports add rows and a TimeCode column.
 """
 
 from __future__ import annotations
