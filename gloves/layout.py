@@ -1,7 +1,8 @@
 """Where a glove carries its markers: one place a marker on a bone's skin, read from a TOML file.
 
-A layout says nothing about one hand's size: places are fractions of the bone they sit on, so that the same glove
-fits every hand. Angles are degrees in the file and radians in memory, the marker radius millimetres and metres.
+A layout says nothing about one hand's size: places are fractions of the bone they sit on, so that the same
+glove fits every hand. Angles are degrees in the file and radians in memory, the marker radius millimetres in
+the file and metres in memory.
 """
 
 from __future__ import annotations
@@ -41,13 +42,11 @@ radius_mm = 3.2  # of every marker, 0.5 to 15
 #   name    your own; no two alike
 #   bone    one of: BONES
 #   along   0 = the bone's near end, 1 = its far end; -0.3 to 1.3
-#   around  degrees about the bone: 0 = back of the hand (nail side), 90 = thumb side, -90 = little-finger side,
-#           180 = palm side
+#   around  degrees about the bone: 0 = back of the hand (nail side), 90 = thumb side,
+#           -90 = little-finger side, 180 = palm side
 #   across  palm only: sideways from the middle of the palm, in hand breadths, positive towards the thumb
 # A labeler tells markers apart by their pattern: keep the three on the back away from any symmetry, and every
-# marker where a camera can see it in most poses.
-
-MARKERS"""
+# marker where a camera can see it in most poses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +63,7 @@ class MarkerPlace:
     along: float
     """0 at the bone's near end to 1 at its far end, and up to 0.3 beyond either."""
     around: float
-    """Angle about the bone [rad]: 0 back of the hand, pi/2 thumb side, -pi/2 little-finger side, pi palm side."""
+    """Angle about the bone [rad]: 0 back, pi/2 thumb side, -pi/2 little-finger side, pi palm side."""
     across: float = 0.0
     """For the palm alone: sideways from its middle, in hand breadths, positive towards the thumb."""
 
@@ -154,8 +153,10 @@ def load_layout(name_or_path: str | Path) -> MarkerLayout:
         raise LayoutError(f"{path}: cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise LayoutError(f"{path}: not a TOML file: it is not UTF-8 text") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise LayoutError(f"{path}: not a TOML file: {error}") from error
+    except RecursionError as error:
+        raise LayoutError(f"{path}: not a TOML file: brackets are nested too deep") from error
     except LayoutError as error:
         raise LayoutError(f"{path}: {error}") from error
 
@@ -178,18 +179,17 @@ def save_layout(path: str | Path, layout: MarkerLayout) -> None:
 
 def starter_layout() -> str:
     """A commented layout file to begin one's own glove with; it loads as it is."""
-    tips = [(f"{digit.capitalize()}Tip", f"{digit}_distal", 0.45, 0.0) for digit in DIGITS]
-    back = [
+    places = [(f"{digit.capitalize()}Tip", f"{digit}_distal", 0.45, 0.0) for digit in DIGITS]
+    places += [
         ("BackHand1", "palm", 0.55, -0.17),
         ("BackHand2", "palm", 0.2, -0.13),
         ("BackHand3", "palm", 0.42, 0.27),
     ]
-    markers = [
-        _marker_lines(MarkerPlace(name, bone, along, 0.0, across))
-        for name, bone, along, across in tips + back
-    ]
-    bones = textwrap.fill(", ".join(BONE_NAMES), 100, subsequent_indent="#           ")
-    return _STARTER.replace("BONES", bones).replace("MARKERS", "\n".join(sum(markers, [])[1:]) + "\n")
+    bones = textwrap.fill(", ".join(BONE_NAMES), 85, subsequent_indent="#           ")
+    lines = [_STARTER.replace("BONES", bones)]
+    for name, bone, along, across in places:
+        lines += _marker_lines(MarkerPlace(name, bone, along, 0.0, across))
+    return "\n".join(lines) + "\n"
 
 
 def _marker_lines(marker: MarkerPlace) -> list[str]:
@@ -200,14 +200,14 @@ def _marker_lines(marker: MarkerPlace) -> list[str]:
 
 
 def _parse_layout(table: Mapping[str, object]) -> MarkerLayout:
-    _check_keys(table, "the file", _LAYOUT_KEYS, optional={"description"})
-    _string(table, "description", "the file", default="")
-    tables = table["marker"]
+    _check_keys(table, "the file", _LAYOUT_KEYS, optional={"description", "marker"})
+    _string(table, "description", default="")
+    tables = table.get("marker", [])
     if not isinstance(tables, list) or not all(isinstance(entry, dict) for entry in tables):
         raise LayoutError("marker is not a list of tables; wanted one [[marker]] table a marker")
     markers = tuple(_parse_marker(entry, number) for number, entry in enumerate(tables, 1))
-    radius = _real(table, "radius_mm", "the file") * 1e-3
-    return MarkerLayout(_string(table, "name", "the file"), markers, radius)
+    radius = _real(table, "radius_mm") * 1e-3
+    return MarkerLayout(_string(table, "name"), markers, radius)
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
@@ -215,11 +215,11 @@ def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
     owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
     _check_keys(table, owner, _MARKER_KEYS, optional={"across"})
     return MarkerPlace(
-        _string(table, "name", owner),
-        _string(table, "bone", owner),
-        along=_real(table, "along", owner),
-        around=math.radians(_real(table, "around", owner)),
-        across=_real(table, "across", owner, default=0.0),
+        _string(table, "name", f"{owner}: "),
+        _string(table, "bone", f"{owner}: "),
+        along=_real(table, "along", f"{owner}: "),
+        around=math.radians(_real(table, "around", f"{owner}: ")),
+        across=_real(table, "across", f"{owner}: ", default=0.0),
     )
 
 
@@ -232,17 +232,17 @@ def _check_keys(table: Mapping[str, object], owner: str, valid: tuple[str, ...],
             raise LayoutError(f"{owner} lacks the key '{key}'")
 
 
-def _string(table: Mapping[str, object], key: str, owner: str, *, default: str | None = None) -> str:
+def _string(table: Mapping[str, object], key: str, prefix: str = "", *, default: str | None = None) -> str:
     value = table.get(key, default)
     if not isinstance(value, str):
-        raise LayoutError(f"{owner}: {key} is {_shown(value)}, wanted text in quotes")
+        raise LayoutError(f"{prefix}{key} is {_shown(value)}, wanted text in quotes")
     return value
 
 
-def _real(table: Mapping[str, object], key: str, owner: str, *, default: float | None = None) -> float:
+def _real(table: Mapping[str, object], key: str, prefix: str = "", *, default: float | None = None) -> float:
     value = table.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
-        raise LayoutError(f"{owner}: {key} is {_shown(value)}, wanted a number")
+        raise LayoutError(f"{prefix}{key} is {_shown(value)}, wanted a number")
     return float(value)
 
 
