@@ -18,6 +18,7 @@ from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
 
 if TYPE_CHECKING:
+    import ezc3d
     from jaxtyping import Float
     from numpy.typing import NDArray
 
@@ -58,16 +59,29 @@ def write_c3d(path: Path, capture: Capture) -> None:
         CaptureError: A label is too long, or the disk did not take the whole file.
         OSError: The file cannot be opened.
     """
-    import ezc3d
-
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:
             raise CaptureError(
                 f"marker name '{name[:40]}...' is longer than the {_MOST_LABEL_BYTES} bytes of a label"
             )
-    path.touch()  # ezc3d says nothing about a folder it may not write to
-    missing = np.isnan(capture.positions[..., 0])
-    points = np.ones((4, *missing.T.shape))
+    # ezc3d adds '.c3d' to any other ending, '.C3D' too.
+    written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")
+    try:
+        written.touch()  # ezc3d does not say when it may not write
+        _content(capture).write(str(written))
+        _check_written(written, capture)
+        written.replace(path)
+    except BaseException:
+        written.unlink(missing_ok=True)
+        raise
+
+
+def _content(capture: Capture) -> ezc3d.c3d:
+    """The capture as ezc3d wants it."""
+    import ezc3d
+
+    missing = np.isnan(capture.positions[..., 0]).T
+    points = np.ones((4, *missing.shape))
     points[:3] = np.moveaxis(capture.positions, (0, 1, 2), (2, 1, 0)) * 1e3
     content = ezc3d.c3d()
     group = content["parameters"]["POINT"]
@@ -75,7 +89,7 @@ def write_c3d(path: Path, capture: Capture) -> None:
     group["LABELS"]["value"] = list(capture.names)
     group["UNITS"]["value"] = ["mm"]
     content["data"]["points"] = points
-    content["data"]["meta_points"]["residuals"] = -1.0 * missing.T[None]
+    content["data"]["meta_points"]["residuals"] = np.where(missing, -1.0, 0.0)[None]
     if capture.num_frames > _MOST_FRAMES:
         for name, count in (("ACTUAL_START_FIELD", 1), ("ACTUAL_END_FIELD", capture.num_frames)):
             content.add_parameter("TRIAL", name, [0, 0])
@@ -83,12 +97,18 @@ def write_c3d(path: Path, capture: Capture) -> None:
                 "type": ezc3d.ezc3d.INT,
                 "value": np.array([count & 0xFFFF, count >> 16]),
             }
-    content.write(str(path))
+    return content
+
+
+def _check_written(path: Path, capture: Capture) -> None:
+    """ezc3d does not look whether its writes succeed: a file on a full disk is too short."""
     with path.open("rb") as file:
-        start = int(np.frombuffer(file.read(_BLOCK), "<u2")[8])
-    # ezc3d does not look whether its writes succeed.
-    if path.stat().st_size < (start - 1) * _BLOCK + 16 * missing.size:
-        raise CaptureError("cannot be written: the disk did not take the whole file")
+        header = np.frombuffer(file.read(_BLOCK), "<u2")
+    if len(header) == _BLOCK // 2:
+        wanted = (int(header[8]) - 1) * _BLOCK + 16 * capture.num_frames * len(capture.names)
+        if path.stat().st_size >= wanted:
+            return
+    raise CaptureError("cannot be written: the disk did not take the whole file")
 
 
 def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 4"]:
@@ -110,29 +130,43 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
     frame_bytes = words * np.dtype(dtype).itemsize
     present = max(0, len(data) - start) // frame_bytes
     stated = _stated_frames(parameters, int(header[4]) - int(header[3]) + 1)
-    if stated < 1:
+    if stated == 0:
         raise CaptureError("no frames: the file holds no frame")
-    if present < stated:
+    if stated is not None and present < stated:
         raise CaptureError(f"truncated: the file states {stated} frames and has room for {present}")
-    frames = np.frombuffer(data, dtype, count=stated * words, offset=start).reshape(stated, words)
-    points = frames[:, : 4 * num_points].reshape(stated, num_points, 4)
+    frames = np.frombuffer(data, dtype, count=(stated or present) * words, offset=start).reshape(-1, words)
+    if stated is None:
+        frames = _without_padding(frames)
+    points = frames[:, : 4 * num_points].reshape(-1, num_points, 4)
     if scale < 0.0:
         return to_native(points, parameters.processor)
     scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
     return scaled
 
 
-def _stated_frames(parameters: Parameters, in_header: int) -> int:
-    """Number of frames: the 32-bit counts of long takes first, then POINT:FRAMES, then the header's own."""
+def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
+    """Number of frames: POINT:FRAMES or the header; where 16 bits are full, the places for long takes.
+
+    None means that a long take states its length nowhere, as ezc3d writes it: the data itself must tell.
+    """
+    frames = int(parameters.number("POINT", "FRAMES", default=in_header))
+    frames = frames & 0xFFFF if frames < 0 else frames
+    if frames != _MOST_FRAMES:
+        return frames
     first = parameters.words("TRIAL", "ACTUAL_START_FIELD")
     last = parameters.words("TRIAL", "ACTUAL_END_FIELD")
     if len(first) == len(last) == 2:
-        return last[0] + (last[1] << 16) - first[0] - (first[1] << 16) + 1
-    long = parameters.number("POINT", "LONG_FRAMES", default=0.0)
-    if long > 0.0:
-        return int(min(long, 2**31))
-    frames = parameters.number("POINT", "FRAMES", default=in_header)
-    return int(frames) if frames >= 0.0 else int(frames) & 0xFFFF
+        return max(0, last[0] + (last[1] << 16) - first[0] - (first[1] << 16) + 1)
+    return int(parameters.number("POINT", "LONG_FRAMES", default=0.0)) or None
+
+
+def _without_padding(frames: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Frames without the zeros that fill the last block."""
+    most = _BLOCK // frames[:1].nbytes
+    end = len(frames)
+    while end > max(_MOST_FRAMES, len(frames) - most) and not frames[end - 1].any():
+        end -= 1
+    return frames[:end]
 
 
 def _labels(parameters: Parameters, num_points: int) -> tuple[str, ...]:
