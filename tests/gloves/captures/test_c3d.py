@@ -206,7 +206,7 @@ BAD: dict[str, bytes] = {
     "scale is zero": c3d().replace(struct.pack("<f", -1.0), bytes(4)),
     "no points": c3d(np.zeros((2, 0, 3)), labels=()),
     "no frames": c3d(np.zeros((0, 2, 3))),
-    "more frames stated than there are": c3d(stated_frames=9),
+    "more frames stated than there are": c3d(stated_frames=99),
     "a long take cut": c3d(stated_frames=65535, long_frames=(0, 2)),
     "unknown numbers": c3d()[:515] + b"\x99" + c3d()[516:],
     "no units": c3d().replace(b"UNITS", b"STINU"),
