@@ -1,0 +1,135 @@
+"""The parameter section of a C3D file, and its three ways of writing numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from handsim.errors import CaptureError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_INTEL, _DEC, _SGI = 84, 85, 86
+INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
+FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
+_CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
+_LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
+
+
+def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
+    """Floats of a file as doubles; a DEC float has its halves swapped and is four times too big."""
+    if processor != _DEC:
+        with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+            return values.astype(np.float64)
+    bits = values.astype(np.uint32)
+    swapped = ((bits >> np.uint32(16)) | (bits << np.uint32(16))).astype("<u4")
+    return to_native(swapped.view("<f4"), _INTEL) / 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """Parameters by upper-case group and name: numbers, or strings for characters."""
+
+    processor: int
+    """Which of the three number formats the whole file uses."""
+    values: dict[tuple[str, str], list[float] | list[str]]
+
+    @staticmethod
+    def parse(data: bytes, start: int) -> Parameters:
+        """Walk the records from byte `start`; nothing outside the file is ever touched.
+
+        Raises:
+            CaptureError: A record reaches beyond the file or makes no sense.
+        """
+        if not 0 < start <= len(data) - 4 or data[start + 3] not in INTEGER_DTYPES:
+            raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
+        processor = data[start + 3]
+        groups: dict[int, str] = {}
+        found: list[tuple[int, str, bytes]] = []
+        place = start + 4
+        try:
+            while place + 2 <= len(data):
+                name_length = abs(int.from_bytes(data[place : place + 1], "little", signed=True))
+                group = int.from_bytes(data[place + 1 : place + 2], "little", signed=True)
+                if name_length == 0:
+                    break
+                offset_place = place + 2 + name_length
+                name = data[place + 2 : offset_place].decode("ascii").upper().strip()
+                order: Literal["little", "big"] = "big" if processor == _SGI else "little"
+                offset = int.from_bytes(data[offset_place : offset_place + 2], order)
+                if group < 0:
+                    groups[-group] = name
+                else:
+                    record = data[offset_place + 2 : offset_place + 2 + _LONGEST_RECORD]
+                    found.append((group, name, record))
+                if offset == 0:
+                    break
+                if offset_place + offset > len(data):
+                    raise ValueError(name)
+                place = offset_place + offset
+            values = {
+                (groups.get(group, ""), name): _read_values(raw, processor) for group, name, raw in found
+            }
+        except (ValueError, IndexError) as error:
+            raise CaptureError("damaged: the parameter section cannot be read") from error
+        return Parameters(processor, values)
+
+    def number(self, group: str, name: str, *, default: float | None = None) -> float:
+        """The first number of a parameter.
+
+        Raises:
+            CaptureError: It is not finite, or there is none and no default.
+        """
+        values = self.values.get((group, name), [])
+        if values and isinstance(values[0], float):
+            if not math.isfinite(values[0]):
+                raise CaptureError(f"damaged: {group}:{name} is {values[0]}")
+            return values[0]
+        if default is None:
+            raise CaptureError(f"damaged: the file states no number {group}:{name}")
+        return float(default)
+
+    def words(self, group: str, name: str) -> list[int]:
+        """A parameter as unsigned 16-bit words; empty if it is absent or no such words."""
+        values = self.values.get((group, name), [])
+        numbers = [value for value in values if isinstance(value, float) and math.isfinite(value)]
+        return [int(value) & 0xFFFF for value in numbers]
+
+    def strings(self, group: str, name: str) -> list[str]:
+        """A parameter of characters as strings without padding; empty if it is absent."""
+        return [value for value in self.values.get((group, name), []) if isinstance(value, str)]
+
+
+def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
+    """The values of one parameter record, `raw` beginning at its type."""
+    kind = int.from_bytes(raw[:1], "little", signed=True)
+    dimensions = list(raw[2 : 2 + raw[1]])
+    count = math.prod(dimensions)
+    size = abs(kind)
+    body = raw[2 + raw[1] : 2 + raw[1] + count * size]
+    if (
+        kind not in {_CHARACTER, _BYTE, _INTEGER, _FLOAT}
+        or len(body) < count * size
+        or len(dimensions) < raw[1]
+    ):
+        raise ValueError("not a parameter")
+    if kind == _CHARACTER:
+        width = dimensions[0] if dimensions else 1
+        return [_text(body[place : place + width]) for place in range(0, count, width)] if count else []
+    if kind == _BYTE:
+        return [float(value) for value in body]
+    if kind == _INTEGER:
+        return [float(value) for value in np.frombuffer(body, INTEGER_DTYPES[processor])]
+    return [float(value) for value in to_native(np.frombuffer(body, FLOAT_DTYPES[processor]), processor)]
+
+
+def _text(raw: bytes) -> str:
+    raw = raw.strip(b" \0")
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")

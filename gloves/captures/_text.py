@@ -1,0 +1,151 @@
+"""What the text formats share: lines, units of length, and a table of numbers with holes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.errors import CaptureError
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+METRES: Final = {
+    "mm": 1e-3,
+    "millimeters": 1e-3,
+    "millimetres": 1e-3,
+    "cm": 1e-2,
+    "centimeters": 1e-2,
+    "centimetres": 1e-2,
+    "m": 1.0,
+    "meters": 1.0,
+    "metres": 1.0,
+}
+_BLANK: Final = math.nan
+
+
+def metres_per(unit: str) -> float:
+    """How many metres a file's unit of length is, whatever its case.
+
+    Raises:
+        CaptureError: It is not millimetres, centimetres or metres.
+    """
+    scale = METRES.get(unit.strip().lower())
+    if scale is None:
+        raise CaptureError(f"unknown unit of length {unit.strip()[:20]!r}; valid units: mm, cm, m")
+    return scale
+
+
+def positive_rate(text: str, *, name: str) -> float:
+    """The frames a second that a header states.
+
+    Raises:
+        CaptureError: It is not a positive number.
+    """
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = math.nan
+    if not 0.0 < rate < math.inf:
+        raise CaptureError(f"{name} is '{text.strip()}', wanted a positive number of frames a second")
+    return rate
+
+
+def split_lines(data: bytes) -> tuple[list[bytes], bool]:
+    """Lines of a file with any kind of line ends, and whether the last one has its line end."""
+    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    lines = data.split(b"\n")
+    ended = not lines[-1].strip(b" ")
+    return (lines[:-1] if ended and len(lines) > 1 else lines), ended
+
+
+def parse_table(
+    lines: list[bytes],
+    *,
+    start: int,
+    ended: bool,
+    delimiter: bytes,
+    num_columns: int,
+    column_name: Callable[[int], str],
+    text_columns: frozenset[int] = frozenset(),
+) -> Float[np.ndarray, "T columns"]:
+    """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is no row.
+
+    A row may lack cells at its end, because some writers leave out what was not seen, and may have blank
+    cells too many. Only the last line of a file can have been cut: it counts as cut if it has no line end and
+    fewer cells than `num_columns` or than the first row, which tells whether rows end in a delimiter. (A cut
+    inside the last cell of a row that is not followed by a delimiter leaves no trace and is not noticed.)
+
+    Args:
+        lines: All lines of the file.
+        start: Index of the first line of the table.
+        ended: Whether the last line has its line end.
+        delimiter: What stands between cells.
+        num_columns: Cells of a whole row.
+        column_name: What an error calls a column.
+        text_columns: Columns that hold no numbers; they are returned as NaN.
+
+    Raises:
+        CaptureError: No rows, a cut last row, a cell that is no number, or a row that is too long.
+    """
+    numbered = [(place, line) for place, line in enumerate(lines[start:], start + 1) if line.strip()]
+    if not numbered:
+        raise CaptureError("no frames: nothing follows the header")
+    if not ended and numbered[-1][0] == len(lines):
+        _check_whole(numbered, delimiter, num_columns)
+    table = np.full((len(numbered), num_columns), np.nan)
+    for row, (number, line) in enumerate(numbered):
+        cells = line.split(delimiter)
+        if len(cells) > num_columns:
+            if any(cell.strip() for cell in cells[num_columns:]):
+                raise CaptureError(f"line {number} has {len(cells)} cells, wanted {num_columns}")
+            del cells[num_columns:]
+        for column in text_columns:
+            if column < len(cells):
+                cells[column] = b""
+        try:
+            table[row, : len(cells)] = [float(cell) if cell else _BLANK for cell in cells]
+        except ValueError:
+            table[row, : len(cells)] = _parse_cells(cells, number, column_name)
+    _check_finite(table, numbered, column_name)
+    return table
+
+
+def _check_whole(numbered: list[tuple[int, bytes]], delimiter: bytes, num_columns: int) -> None:
+    number, line = numbered[-1]
+    # Blank cells beyond the table are worth one at most: the delimiter that may end a row.
+    usual = min(numbered[0][1].count(delimiter) + 1, num_columns + 1)
+    wanted, got = max(usual, num_columns), line.count(delimiter) + 1
+    if got < wanted:
+        raise CaptureError(f"truncated: line {number}, the last, has {got} of {wanted} cells and no line end")
+
+
+def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], str]) -> list[float]:
+    """The slow way for one row: blanks inside cells are allowed, and the cell that is no number is named."""
+    values = []
+    for column, cell in enumerate(cells):
+        text = cell.decode("utf-8", "replace").strip()
+        try:
+            values.append(float(text) if text else _BLANK)
+        except ValueError:
+            raise CaptureError(
+                f"line {number}, column {column + 1} ({column_name(column)}): '{text[:40]}' is not a number"
+            ) from None
+    return values
+
+
+def _check_finite(
+    table: Float[np.ndarray, "T columns"],
+    numbered: list[tuple[int, bytes]],
+    column_name: Callable[[int], str],
+) -> None:
+    infinite = np.argwhere(np.isinf(table))
+    if len(infinite):
+        row, column = (int(place) for place in infinite[0])
+        raise CaptureError(
+            f"line {numbered[row][0]}, column {column + 1} ({column_name(column)}): infinite, wanted a "
+            "finite number or a blank cell"
+        )

@@ -1,0 +1,261 @@
+"""Where a glove carries its markers: one place a marker on a bone's skin, read from a TOML file.
+
+A layout says nothing about one hand's size: places are fractions of the bone they sit on, so that the same
+glove fits every hand. Angles are degrees in the file and radians in memory, the marker radius millimetres in
+the file and metres in memory.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import textwrap
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from handsim.errors import LayoutError, choices
+from handsim.io import atomic_write
+from handsim.topology import BONE_NAMES, BONES, DIGITS, PALM
+
+FEWEST_MARKERS: Final = 5
+MOST_MARKERS: Final = 60
+_RADIUS_RANGE: Final = (0.0005, 0.015)  # [m]
+_ALONG_RANGE: Final = (-0.3, 1.3)
+_AROUND_RANGE: Final = (-180.0, 180.0)  # [deg]
+_ACROSS_RANGE: Final = (-1.0, 1.0)
+_LARGEST: Final = 1e6  # in any unit of the file; also keeps out NaN, infinity and integers beyond float
+_SHIPPED: Final = Path(__file__).parent / "layouts"
+_LAYOUT_KEYS: Final = ("name", "description", "radius_mm", "marker")
+_MARKER_KEYS: Final = ("name", "bone", "along", "around", "across")
+_STARTER: Final = """\
+# A marker glove. Places are fractions of the bones they sit on, so one file fits every size of hand.
+# Check it with `handsim glove check FILE`, which draws the markers on the hand.
+
+name = "my_glove"
+description = "Five finger tips and three markers on the back of the hand"
+radius_mm = 3.2  # of every marker, 0.5 to 15
+
+# One [[marker]] table a marker, 5 to 60 of them; labels count in this order.
+#   name    your own; no two alike
+#   bone    one of: BONES
+#   along   0 = the bone's near end, 1 = its far end; -0.3 to 1.3
+#   around  degrees about the bone: 0 = back of the hand (nail side), 90 = thumb side,
+#           -90 = little-finger side, 180 = palm side
+#   across  palm only: sideways from the middle of the palm, in hand breadths, positive towards the thumb
+# A labeler tells markers apart by their pattern: keep the three on the back away from any symmetry, and every
+# marker where a camera can see it in most poses."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerPlace:
+    """One marker on the skin over one bone.
+
+    Raises:
+        LayoutError: The bone is unknown, or a number is no number or far off the bone.
+    """
+
+    name: str
+    bone: str
+    """One of `handsim.topology.BONE_NAMES`."""
+    along: float
+    """0 at the bone's near end to 1 at its far end, and up to 0.3 beyond either."""
+    around: float
+    """Angle about the bone [rad]: 0 back, pi/2 thumb side, -pi/2 little-finger side, pi palm side."""
+    across: float = 0.0
+    """For the palm alone: sideways from its middle, in hand breadths, positive towards the thumb."""
+
+    def __post_init__(self) -> None:
+        if not self.name or self.name != self.name.strip() or not self.name.isprintable():
+            raise LayoutError(f"marker name {self.name!r}: wanted printable characters without outer blanks")
+        if self.bone not in BONE_NAMES:
+            raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
+        degrees = math.degrees(self.around)
+        for key, value, (low, high) in (
+            ("along", self.along, _ALONG_RANGE),
+            ("around", round(degrees, 9), _AROUND_RANGE),
+            ("across", self.across, _ACROSS_RANGE),
+        ):
+            if not low <= value <= high:
+                unit = " degrees" if key == "around" else ""
+                raise LayoutError(
+                    f"marker '{self.name}': {key} is {value:g}, wanted {low:g} to {high:g}{unit}"
+                )
+        if self.across != 0.0 and self.bone != BONES[PALM].name:
+            raise LayoutError(
+                f"marker '{self.name}': across is for the palm only, and this marker sits on {self.bone}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerLayout:
+    """A marker glove: 5 to 60 markers of one radius, in the order that labels count in.
+
+    Raises:
+        LayoutError: Too few or too many markers, two of one name, or a radius that is no marker's.
+    """
+
+    name: str
+    markers: tuple[MarkerPlace, ...]
+    radius: float
+    """Radius of every marker [m]."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "markers", tuple(self.markers))
+        if not self.name or not self.name.isprintable():
+            raise LayoutError(f"layout name {self.name!r}: wanted printable characters")
+        if not FEWEST_MARKERS <= self.num_markers <= MOST_MARKERS:
+            raise LayoutError(
+                f"a layout needs {FEWEST_MARKERS} to {MOST_MARKERS} markers, got {self.num_markers}"
+            )
+        for place, name in enumerate(self.names):
+            if name in self.names[:place]:
+                raise LayoutError(f"two markers are named '{name}'; every marker needs a name of its own")
+        low, high = _RADIUS_RANGE
+        if not low <= self.radius <= high:
+            raise LayoutError(
+                f"radius_mm is {self.radius * 1e3:g}, wanted {low * 1e3:g} to {high * 1e3:g} millimetres"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Marker names in label order."""
+        return tuple(marker.name for marker in self.markers)
+
+    @property
+    def num_markers(self) -> int:
+        """Number of markers, M."""
+        return len(self.markers)
+
+
+def list_layouts() -> tuple[str, ...]:
+    """Names of the layouts that come with the package."""
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+
+
+def load_layout(name_or_path: str | Path) -> MarkerLayout:
+    """A shipped layout by its name, or anybody's by the path of its `.toml` file.
+
+    Raises:
+        LayoutError: No such layout or file, or the file does not describe one; the sentence names the file.
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in list_layouts():
+        path = _SHIPPED / f"{name_or_path}.toml"
+    elif path.suffix.lower() != ".toml":
+        unknown = choices(str(name_or_path), list_layouts(), noun="glove")
+        raise LayoutError(f"{unknown}, or the path of a .toml file")
+    try:
+        return _parse_layout(tomllib.loads(path.read_text("utf-8")))
+    except OSError as error:
+        raise LayoutError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise LayoutError(f"{path}: not a TOML file: it is not UTF-8 text") from error
+    except ValueError as error:
+        raise LayoutError(f"{path}: not a TOML file: {error}") from error
+    except RecursionError as error:
+        raise LayoutError(f"{path}: not a TOML file: brackets are nested too deep") from error
+    except LayoutError as error:
+        raise LayoutError(f"{path}: {error}") from error
+
+
+def save_layout(path: str | Path, layout: MarkerLayout) -> None:
+    """Write a layout as TOML, numbers to nine decimals; `load_layout` gives the same layout again.
+
+    Raises:
+        LayoutError: The file cannot be written.
+    """
+    lines = [f"name = {_quote(layout.name)}", f"radius_mm = {_number(layout.radius * 1e3)}"]
+    for marker in layout.markers:
+        lines += _marker_lines(marker)
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", "utf-8")
+    except OSError as error:
+        raise LayoutError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def starter_layout() -> str:
+    """A commented layout file to begin one's own glove with; it loads as it is."""
+    places = [(f"{digit.capitalize()}Tip", f"{digit}_distal", 0.45, 0.0) for digit in DIGITS]
+    places += [
+        ("BackHand1", "palm", 0.55, -0.17),
+        ("BackHand2", "palm", 0.2, -0.13),
+        ("BackHand3", "palm", 0.42, 0.27),
+    ]
+    bones = textwrap.fill(", ".join(BONE_NAMES), 85, subsequent_indent="#           ")
+    lines = [_STARTER.replace("BONES", bones)]
+    for name, bone, along, across in places:
+        lines += _marker_lines(MarkerPlace(name, bone, along, 0.0, across))
+    return "\n".join(lines) + "\n"
+
+
+def _marker_lines(marker: MarkerPlace) -> list[str]:
+    """The lines of one [[marker]] table, after a blank one."""
+    lines = ["", "[[marker]]", f"name = {_quote(marker.name)}", f"bone = {_quote(marker.bone)}"]
+    lines += [f"along = {_number(marker.along)}", f"around = {_number(math.degrees(marker.around))}"]
+    return [*lines, f"across = {_number(marker.across)}"] if marker.across else lines
+
+
+def _parse_layout(table: Mapping[str, object]) -> MarkerLayout:
+    _check_keys(table, "the file", _LAYOUT_KEYS, optional={"description", "marker"})
+    _string(table, "description", default="")
+    tables = table.get("marker", [])
+    if not isinstance(tables, list) or not all(isinstance(entry, dict) for entry in tables):
+        raise LayoutError("marker is not a list of tables; wanted one [[marker]] table a marker")
+    markers = tuple(_parse_marker(entry, number) for number, entry in enumerate(tables, 1))
+    radius = _real(table, "radius_mm") * 1e-3
+    return MarkerLayout(_string(table, "name"), markers, radius)
+
+
+def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
+    name = table.get("name")
+    owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
+    _check_keys(table, owner, _MARKER_KEYS, optional={"across"})
+    return MarkerPlace(
+        _string(table, "name", f"{owner}: "),
+        _string(table, "bone", f"{owner}: "),
+        along=_real(table, "along", f"{owner}: "),
+        around=math.radians(_real(table, "around", f"{owner}: ")),
+        across=_real(table, "across", f"{owner}: ", default=0.0),
+    )
+
+
+def _check_keys(table: Mapping[str, object], owner: str, valid: tuple[str, ...], optional: set[str]) -> None:
+    for key in table:
+        if key not in valid:
+            raise LayoutError(f"{owner} has an {choices(key, valid, noun='key')}")
+    for key in valid:
+        if key not in table and key not in optional:
+            raise LayoutError(f"{owner} lacks the key '{key}'")
+
+
+def _string(table: Mapping[str, object], key: str, prefix: str = "", *, default: str | None = None) -> str:
+    value = table.get(key, default)
+    if not isinstance(value, str):
+        raise LayoutError(f"{prefix}{key} is {_shown(value)}, wanted text in quotes")
+    return value
+
+
+def _real(table: Mapping[str, object], key: str, prefix: str = "", *, default: float | None = None) -> float:
+    value = table.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
+        raise LayoutError(f"{prefix}{key} is {_shown(value)}, wanted a number")
+    return float(value)
+
+
+def _shown(value: object) -> str:
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 40 else text[:40] + "..."
+
+
+def _quote(text: str) -> str:
+    """A TOML basic string, which escapes as JSON does."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _number(value: float) -> str:
+    """A TOML float without the noise of unit conversion; never '-0.0'."""
+    return repr(round(value, 9) + 0.0)

@@ -1,0 +1,50 @@
+"""Files that are either whole or not there at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_write(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its name when the block ends well.
+
+    The temporary file has the same suffix, because some writers add one they miss. If the block raises,
+    whatever the reason, the temporary file is removed, an older file at `path` stays as it was, and the error
+    goes on to the caller. Folders that are missing on the way to `path` are made.
+
+    Args:
+        path: Where the finished file shall be; an existing file there is replaced.
+
+    Yields:
+        The path to write to.
+
+    Raises:
+        OSError: The folder cannot be made, `path` is a folder or a device, the disk is full, or the block
+            wrote nothing.
+    """
+    final = Path(path)
+    # Renaming onto a device (/dev/null) would replace it, and a folder would be noticed only after the work.
+    if final.exists() and not final.is_file():
+        raise FileExistsError(f"{final} is not a regular file and cannot be replaced")
+    final.parent.mkdir(parents=True, exist_ok=True)
+    temporary = final.with_name(f".{final.stem}.tmp-{os.getpid()}{final.suffix}")
+    try:
+        yield temporary
+        _flush(temporary)
+        os.replace(temporary, final)
+    except BaseException:  # also an interrupt must leave nothing behind
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _flush(path: Path) -> None:
+    """Wait until the file is on the disk: a rename before that can leave an empty file after a power cut."""
+    descriptor = os.open(path, os.O_RDWR)  # Windows flushes only what is open for writing
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,108 @@
+"""Motive CSV: laid out as Motive 1.x to 3.x lay it out, with everything but markers in the way."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gloves.captures import read_capture
+from gloves.captures.motive_csv import read_motive_csv
+from handsim.errors import CaptureError
+
+# Type, name, quantities and axes of each asset; a number a column counts up from the left.
+BODY = ("Rigid Body", "Cube", ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"], [*"XYZWXYZ", ""])
+BODY_MARKER = ("Rigid Body Marker", "Cube:Marker1", ["Position"] * 3 + ["Marker Quality"], [*"XYZ", ""])
+LABELLED = ("Marker", "Glove:ThumbTip", ["Position"] * 3, [*"XYZ"])
+UNLABELLED = ("Marker", "Unlabeled 2379", ["Position"] * 3, [*"XYZ"])
+QUOTED = ("Marker", "Glove, left:1", ["Position"] * 3, [*"XYZ"])
+
+
+def motive(
+    *assets: tuple[str, str, list[str], list[str]],
+    parent: bool = False,
+    timecode: bool = False,
+    unit: str | None = "Meters",
+    rows: int = 3,
+    first: str = "Format Version,1.23,Take Name,take 1,Take Notes,,Capture Frame Rate,240.000000",
+) -> str:
+    lead = ["", ""] + [""] * timecode
+    head = f"{first},Export Frame Rate,120.000000,Rotation Type,Quaternion"
+    head += f",Length Units,{unit},Coordinate Space,Global" if unit else ""
+    labels = ["Type", "Name", "ID"] + ["Parent"] * parent
+    columns = [[], [], [], []]  # type, name, quantity, axis
+    for kind, name, quantities, axes in assets:
+        for quantity, axis in zip(quantities, axes, strict=True):
+            quoted = f'"{name}"' if "," in name else name
+            for column, value in zip(columns, (kind, quoted, quantity, axis), strict=True):
+                column.append(value)
+    width = len(columns[0])
+    values = {"Type": columns[0], "Name": columns[1], "ID": ['"AB:12"'] * width, "Parent": ["Cube"] * width}
+    lines = [head, ""]
+    lines += [",".join(["", label, *lead[2:], *values[label]]) for label in labels]
+    lines.append(",".join(lead + columns[2]))
+    lines.append(",".join(["Frame", "Time (Seconds)", *["TimeCode"] * timecode, *columns[3]]))
+    for row in range(rows):
+        start = [str(72210 + row), f"{row / 120:.6f}"] + ["15:26:46:12.02"] * timecode
+        lines.append(",".join(start + [f"{row + column / 100:.6f}" for column in range(width)]))
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("parent", [False, True])
+@pytest.mark.parametrize("timecode", [False, True])
+def test_markers_are_found_by_type_and_label(parent: bool, timecode: bool) -> None:
+    text = motive(BODY, BODY_MARKER, LABELLED, BODY, UNLABELLED, QUOTED, parent=parent, timecode=timecode)
+    capture = read_motive_csv(text.encode())
+    assert capture.names == ("Glove:ThumbTip", "Unlabeled 2379", "Glove, left:1")
+    assert capture.rate == 120.0
+    starts = np.array([12, 23, 26])
+    wanted = np.arange(3)[:, None, None] + (starts[:, None] + np.arange(3)) / 100
+    np.testing.assert_allclose(capture.positions, wanted)
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [("Meters", 1.0), ("Centimeters", 1e-2), ("Millimeters", 1e-3), (None, 1.0), ("", 1.0)],
+)
+def test_units(unit: str | None, metres: float) -> None:
+    capture = read_motive_csv(motive(UNLABELLED, unit=unit, rows=1).encode())
+    np.testing.assert_allclose(capture.positions, [[[0.0, 0.01 * metres, 0.02 * metres]]])
+
+
+def test_blank_cells_are_gaps() -> None:
+    lines = motive(LABELLED, UNLABELLED).splitlines()
+    lines[-3] = "1,0,0.1,0.2,0.3,,,"
+    lines[-2] = "2,0,,,,0.4,0.5,0.6"
+    lines[-1] = "3,0,,,,,,"
+    positions = read_motive_csv("\r\n".join(lines).encode()).positions
+    nan = [np.nan] * 3
+    np.testing.assert_allclose(positions, [[[0.1, 0.2, 0.3], nan], [nan, [0.4, 0.5, 0.6]], [nan, nan]])
+
+
+GOOD = motive(LABELLED, UNLABELLED)
+BAD = {
+    "not Motive": "a,b,c\n1,2,3\n",
+    "only rigid bodies": motive(BODY, BODY_MARKER),
+    "no columns": motive(),
+    "unknown unit": motive(LABELLED, unit="Feet"),
+    "no rate": motive(LABELLED, first="Format Version,1.23").replace("Export Frame Rate,120.000000", "x,y"),
+    "no frames": motive(LABELLED, rows=0),
+    "header cut": GOOD[: GOOD.index("Frame,")],
+    "header cut in its last row": GOOD[: GOOD.index("Frame,") + 12],
+    "no Type row": GOOD.replace(",Type,", ",Kind,"),
+    "axes out of order": GOOD.replace("X,Y,Z", "X,Z,Y"),
+    "a word": GOOD.replace("1.010000", "one"),
+    "row too long": GOOD.rstrip() + ",5\n",
+    "last row cut": GOOD[: GOOD.rindex(",")],
+}
+
+
+def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]], None]) -> None:
+    path = tmp_path / "take.csv"
+    actual = {}
+    for case, text in BAD.items():
+        path.write_text(text)
+        with pytest.raises(CaptureError) as caught:
+            read_capture(path)
+        actual[case] = str(caught.value).replace(str(path), "take.csv")
+    golden("motive_csv_errors", actual)

@@ -1,0 +1,167 @@
+"""TRC: what real files do, and where exactly a broken one breaks."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gloves.captures import Capture, read_capture, write_capture
+from gloves.captures.trc import read_trc
+from handsim.errors import CaptureError
+
+SIG18 = Path(os.environ.get("HANDSIM_SIG18", Path(__file__).resolve().parents[3].parent / "shared" / "sig18"))
+
+
+def trc(
+    *rows: str,
+    units: str = "mm",
+    names: str = "Frame#\tTime\ta\t\t\tb\t\t\t",
+    axes: str = "\t\tX1\tY1\tZ1\tX2\tY2\tZ2\t",
+    rate: str = "120",
+    end: str = "\n",
+) -> bytes:
+    """A file of two markers; the header's frame count is wrong on purpose."""
+    keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
+    values = f"{rate}\t120\t999\t7\t{units}"
+    return ("\n".join(["PathFileType\t4\t(X/Y/Z)\tx.trc", keys, values, names, axes, *rows]) + end).encode()
+
+
+ROW = "0\t0\t1\t2\t3\t4\t5\t6"
+POINTS = np.array([[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]])
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [("mm", 1e-3), ("MM", 1e-3), ("cm", 1e-2), ("m", 1.0), ("Meters", 1.0), (" Millimeters ", 1e-3)],
+)
+def test_units(unit: str, metres: float) -> None:
+    capture = read_trc(trc(ROW, units=unit))
+    np.testing.assert_allclose(capture.positions, POINTS * metres)
+    assert (capture.names, capture.rate) == (("a", "b"), 120.0)
+
+
+def test_header_counts_and_frame_numbers_do_not_matter() -> None:
+    capture = read_trc(trc(ROW, ROW.replace("0\t0\t", "17\t0.1\t", 1), ROW.replace("0\t0\t", "3\t\t", 1)))
+    np.testing.assert_allclose(capture.positions, np.repeat(POINTS, 3, axis=0) * 1e-3)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "0\t0\t1\t2\t3\t\t\t",
+        "0\t0\t1\t2\t3\t\t\t\t",
+        "0\t0\t1\t2\t3\t \t \t ",
+        "0\t0\t1\t2\t3",
+        "0\t0\t1\t2\t3\tnan\tNaN\tNAN",
+        "0\t0\t1\t2\t3\t4\t5",
+    ],
+)
+def test_missing_cells(row: str) -> None:
+    positions = read_trc(trc(row, ROW)).positions
+    np.testing.assert_allclose(positions[0, 0], [1e-3, 2e-3, 3e-3])
+    assert np.isnan(positions[0, 1]).all()
+    np.testing.assert_allclose(positions[1], POINTS[0] * 1e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: data.replace(b"\n", b"\r\n"),
+        lambda data: data.replace(b"\n", b"\r"),
+        lambda data: b"\xef\xbb\xbf" + data,
+        lambda data: data.replace(b"\n0\t", b"\n\n0\t", 1),
+        lambda data: data.replace(b"\n0\t", b"\n\t\t\n \n0\t", 1),
+        lambda data: data + b"\n \n\n",
+        lambda data: data[:-1],
+        lambda data: data[:-1] + b"\t\n",
+        lambda data: data[:-1] + b"  ",
+        lambda data: data.replace(b"\ta\t\t\tb\t\t\t", b"\ta\tb"),
+        lambda data: data.replace(b"\ta\t\t\tb\t\t\t", b"\ta\t\t\tb"),
+    ],
+)
+def test_dialects(change: Callable[[bytes], bytes]) -> None:
+    capture = read_trc(change(trc(ROW)))
+    np.testing.assert_allclose(capture.positions, POINTS * 1e-3)
+    assert capture.names == ("a", "b")
+
+
+def test_blank_name_in_the_middle() -> None:
+    assert read_trc(trc(ROW, names="Frame#\tTime\t\t\t\tb\t\t\t")).names == ("*1", "b")
+
+
+def test_every_cut_is_told_or_harmless(tmp_path: Path) -> None:
+    """Cut anywhere after the first row, a file of ours gives whole frames only, or an error."""
+    positions = np.random.default_rng(1).normal(size=(3, 2, 3))
+    positions[1, 1] = positions[2, 1] = np.nan
+    path = tmp_path / "take.trc"
+    write_capture(path, Capture(("a", "b"), positions, 120.0))
+    data = path.read_bytes()
+    first_row_ends = data.index(b"\n", data.index(b"\n1\t") + 1) + 1
+    told = 0
+    for length in range(1, len(data)):
+        try:
+            read = read_trc(data[:length]).positions
+        except CaptureError:
+            told += 1
+        else:
+            if length >= first_row_ends:
+                np.testing.assert_allclose(read, positions[: len(read)], atol=1e-8)
+    assert told > len(data) - first_row_ends - 6
+
+
+BAD = {
+    "not TRC": b"Frame,Time\n1,2\n",
+    "header only": trc(),
+    "header cut after line 3": b"\n".join(trc(ROW).split(b"\n")[:3]) + b"\n",
+    "header cut in line 4": trc(ROW)[:130],
+    "header cut in line 5": trc(end=""),
+    "unknown unit": trc(ROW, units="inches"),
+    "no unit": trc(ROW, units=""),
+    "rate is a word": trc(ROW, rate="fast"),
+    "rate is zero": trc(ROW, rate="0"),
+    "rate is missing": trc(ROW, rate=""),
+    "no markers": trc(ROW, names="Frame#\tTime\t\t"),
+    "line 4 holds no names": trc(ROW, names="1\t0\t1\t2\t3"),
+    "names and axes differ": trc(ROW, names="Frame#\tTime\ta\tb\tc"),
+    "a word": trc(ROW, "1\t0\t1\t2\t3\t4\tfive\t6"),
+    "a decimal comma": trc(ROW, "1\t0\t1,5\t2\t3\t4\t5\t6"),
+    "a word for a frame number": trc("first" + ROW),
+    "infinite": trc(ROW, ROW.replace("6", "inf")),
+    "too many cells": trc(ROW, ROW + "\t\t7"),
+    "last row cut between cells": trc(ROW, "1\t0\t1\t2\t3\t4", end=""),
+    "last row cut in its frame number": trc(ROW, "1", end=""),
+    "last row cut in its last cell": trc(ROW + "\t", ROW, end=""),
+    "only row cut": trc(ROW[:-4], end=""),
+}
+
+
+def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]], None]) -> None:
+    path = tmp_path / "take.trc"
+    actual = {}
+    for case, data in BAD.items():
+        path.write_bytes(data)
+        with pytest.raises(CaptureError) as caught:
+            read_capture(path)
+        actual[case] = str(caught.value).replace(str(path), "take.trc")
+    golden("trc_errors", actual)
+
+
+@pytest.mark.skipif(
+    not SIG18.is_dir(), reason=f"the SIGGRAPH 2018 captures are not at {SIG18} (HANDSIM_SIG18)"
+)
+def test_all_published_captures_read() -> None:
+    paths = sorted(SIG18.rglob("*.trc"))
+    assert len(paths) == 336
+    num_frames = 0
+    for path in paths:
+        capture = read_capture(path)
+        assert capture.positions.shape[1:] == (19, 3)
+        assert capture.names[0] == "ThumbCMC"
+        assert capture.names[-1] == "BackHand3"
+        assert capture.rate == 120.0
+        assert np.isfinite(capture.positions).all()
+        assert np.abs(capture.positions).max() < 3.0, "metres"
+        num_frames += capture.num_frames
+    assert num_frames == 61_941

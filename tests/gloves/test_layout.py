@@ -1,0 +1,166 @@
+"""Layouts: the shipped ones, what a file may say, and a sentence for everything it may not."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gloves.layout import MarkerLayout, MarkerPlace, list_layouts, load_layout, save_layout, starter_layout
+from handsim.errors import LayoutError
+from handsim.topology import BONE_NAMES
+
+DENSE19 = (
+    "ThumbCMC ThumbMCP ThumbIP ThumbTip IndexMCP IndexPIP IndexTip MiddleMCP MiddlePIP MiddleTip "
+    "RingMCP RingPIP RingTip PinkyMCP PinkyPIP PinkyTip BackHand1 BackHand2 BackHand3"
+).split()
+
+
+def test_shipped_layouts() -> None:
+    assert list_layouts() == ("dense19", "sparse13")
+    dense, sparse = load_layout("dense19"), load_layout("sparse13")
+    assert list(dense.names) == DENSE19
+    assert (dense.num_markers, sparse.num_markers) == (19, 13)
+    kept = {name for name in DENSE19 if not name.endswith(("CMC", "MCP"))}
+    assert list(sparse.names) == [name for name in DENSE19 if name in kept]
+    assert dense.radius == sparse.radius == pytest.approx(0.0032)
+    # The sparse glove is the dense one with markers taken off, nothing moved.
+    assert set(sparse.markers) < set(dense.markers)
+
+
+def test_markers_sit_on_the_bones_their_names_tell() -> None:
+    segments = {"CMC": "metacarpal", "MCP": "proximal", "PIP": "middle", "IP": "proximal", "Tip": "distal"}
+    for marker in load_layout("dense19").markers:
+        if marker.name.startswith("BackHand"):
+            assert marker.bone == "palm"
+        elif marker.name == "ThumbMCP":
+            assert marker.bone == "thumb_metacarpal"
+        else:
+            digit, segment = marker.bone.split("_")
+            prefix = {"little": "Pinky"}.get(digit, digit.capitalize())
+            assert marker.name.startswith(prefix)
+            assert segments[marker.name.removeprefix(prefix)] == segment
+
+
+def test_starter_loads(tmp_path: Path) -> None:
+    path = tmp_path / "my_glove.toml"
+    path.write_text(starter_layout())
+    layout = load_layout(path)
+    assert layout.num_markers == 8
+    assert all(bone in starter_layout() for bone in BONE_NAMES)
+    assert max(map(len, starter_layout().splitlines())) <= 110
+
+
+NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)
+NUMBERS = {
+    "along": st.floats(-0.3, 1.3),
+    "around": st.floats(-180.0, 180.0).map(math.radians),
+}
+PLACES = st.one_of(
+    st.builds(MarkerPlace, NAMES, st.sampled_from(BONE_NAMES), **NUMBERS),
+    st.builds(MarkerPlace, NAMES, st.just("palm"), across=st.floats(-1.0, 1.0), **NUMBERS),
+)
+LAYOUTS = st.builds(
+    MarkerLayout,
+    NAMES,
+    st.lists(PLACES, min_size=5, max_size=60, unique_by=lambda place: place.name).map(tuple),
+    st.floats(0.0005, 0.015),
+)
+
+
+@given(layout=LAYOUTS)
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, layout: MarkerLayout) -> None:
+    path = tmp_path_factory.mktemp("layout") / "glove.toml"
+    save_layout(path, layout)
+    again = load_layout(path)
+    assert (again.name, again.names) == (layout.name, layout.names)
+    assert again.radius == pytest.approx(layout.radius, abs=1e-12)
+    for one, other in zip(layout.markers, again.markers, strict=True):
+        assert other.bone == one.bone
+        assert (other.along, other.around, other.across) == pytest.approx(
+            (one.along, one.around, one.across), abs=1e-9
+        )
+
+
+def text(*, head: str = 'name = "g"\nradius_mm = 3.2', count: int = 5, **keys: str) -> str:
+    """A good file of `count` markers, of which the second has the given keys replaced (empty: left out)."""
+    tables = []
+    for number in range(count):
+        values = {"name": f'"m{number}"', "bone": '"palm"', "along": "0.5", "around": "0"}
+        if number == 1:
+            values |= keys
+        tables.append(
+            "[[marker]]\n" + "\n".join(f"{key} = {value}" for key, value in values.items() if value)
+        )
+    return "\n".join([head, *tables])
+
+
+BAD = {
+    "unknown bone": text(bone='"index_proximl"'),
+    "two of one name": text(name='"m0"'),
+    "too few": text(count=2),
+    "too many": text(count=61),
+    "no markers": 'name = "g"\nradius_mm = 3.2',
+    "markers are no list": 'name = "g"\nradius_mm = 3.2\nmarker = 3',
+    "one table": 'name = "g"\nradius_mm = 3.2\n[marker]\nname = "m"',
+    "list of numbers": 'name = "g"\nradius_mm = 3.2\nmarker = [1, 2, 3, 4, 5]',
+    "radius too large": text(head='name = "g"\nradius_mm = 32'),
+    "radius in metres": text(head='name = "g"\nradius_mm = 0.0032'),
+    "radius is NaN": text(head='name = "g"\nradius_mm = nan'),
+    "radius missing": text(head='name = "g"'),
+    "radius is text": text(head='name = "g"\nradius_mm = "3.2"'),
+    "radius is true": text(head='name = "g"\nradius_mm = true'),
+    "huge integer": text(head=f'name = "g"\nradius_mm = 1{"0" * 400}'),
+    "name is a number": text(head="name = 3\nradius_mm = 3.2"),
+    "name is empty": text(head='name = ""\nradius_mm = 3.2'),
+    "description is a number": text(head='name = "g"\nradius_mm = 3.2\ndescription = 3'),
+    "extra key": text(head='name = "g"\nradius_mm = 3.2\nradius = 3'),
+    "extra marker key": text(allong="0.5"),
+    "missing marker key": text(along=""),
+    "missing marker name": text(name=""),
+    "marker name is a number": text(name="3"),
+    "marker name is empty": text(name='""'),
+    "marker name has a tab": text(name='"a\\tb"'),
+    "along is text": text(along='"half"'),
+    "along is NaN": text(along="nan"),
+    "along is a list": text(along="[0.5, 0.5]"),
+    "along far off": text(along="1.4"),
+    "around too large": text(around="181"),
+    "across on a finger": text(bone='"index_middle"', across="0.1"),
+    "across too large": text(across="-1.5"),
+    "not TOML": "name = ",
+    "nested too deep": "name = " + "[" * 5000,
+    "empty file": "",
+}
+
+
+def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]], None]) -> None:
+    path = tmp_path / "glove.toml"
+    actual = {}
+    for case, content in BAD.items():
+        path.write_text(content)
+        with pytest.raises(LayoutError) as caught:
+            load_layout(path)
+        actual[case] = str(caught.value).replace(str(path), "glove.toml")
+    for case, name in {"unknown glove": "dense91", "missing file": "missing.toml"}.items():
+        with pytest.raises(LayoutError) as caught:
+            load_layout(name)
+        actual[case] = str(caught.value)
+    path.write_bytes(b"name = '\xff'")
+    with pytest.raises(LayoutError) as caught:
+        load_layout(path)
+    actual["not UTF-8"] = str(caught.value).replace(str(path), "glove.toml")
+    with pytest.raises(LayoutError) as caught:
+        save_layout(tmp_path, load_layout("dense19"))
+    actual["save onto a folder"] = str(caught.value).replace(str(tmp_path), "folder")
+    assert not any("\n" in sentence for sentence in actual.values())
+    golden("layout_errors", actual)
+
+
+def test_good_text_loads(tmp_path: Path) -> None:
+    """The error cases differ from a good file in one thing; this is that file."""
+    path = tmp_path / "glove.toml"
+    path.write_text(text())
+    assert load_layout(path).names == ("m0", "m1", "m2", "m3", "m4")
