@@ -33,10 +33,11 @@ _THENAR: Final = (
     (THENAR, dorsal(1), 0.05),
     (THENAR, palmar(0), 0.8),
     (THENAR, palmar(1), 0.6),
-    (THENAR, palmar(2), 0.2),
+    (THENAR, palmar(2), 0.3),
+    (THENAR, palmar(3), 0.05),
     (METACARPUS, dorsal(0), 0.15),
-    (METACARPUS, palmar(0), 0.3),
-    (METACARPUS, palmar(1), 0.15),
+    (METACARPUS, palmar(0), 0.4),
+    (METACARPUS, palmar(1), 0.25),
 )
 _KNUCKLE_SHARES: Final = {KNUCKLES: (0.35, 0.25), PAST_KNUCKLES: (0.9, 0.7), WEB: (1.0, 0.9)}  # finger, web
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from handsim.skin_weights import cage_weights, strongest_weights
+from handsim.skeleton import build_skeleton
 from handsim.subdivision import catmull_clark, subdivided_loop
 from handsim.surface_cage import (
     KNUCKLES,
@@ -20,8 +21,7 @@ from handsim.surface_cage import (
     dorsal,
     first_scales,
     palmar,
-    radius_at,
-    ring_places,
+    ring_girths,
 )
 from handsim.topology import DIGITS
 from handsim.transforms import MIRROR
@@ -60,6 +60,7 @@ class _Template(NamedTuple):
     bone_weights: np.ndarray
     ring_loops: list[np.ndarray]
     knuckle_loop: np.ndarray
+    tips: list[np.ndarray]
 
 
 @functools.cache
@@ -74,13 +75,15 @@ def _template() -> _Template:
         subdivide = step if subdivide is None else step @ subdivide
         quads, count = next_quads, step.shape[0]
     assert subdivide is not None
+    children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # a quad's four follow one another
+    tips = [np.unique(quads[children[pair]]) for pair in topology.tips]
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     indices, weights = strongest_weights(subdivide @ cage_weights(topology))
     sizes = np.cumsum([len(rings) for rings in topology.rings])[:-1]
     ring_loops = np.split(np.array(loops[:-1]), sizes)
     for array in (faces, indices, weights):
         array.setflags(write=False)
-    return _Template(topology, subdivide, faces, indices, weights, ring_loops, loops[-1])
+    return _Template(topology, subdivide, faces, indices, weights, ring_loops, loops[-1], tips)
 
 
 def build_surface(shape: HandShape) -> HandSurface:
@@ -103,12 +106,15 @@ def build_surface(shape: HandShape) -> HandSurface:
 
 def _refit(scales: CageScales, vertices: np.ndarray, shape: HandShape, template: _Template) -> None:
     """Corrects the scales by wanted over measured."""
+    rest = build_skeleton(shape.with_side("right")).rest_transforms()
     for digit in range(len(DIGITS)):
         loops = vertices[template.ring_loops[digit]]
         girths = np.linalg.norm(loops - np.roll(loops, 1, axis=1), axis=-1).sum(axis=1)
-        wanted = 2.0 * np.pi * radius_at(shape, digit, ring_places(shape, digit))
-        scales.rings[digit][:-1] *= (wanted / girths)[:-1]
+        scales.rings[digit][:-1] *= (ring_girths(shape, digit) / girths)[:-1]
         scales.rings[digit][-1] = scales.rings[digit][-2]
+        base, along = rest[1 + 3 * digit, :3, 3], rest[1 + 3 * digit, :3, 0]
+        reach = float(((vertices[template.tips[digit]] - base) @ along).max())
+        scales.tips[digit] += shape.bone_lengths[digit].sum() - reach
     palm = template.topology.palm
     loop = vertices[template.knuckle_loop]
     scales.breadth *= shape.breadth / float(np.ptp(loop[:, 1]))

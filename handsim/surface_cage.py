@@ -37,24 +37,24 @@ _HEIGHTS: Final = np.array(
         [0.24, 0.43, 0.52, 0.54, 0.54, 0.52, 0.48, 0.40, 0.20],
         [0.24, 0.43, 0.52, 0.54, 0.54, 0.52, 0.48, 0.40, 0.20],
         [0.30, 0.46, 0.52, 0.54, 0.54, 0.52, 0.50, 0.45, 0.22],
-        [0.30, 0.47, 0.52, 0.52, 0.52, 0.50, 0.50, 0.46, 0.22],
+        [0.30, 0.47, 0.50, 0.52, 0.51, 0.50, 0.49, 0.44, 0.20],
         [0.26, 0.46, 0.47, 0.49, 0.46, 0.49, 0.46, 0.46, 0.20],
-        [0.24, 0.53, 0.38, 0.53, 0.38, 0.52, 0.38, 0.50, 0.20],
+        [0.24, 0.57, 0.38, 0.58, 0.39, 0.56, 0.38, 0.53, 0.20],
     ]
 )
 _DEPTHS: Final = np.array(
     [
         [0.50, 0.80, 0.90, 0.92, 0.92, 0.92, 0.90, 0.80, 0.42],
         [0.50, 0.80, 0.88, 0.90, 0.90, 0.92, 0.92, 0.82, 0.42],
-        [0.60, 1.00, 1.00, 0.88, 0.82, 0.90, 1.02, 0.98, 0.45],
-        [0.80, 1.25, 1.00, 0.70, 0.60, 0.66, 0.82, 0.88, 0.45],
+        [0.60, 1.00, 1.00, 0.88, 0.86, 0.92, 0.98, 0.92, 0.50],
+        [0.80, 1.25, 0.95, 0.72, 0.66, 0.70, 0.84, 0.88, 0.55],
         [0.52, 0.66, 0.62, 0.58, 0.56, 0.60, 0.66, 0.70, 0.42],
         [0.40, 0.62, 0.64, 0.64, 0.64, 0.64, 0.64, 0.60, 0.38],
     ]
 )
 _ROW_PLACES: Final = np.array([-0.26, -0.05, 0.16, 0.42, 0.70, 0.97])  # along the metacarpals: 0 wrist, 1 joint
 _WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # of the four rays, in hand breadths
-_EDGES: Final = np.array([[0.13, 0.13, 0.12, 0.13, 0.13, 0.145], [0.13, 0.13, 0.16, 0.17, 0.155, 0.145]])
+_EDGES: Final = np.array([[0.15, 0.14, 0.12, 0.13, 0.13, 0.145], [0.15, 0.14, 0.16, 0.17, 0.155, 0.145]])
 
 _RING_ANGLES: Final = np.deg2rad(np.arange(30.0, 360.0, 60.0))
 _ROUND: Final = np.stack([1.03 * np.cos(_RING_ANGLES), 0.97 * np.sin(_RING_ANGLES)], axis=-1)
@@ -67,8 +67,11 @@ _SECTIONS: Final = {
     "before 2": _ROUND,
     "after 2": _ROUND * [1.02, 0.97],
     "pad": np.array([[0.92, 0.52], [0.0, 0.80], [-0.92, 0.52], [-0.86, -0.62], [0.0, -1.12], [0.86, -0.62]]),
-    "tip": np.array([[0.66, 0.36], [0.0, 0.56], [-0.66, 0.36], [-0.58, -0.50], [0.0, -0.78], [0.58, -0.50]]),
+    "tip": np.array([[0.52, 0.28], [0.0, 0.46], [-0.52, 0.28], [-0.46, -0.44], [0.0, -0.68], [0.46, -0.44]]),
 }
+
+
+_WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +84,8 @@ class CageTopology:
     """Rings of each digit, outwards; a finger's shared first ring on the web row is not among them."""
     quads: Int[np.ndarray, "Q 4"]
     """Faces, counter-clockwise from outside."""
+    tips: Int[np.ndarray, "5 2"]
+    """The two faces that close each digit."""
 
     @property
     def num_vertices(self) -> int:
@@ -124,12 +129,14 @@ def cage_topology() -> CageTopology:
     for column in range(0, 8, 2):
         places = [dorsal(column + i) for i in range(3)] + [palmar(column + i) for i in (2, 1, 0)]
         bases.append(palm[WEB, places])
+    tips = []
     for base, digit_rings in zip(bases, rings, strict=True):
         loops = [base, *digit_rings]
         for near, far in zip(loops[:-1], loops[1:], strict=True):
             quads += np.stack([near, np.roll(near, -1), np.roll(far, -1), far], axis=-1).tolist()
+        tips.append([len(quads), len(quads) + 1])
         quads += loops[-1][[[1, 2, 3, 4], [4, 5, 0, 1]]].tolist()
-    return CageTopology(palm, tuple(rings), np.array(quads))
+    return CageTopology(palm, tuple(rings), np.array(quads), np.array(tips))
 
 
 @dataclass(slots=True, eq=False)
@@ -153,7 +160,7 @@ def first_scales() -> CageScales:
 def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
     """Distance of each ring from the digit's first joint, along the straight digit [m]."""
     first, second, third = shape.bone_lengths[digit]
-    _, radius_1, radius_2, _ = shape.radii[digit]
+    _, radius_1, radius_2, radius_3 = shape.radii[digit]
     joint_2, tip = first + second, first + second + third
     after_2 = joint_2 + 0.6 * radius_2
     places = [
@@ -162,10 +169,18 @@ def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
         first + 0.7 * radius_1,
         joint_2 - 0.6 * radius_2,
         after_2,
-        after_2 + 0.50 * (tip - after_2),
+        np.clip(tip - radius_3, after_2 + 0.35 * (tip - after_2), after_2 + 0.6 * (tip - after_2)),
         after_2 + 0.88 * (tip - after_2),
     ]
     return np.array([0.5 * first, *places] if digit == 0 else places)
+
+
+def ring_girths(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
+    """Girth of the skin at each ring [m]: a little more at the joints, a little less between them."""
+    names = THUMB_RINGS if digit == 0 else FINGER_RINGS
+    waist = np.array([_WAISTS.get(name, 1.0) for name in names])
+    girths: np.ndarray = 2.0 * np.pi * waist * radius_at(shape, digit, ring_places(shape, digit))
+    return girths
 
 
 def radius_at(shape: HandShape, digit: int, places: Float[np.ndarray, "R"]) -> Float[np.ndarray, "R"]:
@@ -262,12 +277,15 @@ def _shape_thumb_base(
         vertices[vertex] = (1.0 - share) * vertices[vertex] + share * target
 
     move(CARPUS, dorsal(0), at(-0.1, -0.9, 0.9), 0.5)
-    move(CARPUS, palmar(0), at(-0.1, 0.9, 0.7), 0.7)
+    move(CARPUS, palmar(0), at(-0.1, 0.9, 0.6), 0.7)
+    move(CARPUS, palmar(1), at(-0.05, 0.85, -0.7), 0.6)
     move(THENAR, dorsal(0), at(0.25, -1.2, 0.5), 0.5)
-    move(THENAR, palmar(0), at(0.25, 1.15, 0.0), 0.8)
-    move(THENAR, palmar(1), at(0.25, 0.9, -1.2), 0.8)
-    move(CARPUS, palmar(1), at(-0.05, 0.9, -0.6), 0.6)
-    move(METACARPUS, palmar(0), at(0.75, -1.1, -1.5), 0.4)
+    move(THENAR, palmar(0), at(0.45, 1.1, -0.45), 0.9)
+    move(THENAR, palmar(1), at(0.42, 0.5, -1.25), 0.9)
+    move(THENAR, palmar(2), at(0.30, 0.1, -1.75), 0.6)
+    move(METACARPUS, palmar(0), at(0.73, -1.1, -1.1), 0.8)
+    move(METACARPUS, palmar(1), at(0.68, -0.95, -1.7), 0.7)
     ring = topology.rings[0][0]
-    section = np.array([[1.0, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.9, -0.7], [-0.3, -1.3], [0.95, -0.75]])
-    vertices[ring] = frames.around(0, np.array([0.5, 0.5, 0.55, 0.7, 0.6, 0.5]) * length, 1.12 * radius * section)
+    section = np.array([[1.0, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.5, -0.6], [-0.1, -0.95], [0.95, -0.45]])
+    along = np.array([0.55, 0.5, 0.55, 0.75, 0.75, 0.65]) * length
+    vertices[ring] = frames.around(0, along, 1.12 * radius * section)
