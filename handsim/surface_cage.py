@@ -281,14 +281,14 @@ def _shape_thumb_base(
     move(CARPUS, palmar(1), at(-0.02, 1.57, -0.29), 0.7)
     move(CARPUS, palmar(2), at(-0.11, 1.57, -1.36), 0.5)
     move(THENAR, dorsal(0), at(0.25, -1.2, 0.5), 0.5)
-    move(THENAR, palmar(0), at(0.43, 1.27, -0.07), 0.9)
-    move(THENAR, palmar(1), at(0.53, 0.85, -1.22), 0.9)
+    move(THENAR, palmar(0), at(0.50, 1.20, -0.55), 0.9)
+    move(THENAR, palmar(1), at(0.48, 0.75, -1.35), 0.9)
     move(THENAR, palmar(2), at(0.41, 0.77, -1.94), 0.7)
     move(THENAR, palmar(3), at(0.29, 0.59, -2.77), 0.4)
-    move(METACARPUS, palmar(0), at(0.78, -1.14, -1.13), 0.8)
-    move(METACARPUS, palmar(1), at(0.77, -0.47, -1.54), 0.8)
+    move(METACARPUS, palmar(0), at(0.66, -0.50, -1.20), 0.9)
+    move(METACARPUS, palmar(1), at(0.68, -0.55, -1.75), 0.8)
     move(METACARPUS, palmar(2), at(0.69, -0.17, -2.31), 0.4)
     ring = topology.rings[0][0]
-    section = np.array([[1.0, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.5, -0.6], [-0.1, -0.95], [0.95, -0.45]])
-    along = np.array([0.55, 0.5, 0.55, 0.75, 0.75, 0.65]) * length
+    section = np.array([[1.0, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.05, -0.85], [1.0, -0.45]])
+    along = np.array([0.55, 0.5, 0.55, 0.72, 0.77, 0.67]) * length
     vertices[ring] = frames.around(0, along, 1.12 * radius * section)
