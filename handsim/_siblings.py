@@ -1,7 +1,7 @@
 """Watches over the five generic import names that handsim shares with the whole world.
 
-`train`, `render` and their like are names that anybody may give to a script. When one of them leads elsewhere,
-Python fails deep inside handsim with a sentence that helps nobody, so this warning comes first.
+`train`, `render` and their like are names that anybody may give to a script. When one of them leads
+elsewhere, Python fails deep inside handsim with a sentence that helps nobody, so this warning comes first.
 """
 
 from __future__ import annotations
