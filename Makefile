@@ -1,0 +1,54 @@
+# handsim's chores. Each target makes .venv by itself, once, and anew when its makings change.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+# What drawing without a screen needs on Debian and Ubuntu: EGL, OpenGL and Mesa's software driver.
+DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint format clean drawing
+
+help:  ## list the targets (this)
+	@echo "usage: make TARGET [PYTHON=python3.12]"
+	@sed -n 's/^\([a-z]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST)
+
+demo: $(INSTALLED) drawing  ## run the whole chain on a built-in example, into demo/
+	$(BIN)/handsim demo --out demo
+
+test: $(INSTALLED) drawing lint  ## every check there is: lint, then the tests
+	$(BIN)/pytest -n 2
+
+lint: $(INSTALLED)  ## style, format, types and the order of imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(INSTALLED)  ## put the code into its format
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:  ## remove .venv, caches and what the demo wrote
+	rm -rf $(VENV) demo build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# setuptools goes in first so that the build needs no isolated environment with versions of its own.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; (3, 11) <= sys.version_info < (3, 14) or sys.exit(1)' || { \
+	  echo "handsim needs Python 3.11, 3.12 or 3.13 and '$(PYTHON)' is none of them; try make PYTHON=python3.12"; exit 1; }
+	@echo "making $(VENV): one to ten minutes, 1.8 GB with torch's CPU build (CONTRIBUTING.md says how to get it)"
+	$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt setuptools
+	$(BIN)/pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	@touch $@
+
+drawing:
+	@dpkg --status $(DRAWING_PACKAGES) >/dev/null 2>&1 || { \
+	  test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get update -qq && \
+	  DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(DRAWING_PACKAGES); } || \
+	  echo "Drawing without a screen, which make demo does, needs EGL and OpenGL; if it fails, have root run" \
+	    "'apt-get install $(DRAWING_PACKAGES)' or install your system's counterparts."

@@ -1,0 +1,25 @@
+"""What tests of every package share."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20180810)
+
+
+@pytest.fixture(scope="session")
+def sig18() -> Path:
+    """The folder of the public Mocap_SIG18_Data captures, which are non-commercial and never part of this."""
+    folder = Path(os.environ.get("HANDSIM_SIG18", ROOT.parent / "shared" / "sig18"))
+    if not folder.is_dir():
+        pytest.skip("the Mocap_SIG18_Data captures are not here; HANDSIM_SIG18 may name their folder")
+    return folder

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """The wheel, built from a copy: what setuptools leaves beside the sources must not enter the next one."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in (*PACKAGES, "tests"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    options = ["--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    command = [sys.executable, "-m", "pip", "wheel", *options, "--wheel-dir", str(out), str(source)]
+    subprocess.run(command, check=True)
+    (path,) = out.glob("handsim-*.whl")
+    return zipfile.ZipFile(path)
+
+
+def run_python(code: str, cwd: Path = ROOT) -> str:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, check=True).stdout
+
+
+def test_wheel_holds_the_six_packages_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+    tops = {name.split("/")[0] for name in wheel.namelist()}
+    (about,) = (top for top in tops if top.endswith(".dist-info"))
+    assert tops == {*PACKAGES, about}
+    assert not [name for name in wheel.namelist() if "test" in name.lower()]
+
+
+def test_wheel_holds_every_source_and_data_file(wheel: zipfile.ZipFile) -> None:
+    """Every file under the six packages is in the wheel: layouts, poses and weights too."""
+    wanted = {
+        path.relative_to(ROOT).as_posix()
+        for package in PACKAGES
+        for path in (ROOT / package).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert {f"{package}/py.typed" for package in PACKAGES} <= wanted
+    assert wanted <= set(wheel.namelist())
+
+
+def test_wheel_carries_licence_command_and_one_version(wheel: zipfile.ZipFile) -> None:
+    stated = re.search(r'__version__ = "(.+)"', (ROOT / "handsim" / "_version.py").read_text())
+    assert stated is not None
+    about = f"handsim-{stated.group(1)}.dist-info"
+    texts = {name: wheel.read(f"{about}/{name}").decode() for name in ("METADATA", "entry_points.txt")}
+    assert f"\nVersion: {stated.group(1)}\n" in texts["METADATA"]
+    assert "handsim = handsim.cli:main" in texts["entry_points.txt"]
+    assert f"{about}/licenses/LICENSE" in wheel.namelist()
+    assert "version" not in _project_table()  # pyproject.toml repeats no version
+    assert f"version: {stated.group(1)}\n" in (ROOT / "CITATION.cff").read_text()
+    assert f"## [{stated.group(1)}]" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def _project_table() -> dict[str, object]:
+    import tomllib
+
+    project: dict[str, object] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    return project
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_public_names_exist(package: str) -> None:
+    module = importlib.import_module(package)
+    assert module.__all__ == sorted(set(module.__all__))
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
+    assert module.__version__ == importlib.import_module("handsim").__version__
+
+
+@pytest.mark.parametrize(
+    ("packages", "heavy"),
+    [
+        (("handsim", "gloves", "poses"), ("torch",)),
+        (("handsim", "gloves", "poses", "train"), ("pyrender", "OpenGL")),
+    ],
+)
+def test_nobody_pays_for_another_packages_imports(packages: tuple[str, ...], heavy: tuple[str, ...]) -> None:
+    """Every module of these packages, imported in one fresh Python, leaves the heavy ones alone."""
+    modules = sorted(
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+        for package in packages
+        for path in (ROOT / package).rglob("*.py")
+    )
+    code = f"import importlib, sys\nfor name in {modules}: importlib.import_module(name)\n"
+    assert run_python(code + f"print(sorted({set(heavy)} & set(sys.modules)))") == "[]\n"
+
+
+def test_a_neighbour_called_train_is_told(tmp_path: Path) -> None:
+    (tmp_path / "train.py").write_text("")
+    code = f"import sys; sys.path.append({str(ROOT)!r}); import handsim"
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert (
+        "ShadowedPackageWarning: handsim needs its own package 'train', but `import train` finds"
+        in result.stderr
+    )
+    assert "train.py; rename that" in result.stderr
+
+
+def test_constraints_pin_every_dependency() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = dict(line.split("==") for line in lines if not line.startswith("#"))
+    assert all(pins.values())
+    project = _project_table()
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]  # type: ignore[misc,index]
+    names = {_canonical(re.split(r"[<>=!]", requirement)[0]) for requirement in wanted}
+    pinned = {_canonical(name) for name in pins}
+    assert names <= pinned
+    assert {_canonical(name) for name in _requirements_of(names)} <= pinned
+
+
+def _canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _requirements_of(names: set[str]) -> set[str]:
+    """The installed requirements of these distributions, all the way down, extras left out."""
+    found: set[str] = set()
+    waiting = set(names)
+    while waiting:
+        name = waiting.pop()
+        try:
+            requirements = metadata.requires(name) or []
+        except metadata.PackageNotFoundError:
+            continue  # a marker for another system or Python
+        found.add(name)
+        if name == "torch":
+            continue  # its CUDA build has dozens of its own, pinned by torch itself
+        for requirement in requirements:
+            if "extra ==" not in requirement:
+                following = _canonical(re.split(r"[\s<>=!;\[(~]", requirement)[0])
+                waiting |= {following} - found
+    return found

@@ -1,0 +1,5 @@
+"""From simulated captures to a labeler."""
+
+from handsim import __version__  # the first import: a hidden sibling is told before it hurts
+
+__all__ = ["__version__"]
