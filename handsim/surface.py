@@ -49,6 +49,17 @@ class HandSurface:
     bone_weights: Float[np.ndarray, "V 4"]
     """Their shares: not negative, in descending order, summing to one."""
 
+    def vertex_normals(self) -> Float[np.ndarray, "V 3"]:
+        """Outward unit normals at rest, each the area-weighted mean of the faces around the vertex."""
+        triangles = self.vertices[self.faces]
+        crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        corners, count = self.faces.ravel(), len(self.vertices)
+        normals = np.stack(
+            [np.bincount(corners, np.repeat(crosses[:, axis], 3), count) for axis in range(3)], axis=1
+        )
+        unit: np.ndarray = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        return unit
+
 
 class _Template(NamedTuple):
     """What all hands share."""
