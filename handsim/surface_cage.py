@@ -46,8 +46,8 @@ _DEPTHS: Final = np.array(
     [
         [0.50, 0.80, 0.90, 0.92, 0.92, 0.92, 0.90, 0.80, 0.42],
         [0.50, 0.80, 0.88, 0.90, 0.90, 0.92, 0.92, 0.82, 0.42],
-        [0.60, 1.00, 1.00, 0.88, 0.86, 0.92, 0.98, 0.92, 0.50],
-        [0.80, 1.25, 0.95, 0.72, 0.66, 0.70, 0.84, 0.88, 0.55],
+        [0.60, 1.00, 1.00, 0.95, 0.90, 0.92, 0.96, 0.90, 0.50],
+        [0.80, 1.25, 0.95, 0.80, 0.70, 0.71, 0.82, 0.86, 0.55],
         [0.52, 0.66, 0.62, 0.58, 0.56, 0.60, 0.66, 0.70, 0.42],
         [0.40, 0.62, 0.64, 0.64, 0.64, 0.64, 0.64, 0.60, 0.38],
     ]
@@ -164,9 +164,9 @@ def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
     joint_2, tip = first + second, first + second + third
     after_2 = joint_2 + 0.6 * radius_2
     places = [
-        first - 0.7 * radius_1,
+        first - 0.75 * radius_1,
         first,
-        first + 0.7 * radius_1,
+        first + 0.75 * radius_1,
         joint_2 - 0.6 * radius_2,
         after_2,
         np.clip(tip - radius_3, after_2 + 0.35 * (tip - after_2), after_2 + 0.6 * (tip - after_2)),
@@ -281,7 +281,7 @@ def _shape_thumb_base(
     move(CARPUS, palmar(1), at(-0.02, 1.57, -0.29), 0.7)
     move(CARPUS, palmar(2), at(-0.11, 1.57, -1.36), 0.5)
     move(THENAR, dorsal(0), at(0.25, -1.2, 0.5), 0.5)
-    move(THENAR, palmar(0), at(0.50, 1.20, -0.55), 0.9)
+    move(THENAR, palmar(0), at(0.48, 1.33, -0.55), 0.9)
     move(THENAR, palmar(1), at(0.48, 0.75, -1.35), 0.9)
     move(THENAR, palmar(2), at(0.41, 0.77, -1.94), 0.7)
     move(THENAR, palmar(3), at(0.29, 0.59, -2.77), 0.4)
@@ -289,6 +289,6 @@ def _shape_thumb_base(
     move(METACARPUS, palmar(1), at(0.68, -0.55, -1.75), 0.8)
     move(METACARPUS, palmar(2), at(0.69, -0.17, -2.31), 0.4)
     ring = topology.rings[0][0]
-    section = np.array([[1.0, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.05, -0.85], [1.0, -0.45]])
+    section = np.array([[1.1, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.05, -0.9], [1.12, -0.5]])
     along = np.array([0.55, 0.5, 0.55, 0.72, 0.77, 0.67]) * length
     vertices[ring] = frames.around(0, along, 1.12 * radius * section)
