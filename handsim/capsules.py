@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 FIRMNESS: Final = 0.8
 """Capsule radius over skin radius."""
 _CARPUS_SPREAD: Final = 0.42  # where the metacarpals begin: their sideways place at the carpus over the knuckles'
+_CARPUS_RISE: Final = 0.2  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +71,7 @@ def build_capsules(shape: HandShape) -> Capsules:
     thickness = FIRMNESS * shape.palm_thickness / 2
     for digit in range(1, len(DIGITS)):
         knuckle = shape.knuckles[digit]
-        carpus = np.array([0.2 * shape.knuckles[2, 0], _CARPUS_SPREAD * knuckle[1], -0.002])
+        carpus = np.array([0.2 * shape.knuckles[2, 0], _CARPUS_SPREAD * knuckle[1], _CARPUS_RISE * shape.palm_thickness])
         rows.append((PALM, carpus, knuckle, min(thickness, float(firm[digit, 0]) * 1.1)))
     for sideways in (-0.1, 0.1):
         place_across = sideways * shape.breadth

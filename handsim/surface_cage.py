@@ -56,6 +56,10 @@ _ROW_PLACES: Final = np.array([-0.26, -0.05, 0.16, 0.42, 0.70, 0.97])  # along t
 _WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # of the four rays, in hand breadths
 _EDGES: Final = np.array([[0.15, 0.14, 0.12, 0.13, 0.13, 0.145], [0.15, 0.14, 0.16, 0.17, 0.155, 0.145]])
 
+_CARPUS_RISE: Final = 0.33  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
+# Finger joints turn nearer to the back than to the pad: how far a section's middle lies below, in radii.
+_PALMWARD: Final = np.array([0.0, -0.16])
+
 _RING_ANGLES: Final = np.deg2rad(np.arange(30.0, 360.0, 60.0))
 _ROUND: Final = np.stack([1.03 * np.cos(_RING_ANGLES), 0.97 * np.sin(_RING_ANGLES)], axis=-1)
 # Sections (y, z) of the rings about the axis: knuckles stand out on the back, the nail is flat, the pad full.
@@ -214,7 +218,7 @@ def cage_vertices(shape: HandShape, topology: CageTopology, scales: CageScales) 
     for digit, rings in enumerate(topology.rings):
         names = THUMB_RINGS if digit == 0 else FINGER_RINGS
         places = ring_places(shape, digit)
-        sections = np.array([_SECTIONS[name] for name in names])
+        sections = np.array([_SECTIONS[name] + _PALMWARD for name in names])
         sections = sections * (radius_at(shape, digit, places) * scales.rings[digit])[:, None, None]
         places[-1] += scales.tips[digit]
         vertices[rings] = frames.around(digit, places[:, None], sections)
@@ -226,6 +230,7 @@ def _palm(shape: HandShape, frames: _Frames, scales: CageScales) -> Float[np.nda
     rows = np.empty((NUM_ROWS, AROUND, 3))
     wrist = np.zeros((4, 3))
     wrist[:, 1] = _WRIST_COLUMNS * shape.breadth
+    wrist[:, 2] = _CARPUS_RISE * shape.palm_thickness
     knuckles = shape.knuckles[1:]
     along = np.clip(_ROW_PLACES, 0.0, 1.0)[:, None, None]
     centres = (1.0 - along) * wrist + along * knuckles
@@ -255,7 +260,7 @@ def _finger_bases(
     for finger, place in enumerate(places):
         digit, column = finger + 1, 2 * finger
         radius = 1.2 * radius_at(shape, digit, places[finger : finger + 1])
-        section = _ROUND * radius
+        section = (_ROUND + _PALMWARD) * radius
         section[3:, 1] -= deepen * radius
         slots = [dorsal(column + i) for i in range(3)] + [palmar(column + i) for i in (2, 1, 0)]
         row[slots] += frames.around(digit, place, section)
