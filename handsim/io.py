@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     final = Path(path)
     # Renaming onto a device (/dev/null) would replace it, and a folder would be noticed only after the work.
     if final.exists() and not final.is_file():
-        raise FileExistsError(f"{final} is not a regular file and cannot be replaced")
+        raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
     final.parent.mkdir(parents=True, exist_ok=True)
     temporary = final.with_name(f".{final.stem}.tmp-{os.getpid()}{final.suffix}")
     try:

@@ -66,6 +66,7 @@ def read_capture(path: str | Path) -> Capture:
     Raises:
         CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its units are unknown.
     """
+    # Here and below: the formats import `Capture` from this module.
     from gloves.captures.c3d import read_c3d
     from gloves.captures.motive_csv import read_motive_csv
     from gloves.captures.trc import read_trc

@@ -81,7 +81,7 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
         OSError: The file cannot be written.
     """
     num_frames, num_markers = capture.positions.shape[:2]
-    rate = f"{capture.rate:.17g}" if not capture.rate.is_integer() else f"{capture.rate:.0f}"
+    rate = repr(capture.rate).removesuffix(".0")
     values = (rate, rate, str(num_frames), str(num_markers), "mm", rate, "1", str(num_frames))
     header = (
         f"PathFileType\t4\t(X/Y/Z)\t{title}",
