@@ -60,9 +60,7 @@ def sample_ghosts(
     frames = len(markers)
     low, high = markers.min(axis=1), markers.max(axis=1)
     count = np.minimum(rng.poisson(config.stray_rate, frames), MAX_GHOSTS)
-    uniform = rng.uniform(
-        -config.stray_margin / 2, 1 + config.stray_margin / 2, size=(frames, MAX_GHOSTS, 3)
-    )
+    uniform = rng.uniform(-config.stray_margin / 2, 1 + config.stray_margin / 2, size=(frames, MAX_GHOSTS, 3))
     strays = low[:, None] + uniform * (high - low)[:, None]
     strays[np.arange(MAX_GHOSTS) >= count[:, None]] = np.nan
     images = np.full(markers.shape, np.nan)

@@ -105,7 +105,9 @@ def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
                     found += ex * ex + ey * ey + ez * ez < reach[k] * reach[k]
                 for n in range(found):
                     k = near[n]
-                    squared = segment_distance_squared(marker, cameras[c], segments[t, k, 0], segments[t, k, 1])
+                    squared = segment_distance_squared(
+                        marker, cameras[c], segments[t, k, 0], segments[t, k, 1]
+                    )
                     if squared < radii[k] * radii[k]:
                         free[t, m, c] = False
                         break
@@ -118,7 +120,10 @@ def _free_lines(frames: Any, starts: Any, ends: Any, segments: Any, radii: Any) 
     for line in range(len(frames)):
         axes = segments[frames[line]]
         for k in range(len(radii)):
-            if segment_distance_squared(starts[line], ends[line], axes[k, 0], axes[k, 1]) < radii[k] * radii[k]:
+            if (
+                segment_distance_squared(starts[line], ends[line], axes[k, 0], axes[k, 1])
+                < radii[k] * radii[k]
+            ):
                 free[line] = False
                 break
     return free

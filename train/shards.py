@@ -157,7 +157,9 @@ class Dataset:
         for name, wanted in self.manifest.files.items():
             file = path / name
             if not file.is_file():
-                raise DatasetError(f"{file} is missing; delete {path / MANIFEST} and run handsim generate again")
+                raise DatasetError(
+                    f"{file} is missing; delete {path / MANIFEST} and run handsim generate again"
+                )
             if checksum(file) != wanted:
                 raise DatasetError(
                     f"{file} is damaged (its checksum is not the manifest's); delete it together with "

@@ -99,7 +99,9 @@ def generate_dataset(
     """
     layout, rig = load_layout(config.glove), named_rig(config.rig)
     if config.min_cameras > len(rig.positions):
-        raise DatasetError(f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}")
+        raise DatasetError(
+            f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
+        )
     attach(layout, HandModel.named("M"))  # a glove that does not fit is told before anything is written
     settings = {**dataclasses.asdict(config), "layout": dataclasses.asdict(layout)}
     _claim(out, settings)
@@ -170,7 +172,9 @@ def _make_all(config: DatasetConfig, out: Path, todo: list[int], workers: int) -
             for job in as_completed(jobs):
                 yield job.result()
         except BrokenProcessPool as error:
-            raise DatasetError("a worker died (out of memory?); run the same command again to go on") from error
+            raise DatasetError(
+                "a worker died (out of memory?); run the same command again to go on"
+            ) from error
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -216,9 +220,7 @@ def simulate_frames(
 ) -> None:
     """Fill rows with random poses of one gloved hand and what the rig sees of them."""
     count = len(block)
-    slipped = vary_places(
-        layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng
-    )
+    slipped = vary_places(layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng)
     attachment = attach(slipped, model)
     position = np.array([0.0, 0.0, 1.1]) + rng.uniform(-config.volume, config.volume, size=(count, 3))
     qpos = join_qpos(
@@ -234,5 +236,3 @@ def simulate_frames(
     block["ghosts"] = sample_ghosts(
         markers, rig, segments, radii, config.ghosts, min_cameras=config.min_cameras, rng=rng
     )
-
-
