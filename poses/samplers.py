@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(3.0)
+_SWAY: Final = np.deg2rad(3.0)  # all fingers to one side
 _SPLIT: Final = np.array(
     [0.3, 0.2, 0.25]
 )  # how often the fingers part: index-middle, middle-ring, ring-little
@@ -86,8 +87,8 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     digits[:, 1:, 1] = _MCP_OPEN + (_MCP_CLOSED - _MCP_OPEN) * ndtr(1.15 * knuckles)
     digits[:, 1:, 2] = _PIP_OPEN + (_PIP_CLOSED - _PIP_OPEN) * ndtr(1.3 * middles)
     digits[:, 1:, 3] = _DIP_SHARE * digits[:, 1:, 2] - _DIP_LAG + _DIP_NOISE * rng.standard_normal((count, 4))
-    fan = rng.standard_normal((count, 1))
-    digits[:, 1:, 0] = fan * _SPREAD + _ABDUCTION_NOISE * rng.standard_normal((count, 4))
+    fan, sway = rng.standard_normal((2, count, 1))
+    digits[:, 1:, 0] = fan * _SPREAD + sway * _SWAY + _ABDUCTION_NOISE * rng.standard_normal((count, 4))
     return angles
 
 
