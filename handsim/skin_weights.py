@@ -22,7 +22,7 @@ from handsim.topology import NUM_BONES, PALM
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Share of the outer bone on a digit's rings: (bone of the digit, share) pairs, the rest goes to the bone before.
+# Bone of the digit and its share on each ring past the web; the rest goes to the bone before it.
 _FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))
 # Share of the thumb's metacarpal on the palm's rows around it: (row, place, share).
 _THENAR: Final = (
@@ -47,7 +47,9 @@ def cage_weights(topology: CageTopology) -> Float[np.ndarray, "K 16"]:
     weights = np.zeros((topology.num_vertices, NUM_BONES))
     for row, (on_finger, on_web) in _KNUCKLE_SHARES.items():
         for column in range(9):
-            fingers = [column // 2] if column % 2 else [f for f in (column // 2 - 1, column // 2) if 0 <= f < 4]
+            fingers = (
+                [column // 2] if column % 2 else [f for f in (column // 2 - 1, column // 2) if 0 <= f < 4]
+            )
             share = on_finger if column % 2 or len(fingers) == 1 else on_web
             for place in (dorsal(column), palmar(column)):
                 weights[topology.palm[row, place], [4 + 3 * f for f in fingers]] = share / len(fingers)
