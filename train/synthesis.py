@@ -1,4 +1,4 @@
-"""A simulated capture in shards: hands, gloves, poses and a rig, on all cores, resumable, always the same bytes."""
+"""A simulated capture in shards: hands, gloves, poses and a rig, on all cores, resumable, reproducible."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from handsim.cameras import CameraRig, named_rig
 from handsim.errors import DatasetError, ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.shape import Population, sample_shape
-from handsim.topology import SIDES
+from handsim.topology import SIDES, Side
 from handsim.transforms import random_quaternions
 from poses.samplers import PoseMix
 from poses.validity import resting_angles, sample_valid_angles
@@ -199,7 +199,7 @@ def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:
 
 def sample_hand(population: Population, *, rng: np.random.Generator) -> HandModel:
     """A random person's left or right hand whose fingers have room beside each other."""
-    side = SIDES[int(rng.integers(2))]
+    side: Side = SIDES[int(rng.integers(2))]
     while True:
         model = HandModel(sample_shape(population, side=side, rng=rng))
         try:
