@@ -1,0 +1,47 @@
+"""One scene, drawn as colours or as depth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from render._gl import load_pyrender, offscreen_renderer
+from render.scene import HandScene, build_scene
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32, UInt8
+    from numpy.typing import NDArray
+
+
+def render_rgb(scene: HandScene, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colour picture, sRGB.
+
+    Args:
+        scene: What to draw.
+        size: Width and height [pixels].
+
+    Raises:
+        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+    """
+    renderer = offscreen_renderer(*size)
+    flags = load_pyrender().RenderFlags.SHADOWS_DIRECTIONAL
+    color, _ = renderer.render(build_scene(scene), flags=flags)
+    picture: NDArray[np.uint8] = np.array(color[..., :3])
+    return picture
+
+
+def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
+    """Depth picture: distance along the camera's axis [m], 0 where there is nothing.
+
+    Args:
+        scene: What to draw.
+        size: Width and height [pixels].
+
+    Raises:
+        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+    """
+    renderer = offscreen_renderer(*size)
+    depth = renderer.render(build_scene(scene), flags=load_pyrender().RenderFlags.DEPTH_ONLY)
+    picture: NDArray[np.float32] = np.asarray(depth, dtype=np.float32)
+    return picture
