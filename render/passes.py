@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from render._gl import load_pyrender, offscreen_renderer
-from render.scene import HandScene, build_scene
+from render.scene import HandScene, View, build_scene
 
 if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt8
+    from jaxtyping import Bool, Float, Float32, UInt8
     from numpy.typing import NDArray
 
 
@@ -45,3 +45,23 @@ def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray,
     depth = renderer.render(build_scene(scene), flags=load_pyrender().RenderFlags.DEPTH_ONLY)
     picture: NDArray[np.float32] = np.asarray(depth, dtype=np.float32)
     return picture
+
+
+def nothing_before(
+    depth: Float32[np.ndarray, "H W"], view: View, points: Float[np.ndarray, "N 3"], *, slack: float
+) -> Bool[np.ndarray, "N"]:
+    """Which points lie in a depth picture with nothing in front of them.
+
+    Args:
+        depth: The picture [m], 0 where there is nothing.
+        view: Its camera.
+        points: Points in the world [m].
+        slack: How far behind the first surface a point still counts [m], such as a marker's radius.
+    """
+    height, width = depth.shape
+    column, row = np.floor(view.project(points, (width, height))).astype(int).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    first = depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    ahead = (points - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2]
+    free: NDArray[np.bool_] = inside & (ahead > 0) & ((first == 0) | (ahead <= first + slack))
+    return free

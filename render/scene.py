@@ -32,8 +32,12 @@ if TYPE_CHECKING:
 OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
 _NEAR, _FAR = 0.01, 20.0  # [m]
-# Where the light comes from, in camera axes (x right, y down, z ahead), and how strong: key, fill, rim.
-_LIGHTS: Final = (((-0.5, -0.75, -0.85), 3.1), ((0.95, -0.1, -0.6), 1.25), ((0.2, -0.9, 0.75), 1.6))
+# Where the light comes from, in camera axes (x right, y down, z ahead), and how strong it is.
+_KEY: Final = (-0.45, -0.7, -1.0)
+_KEY_INTENSITY: Final = 2.9
+_LAMPS: Final = (((0.85, -0.1, -0.5), 1.3), ((0.15, -0.85, 0.5), 1.2))  # fill, rim
+_LAMP_DISTANCE: Final = 30.0  # [m], so far that its rays are as good as parallel
+_SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
 _AMBIENT: Final = 0.16
 
 
@@ -170,13 +174,26 @@ def build_scene(scene: HandScene) -> Any:
         _add_balls(pyrender, built, balls)
     camera = pyrender.PerspectiveCamera(yfov=scene.view.field_of_view, znear=_NEAR, zfar=_FAR)
     built.add(camera, pose=scene.view.T_world_camera @ OPENGL_FROM_OPENCV)
-    for place, intensity in _LIGHTS:
-        # A light shines along its own -z, as an OpenGL camera looks.
-        towards = scene.view.T_world_camera[:3, :3] @ -np.array(place)
-        pose = np.eye(4)
-        pose[:3, :3] = _frame_with_z(-towards)
-        built.add(pyrender.DirectionalLight(intensity=intensity), pose=pose)
+    _add_lights(pyrender, built, scene.view)
     return built
+
+
+def _add_lights(pyrender: Any, built: Any, view: View) -> None:
+    """A key light that casts shadows, and two far lamps that cast none: grazing shadows look like dirt."""
+    rotation = view.T_world_camera[:3, :3]
+    pose = np.eye(4)
+    pose[:3, :3] = _frame_with_z(rotation @ np.array(_KEY))
+    key = pyrender.DirectionalLight(intensity=_KEY_INTENSITY)
+    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin: more depth, more bias.
+    # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
+    key._get_shadow_camera = lambda diagonal: pyrender.OrthographicCamera(
+        xmag=0.52 * diagonal, ymag=0.52 * diagonal, znear=0.3 * diagonal, zfar=_SHADOW_DEPTH * diagonal
+    )
+    built.add(key, pose=pose)
+    for place, intensity in _LAMPS:
+        lamp = np.eye(4)
+        lamp[:3, 3] = view.T_world_camera[:3, 3] + rotation @ np.array(place) * _LAMP_DISTANCE
+        built.add(pyrender.PointLight(intensity=intensity * _LAMP_DISTANCE**2), pose=lamp)
 
 
 def _hand_mesh(pyrender: Any, hand: PosedHand) -> Any:
