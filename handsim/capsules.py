@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 
 FIRMNESS: Final = 0.8
 """Capsule radius over skin radius."""
-_CARPUS_SPREAD: Final = 0.42  # where the metacarpals begin: their sideways place at the carpus over the knuckles'
-_CARPUS_RISE: Final = 0.2  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
+_CARPUS_SPREAD: Final = (
+    0.42  # where the metacarpals begin: their sideways place at the carpus over the knuckles'
+)
+_CARPUS_RISE: Final = 0.28  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,11 +73,15 @@ def build_capsules(shape: HandShape) -> Capsules:
     thickness = FIRMNESS * shape.palm_thickness / 2
     for digit in range(1, len(DIGITS)):
         knuckle = shape.knuckles[digit]
-        carpus = np.array([0.2 * shape.knuckles[2, 0], _CARPUS_SPREAD * knuckle[1], _CARPUS_RISE * shape.palm_thickness])
+        carpus = np.array(
+            [0.2 * shape.knuckles[2, 0], _CARPUS_SPREAD * knuckle[1], _CARPUS_RISE * shape.palm_thickness]
+        )
         rows.append((PALM, carpus, knuckle, min(thickness, float(firm[digit, 0]) * 1.1)))
     for sideways in (-0.1, 0.1):
         place_across = sideways * shape.breadth
-        wrist = np.array([[-0.15 * shape.length, place_across, 0.0], [0.05 * shape.length, place_across, 0.0]])
+        wrist = np.array(
+            [[-0.15 * shape.length, place_across, 0.0], [0.05 * shape.length, place_across, 0.0]]
+        )
         rows.append((PALM, wrist[0], wrist[1], FIRMNESS * 0.2 * shape.breadth))
     mirror = MIRROR if shape.side == "left" else np.eye(3)
     return Capsules(

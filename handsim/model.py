@@ -82,7 +82,9 @@ class HandModel:
             parent = transforms[:, bone.parent]
             local = self.skeleton.rotations[number] @ turns[number]
             transforms[:, number, :3, :3] = parent[:, :3, :3] @ local
-            transforms[:, number, :3, 3] = parent[:, :3, :3] @ self.skeleton.offsets[number] + parent[:, :3, 3]
+            transforms[:, number, :3, 3] = (
+                parent[:, :3, :3] @ self.skeleton.offsets[number] + parent[:, :3, 3]
+            )
         return transforms
 
     def skin(self, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T V 3"]:

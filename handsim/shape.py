@@ -36,12 +36,12 @@ _BONE_LENGTHS: Final = np.array(
 # Where each digit begins [mm], in the wrist frame: thumb CMC joint, then the four MCP joints. x follows the
 # metacarpal and carpus lengths, y spreads over the breadth, z is the transverse arch.
 _KNUCKLES: Final = np.array(
-    [[24.0, 26.0, -18.0], [97.5, 27.0, -2.0], [98.0, 5.0, 2.0], [90.5, -15.5, 0.0], [80.5, -35.0, -8.0]]
+    [[26.0, 25.5, -17.5], [97.5, 27.0, -2.0], [98.0, 5.0, 2.0], [90.5, -15.5, 0.0], [80.5, -35.0, -8.0]]
 )
 # How each digit points at zero angles [deg]: turn about z, tip towards the palm, roll about its own length.
 # The rolls make flexed fingers converge on the scaphoid; the thumb's nail faces sideways.
 _BASE_ANGLES: Final = np.array(
-    [[28.0, 33.0, -87.0], [-1.5, -3.0, -10.0], [-5.0, -2.0, -3.0], [-10.0, -2.0, 4.0], [-18.0, -2.0, 12.0]]
+    [[30.0, 32.0, -87.0], [-1.0, -8.0, -10.0], [-5.0, -2.0, -3.0], [-10.0, -2.0, 4.0], [-18.0, -2.0, 12.0]]
 )
 # Skin radius [mm] at a digit's base, second and third joint and behind the tip: Greiner's girths over 2 pi.
 _RADII: Final = np.array(

@@ -47,7 +47,9 @@ def cage_weights(topology: CageTopology) -> Float[np.ndarray, "K 16"]:
     weights = np.zeros((topology.num_vertices, NUM_BONES))
     for row, (on_finger, on_web) in _KNUCKLE_SHARES.items():
         for column in range(9):
-            fingers = [column // 2] if column % 2 else [f for f in (column // 2 - 1, column // 2) if 0 <= f < 4]
+            fingers = (
+                [column // 2] if column % 2 else [f for f in (column // 2 - 1, column // 2) if 0 <= f < 4]
+            )
             share = on_finger if column % 2 or len(fingers) == 1 else on_web
             for place in (dorsal(column), palmar(column)):
                 weights[topology.palm[row, place], [4 + 3 * f for f in fingers]] = share / len(fingers)

@@ -54,7 +54,9 @@ def catmull_clark(
     return sparse.csr_array(sparse.vstack([vertex_points, edge_points, faces])), new_quads
 
 
-def subdivided_loop(loop: Int[np.ndarray, "K"], quads: Int[np.ndarray, "Q 4"], num_vertices: int) -> np.ndarray:
+def subdivided_loop(
+    loop: Int[np.ndarray, "K"], quads: Int[np.ndarray, "Q 4"], num_vertices: int
+) -> np.ndarray:
     """The 2 K vertices that a closed loop of edges passes through after one `catmull_clark` step."""
     edges, _ = edge_table(quads)
     number = {(int(a), int(b)): place for place, (a, b) in enumerate(edges)}

@@ -52,13 +52,16 @@ _DEPTHS: Final = np.array(
         [0.40, 0.62, 0.64, 0.64, 0.64, 0.64, 0.64, 0.60, 0.38],
     ]
 )
-_ROW_PLACES: Final = np.array([-0.26, -0.05, 0.16, 0.42, 0.70, 0.97])  # along the metacarpals: 0 wrist, 1 joint
+_ROW_PLACES: Final = np.array(
+    [-0.26, -0.05, 0.16, 0.42, 0.70, 0.97]
+)  # along the metacarpals: 0 wrist, 1 joint
 _WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # of the four rays, in hand breadths
 _EDGES: Final = np.array([[0.15, 0.14, 0.12, 0.13, 0.13, 0.145], [0.15, 0.14, 0.16, 0.17, 0.155, 0.145]])
 
-_CARPUS_RISE: Final = 0.33  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
+_CARPUS_RISE: Final = 0.42  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
+_ARCH: Final = np.array([0.0, 0.0, 0.04, 0.08, 0.08, 0.02])  # and the metacarpals' backs over theirs, by row
 # Finger joints turn nearer to the back than to the pad: how far a section's middle lies below, in radii.
-_PALMWARD: Final = np.array([0.0, -0.16])
+_PALMWARD: Final = np.array([0.0, -0.14])
 
 _RING_ANGLES: Final = np.deg2rad(np.arange(30.0, 360.0, 60.0))
 _ROUND: Final = np.stack([1.03 * np.cos(_RING_ANGLES), 0.97 * np.sin(_RING_ANGLES)], axis=-1)
@@ -218,7 +221,8 @@ def cage_vertices(shape: HandShape, topology: CageTopology, scales: CageScales) 
     for digit, rings in enumerate(topology.rings):
         names = THUMB_RINGS if digit == 0 else FINGER_RINGS
         places = ring_places(shape, digit)
-        sections = np.array([_SECTIONS[name] + _PALMWARD for name in names])
+        sections = np.array([_SECTIONS[name] for name in names])
+        sections[:-2] += _PALMWARD
         sections = sections * (radius_at(shape, digit, places) * scales.rings[digit])[:, None, None]
         places[-1] += scales.tips[digit]
         vertices[rings] = frames.around(digit, places[:, None], sections)
@@ -234,7 +238,9 @@ def _palm(shape: HandShape, frames: _Frames, scales: CageScales) -> Float[np.nda
     knuckles = shape.knuckles[1:]
     along = np.clip(_ROW_PLACES, 0.0, 1.0)[:, None, None]
     centres = (1.0 - along) * wrist + along * knuckles
-    centres[..., 0] = _ROW_PLACES[:, None] * np.where(_ROW_PLACES[:, None] < 0.0, knuckles[1, 0], knuckles[:, 0])
+    centres[..., 0] = _ROW_PLACES[:, None] * np.where(
+        _ROW_PLACES[:, None] < 0.0, knuckles[1, 0], knuckles[:, 0]
+    )
     columns = np.empty((6, 9, 3))
     columns[:, 1::2] = centres
     columns[:, 2:-1:2] = 0.5 * (centres[:, :-1] + centres[:, 1:])
@@ -244,7 +250,7 @@ def _palm(shape: HandShape, frames: _Frames, scales: CageScales) -> Float[np.nda
     columns[:, 8, 1] -= edges[1]
     thickness = shape.palm_thickness * scales.thickness
     rows[:6, :9], rows[:6, 9:] = columns, columns[:, ::-1]
-    rows[:6, :9, 2] += _HEIGHTS * thickness
+    rows[:6, :9, 2] += (_HEIGHTS + _ARCH[:, None]) * thickness
     rows[:6, 9:, 2] -= _DEPTHS[:, ::-1] * thickness
     rows[PAST_KNUCKLES] = _finger_bases(shape, frames, np.full(4, 0.75) * shape.radii[1:, 0], 0.12)
     rows[WEB] = _finger_bases(shape, frames, WEB_PLACE * shape.bone_lengths[1:, 0], 0.0)

@@ -21,8 +21,13 @@ if TYPE_CHECKING:
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(3.0)
-_SPLIT: Final = np.array([0.3, 0.2, 0.25])  # how often the fingers part: index-middle, middle-ring, ring-little
+_SWAY: Final = np.deg2rad(3.0)  # all fingers to one side
+_SPLIT: Final = np.array(
+    [0.3, 0.2, 0.25]
+)  # how often the fingers part: index-middle, middle-ring, ring-little
 _ALIKE: Final = 0.98
+_DIP_SHARE: Final = 0.68
+_DIP_LAG: Final = np.deg2rad(6.0)
 _DIP_NOISE: Final = np.deg2rad(9.0)
 _MCP_OPEN, _MCP_CLOSED = np.deg2rad([-18.0, 92.0])
 _PIP_OPEN, _PIP_CLOSED = np.deg2rad([-3.0, 112.0])
@@ -81,9 +86,9 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     middles = within * knuckles + np.sqrt(1 - within**2) * _grouped(splits, rng.standard_normal((count, 4)))
     digits[:, 1:, 1] = _MCP_OPEN + (_MCP_CLOSED - _MCP_OPEN) * ndtr(1.15 * knuckles)
     digits[:, 1:, 2] = _PIP_OPEN + (_PIP_CLOSED - _PIP_OPEN) * ndtr(1.3 * middles)
-    digits[:, 1:, 3] = 2 / 3 * digits[:, 1:, 2] + _DIP_NOISE * rng.standard_normal((count, 4))
-    fan = rng.standard_normal((count, 1))
-    digits[:, 1:, 0] = fan * _SPREAD + _ABDUCTION_NOISE * rng.standard_normal((count, 4))
+    digits[:, 1:, 3] = _DIP_SHARE * digits[:, 1:, 2] - _DIP_LAG + _DIP_NOISE * rng.standard_normal((count, 4))
+    fan, sway = rng.standard_normal((2, count, 1))
+    digits[:, 1:, 0] = fan * _SPREAD + sway * _SWAY + _ABDUCTION_NOISE * rng.standard_normal((count, 4))
     return angles
 
 

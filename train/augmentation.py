@@ -69,7 +69,9 @@ def corrupt(
     truth = np.full(present.shape, -1)
     truth[:, :count] = np.arange(count)
     order = rng.random(present.shape).argsort(axis=1)
-    order = np.take_along_axis(order, np.take_along_axis(~present, order, 1).argsort(axis=1, kind="stable"), 1)
+    order = np.take_along_axis(
+        order, np.take_along_axis(~present, order, 1).argsort(axis=1, kind="stable"), 1
+    )
     width = max(1, int(present.sum(1).max()))
     order = order[:, :width]
     present = np.take_along_axis(present, order, 1)

@@ -56,7 +56,9 @@ class SetLabeler(nn.Module):
         self.rounds = nn.ModuleList(MessageRound(width, config.gates, bumps) for _ in range(config.depth))
         self.norm = nn.LayerNorm(width)
         self.to_scores = nn.Linear(width, config.num_labels + 1)
-        self.to_occluded = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, config.num_labels))
+        self.to_occluded = nn.Sequential(
+            nn.Linear(width, width), nn.SiLU(), nn.Linear(width, config.num_labels)
+        )
 
     def forward(self, points: Float[Tensor, "B N 3"], present: Bool[Tensor, "B N"]) -> LabelScores:
         """Score clouds [m], padded where not `present`."""
@@ -66,7 +68,9 @@ class SetLabeler(nn.Module):
         pairs = (present[:, :, None] & present[:, None]).to(points.dtype)
         count = present.sum(1).to(points.dtype)[:, None, None] / 20.0  # (B, 1, 1), about 1
         profile = (bumps * pairs[..., None]).sum(2)
-        features = self.embed(torch.cat([profile, count.expand(-1, profile.shape[1], 1)], dim=-1))  # (B, N, W)
+        features = self.embed(
+            torch.cat([profile, count.expand(-1, profile.shape[1], 1)], dim=-1)
+        )  # (B, N, W)
         for message_round in self.rounds:
             features = message_round(features, bumps, pairs)
         features = self.norm(features)

@@ -57,7 +57,9 @@ def digit_faces(skin: HandSurface, digit: int) -> np.ndarray:
 
 def outline(vertices: np.ndarray, faces: np.ndarray, origin: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Distance [m] of the outermost skin from `origin` in 72 directions in a plane."""
-    section = trimesh.Trimesh(vertices, faces, process=False).section(plane_origin=origin, plane_normal=normal)
+    section = trimesh.Trimesh(vertices, faces, process=False).section(
+        plane_origin=origin, plane_normal=normal
+    )
     across = np.linalg.svd(normal[None])[2][1:]
     ends = (section.vertices[np.concatenate([e.nodes for e in section.entities])] - origin) @ across.T
     along = np.linspace(0.0, 1.0, 20)[:, None, None]
@@ -212,7 +214,10 @@ def test_posed_digits_keep_their_sections(size, pose):
             assert areas[1] > 0.6 * areas[0], BONES[bone].name
         bone = 2 + 3 * digit
         half = shape.bone_lengths[digit, 1] / 2
-        areas = [section_area(v, t[bone], half, t[bone, :3, 0]) for v, t in ((skin.vertices, before), (moved, after))]
+        areas = [
+            section_area(v, t[bone], half, t[bone, :3, 0])
+            for v, t in ((skin.vertices, before), (moved, after))
+        ]
         assert areas[1] > 0.9 * areas[0], BONES[bone].name
 
 
@@ -255,7 +260,11 @@ def test_skinning_is_rigid_for_a_rigid_hand_and_takes_batches(seed):
     moves[:, :3, :3] = [euler_matrix(angles) for angles in rng.uniform(-3, 3, (3, 3))]
     moves[:, :3, 3] = rng.standard_normal((3, 3))
     result = linear_blend_skinning(
-        skin.vertices[:50], skin.bone_indices[:50], skin.bone_weights[:50], transforms, moves[:, None] @ transforms
+        skin.vertices[:50],
+        skin.bone_indices[:50],
+        skin.bone_weights[:50],
+        transforms,
+        moves[:, None] @ transforms,
     )
     wanted = np.einsum("bij,nj->bni", moves[:, :3, :3], skin.vertices[:50]) + moves[:, None, :3, 3]
     assert result.shape == (3, 50, 3)

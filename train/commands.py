@@ -1,0 +1,221 @@
+"""The commands `handsim generate | train | label | evaluate`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from gloves.captures import read_capture, write_capture
+from gloves.captures.markers import labelled_capture, select_markers, unlabelled_frames
+from gloves.layout import load_layout
+from handsim.errors import CaptureError, HandSimError, WeightsError
+from train.shards import Dataset, save_json
+from train.synthesis import DatasetConfig, generate_dataset
+
+if TYPE_CHECKING:
+    from train.labeler import TrainedSetLabeler
+    from train.loop import TrainConfig
+
+
+def generate(
+    out: Path, config: Annotated[DatasetConfig, tyro.conf.arg(name="")], workers: int | None = None
+) -> None:
+    """Make a training set; run it again to go on where it was stopped.
+
+    Args:
+        out: Folder for the shards and their manifest.
+        config: What to make.
+        workers: Processes; all cores when not given.
+    """
+    with progress_bar("frames") as (bar, task):
+        manifest = generate_dataset(
+            config,
+            out,
+            workers=workers,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    Console().print(f"{manifest.num_frames} frames of {config.glove} in {out}")
+
+
+def train(
+    dataset: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    config: "Annotated[TrainConfig, tyro.conf.arg(name='')]",
+    labeler: Literal["set"] = "set",
+) -> None:
+    """Train a labeler on a training set; run it again to go on where it was stopped.
+
+    Args:
+        dataset: Folder that `handsim generate` wrote.
+        out: Folder for the weights, the model card and the checkpoint.
+        config: How to train.
+        labeler: Kind of network.
+    """
+    from train.loop import train_labeler
+
+    del labeler  # one kind so far; the name is part of the command line's contract
+    with progress_bar("samples") as (bar, task):
+
+        def report(done: int, total: int, loss: float) -> None:
+            bar.update(task, completed=done, total=total, description=f"loss {loss:.3f}")
+
+        card = train_labeler(Dataset(dataset), config, out, progress=report)
+    print_figures(card["held_out_simulated"], title="Held-out simulated frames")
+    Console().print(f"weights and model card in {out}")
+
+
+def label(
+    capture: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    glove: str = "dense19",
+    labeler: str | None = None,
+) -> None:
+    """Label every frame of a capture on its own; names and order of its columns are not used.
+
+    Args:
+        capture: A .trc, .c3d or Motive .csv file.
+        out: Labelled .trc or .c3d file; points that are no markers become columns Unlabeled1, Unlabeled2, ...
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        labeler: Folder of a trained labeler; the glove's shipped one when not given.
+    """
+    network = labeler_of(glove, labeler)
+    source = read_capture(capture)
+    frames = unlabelled_frames(source)
+    with progress_bar("frames") as (bar, task):
+        labellings = []
+        for first in range(0, len(frames), 1024):
+            labellings += network.label_frames(frames[first : first + 1024])
+            bar.update(task, completed=len(labellings), total=len(frames))
+    labels = [labelling.labels for labelling in labellings]
+    write_capture(out, labelled_capture(frames, labels, network.marker_names, source.rate))
+    named = sum(int((label >= 0).sum()) for label in labels)
+    points = sum(len(label) for label in labels)
+    sure = np.concatenate([labelling.confidence for labelling in labellings]) if points else np.ones(1)
+    Console().print(
+        f"{out}: {len(frames)} frames, {named} of {points} points labelled, median confidence {np.median(sure):.3f}"
+    )
+
+
+def evaluate(
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    glove: str = "dense19",
+    labeler: str | None = None,
+    occlude: int = 0,
+    ghosts: int = 0,
+    seed: int = 0,
+    json: Path | None = None,
+) -> None:
+    """Measure a labeler on labelled captures, corrupted as in the paper.
+
+    Args:
+        captures: Labelled .trc, .c3d or .csv files, or folders searched for them.
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        labeler: Folder of a trained labeler; the glove's shipped one when not given.
+        occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).
+        ghosts: Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2).
+        seed: Seed of the corruption.
+        json: File for the figures.
+    """
+    from train.augmentation import Corruption
+    from train.evaluation import evaluate_labeler
+
+    if occlude < 0 or ghosts < 0:
+        raise HandSimError(f"occlude is {occlude} and ghosts {ghosts}, wanted 0 or more of each")
+    network = labeler_of(glove, labeler)
+    files = _capture_files(captures)
+    markers = np.concatenate([_known_markers(file, network.marker_names) for file in files])
+    report = evaluate_labeler(network, markers, Corruption(occlude, ghosts), rng=np.random.default_rng(seed))
+    title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
+    print_figures({"share": report.figures}, title=title)
+    by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
+    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
+    Console().print("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
+    if json is not None:
+        settings = {
+            "glove": glove,
+            "occlude": occlude,
+            "ghosts": ghosts,
+            "seed": seed,
+            "frames": len(markers),
+        }
+        save_json(json, {**settings, "figures": report.figures, "slot_accuracy_by_marker": by_marker})
+
+
+def labeler_of(glove: str, labeler: str | None) -> TrainedSetLabeler:
+    """The labeler asked for, checked against the glove's markers."""
+    from train.labeler import load_labeler, shipped_labelers
+
+    layout = load_layout(glove)
+    if labeler is None and glove not in shipped_labelers():
+        raise WeightsError(
+            f"no labeler comes with glove '{glove}' (shipped: {', '.join(shipped_labelers())}); train one with "
+            f"handsim generate and handsim train, and give its folder as --labeler"
+        )
+    network = load_labeler(glove if labeler is None else Path(labeler))
+    if network.marker_names != layout.names:
+        raise WeightsError(
+            f"the labeler knows markers {', '.join(network.marker_names)}, but glove '{glove}' has "
+            f"{', '.join(layout.names)}"
+        )
+    return network
+
+
+@contextmanager
+def progress_bar(unit: str) -> Iterator[tuple[Progress, int]]:
+    """A progress bar on standard error and the one task in it."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} " + unit),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        yield bar, bar.add_task("", total=1)
+
+
+def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
+    """Figures as a table in percent, a column each."""
+    table = Table(title=title)
+    table.add_column("figure")
+    for name in columns:
+        table.add_column(f"{name} [%]", justify="right")
+    for figure in next(iter(columns.values())):
+        table.add_row(
+            figure.replace("_", " "), *(f"{100 * column[figure]:.2f}" for column in columns.values())
+        )
+    Console().print(table)
+
+
+def _capture_files(paths: tuple[Path, ...]) -> list[Path]:
+    from gloves.captures import READABLE
+
+    files = []
+    for path in paths:
+        inside = (
+            sorted(file for file in path.rglob("*") if file.suffix.lower() in READABLE)
+            if path.is_dir()
+            else [path]
+        )
+        if not inside:
+            raise CaptureError(f"{path} holds no capture; wanted files {', '.join(READABLE)}")
+        files += inside
+    if not files:
+        raise CaptureError("no capture was given; wanted files or folders")
+    return files
+
+
+def _known_markers(file: Path, names: tuple[str, ...]) -> np.ndarray:
+    try:
+        return select_markers(read_capture(file), names)
+    except CaptureError as error:
+        text = str(error)
+        raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error

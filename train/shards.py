@@ -1,0 +1,183 @@
+"""Training sets on disk: `.npy` shards of rows and hands, and a manifest that names and checks them.
+
+A row is clean: what the hand did and what the rig saw of it. Jitter, drops and a shuffled order are drawn
+when training (`train.augmentation`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.ghosts import MAX_GHOSTS
+from handsim.errors import DatasetError
+from handsim.io import atomic_write
+from handsim.shape import HandShape
+from handsim.topology import NUM_QPOS, SIDES
+
+if TYPE_CHECKING:
+    from jaxtyping import Shaped
+    from numpy.typing import NDArray
+
+SCHEMA: Final = 1
+MANIFEST: Final = "manifest.json"
+CONFIG: Final = "config.json"
+
+
+def row_dtype(num_markers: int) -> np.dtype[np.void]:
+    """One frame: qpos; the hand's place in the shard; markers [m]; cameras that see each (bits); ghosts [m]."""
+    return np.dtype(
+        [
+            ("qpos", "<f4", (NUM_QPOS,)),
+            ("hand", "<u4"),
+            ("markers", "<f4", (num_markers, 3)),
+            ("cameras", "<u4", (num_markers,)),
+            ("ghosts", "<f4", (MAX_GHOSTS, 3)),
+        ]
+    )
+
+
+HAND_DTYPE: Final = np.dtype(
+    [
+        ("left", "?"),
+        ("length", "<f8"),
+        ("breadth", "<f8"),
+        ("bone_lengths", "<f8", (5, 3)),
+        ("knuckles", "<f8", (5, 3)),
+        ("base_angles", "<f8", (5, 3)),
+        ("radii", "<f8", (5, 4)),
+        ("palm_thickness", "<f8"),
+    ]
+)
+
+
+def pack_hand(shape: HandShape) -> tuple[Any, ...]:
+    """A hand as one element of a `HAND_DTYPE` array."""
+    return (shape.side == "left", *(getattr(shape, name) for name in (HAND_DTYPE.names or ())[1:]))
+
+
+def unpack_hand(record: np.void) -> HandShape:
+    """The hand of one element of a `HAND_DTYPE` array."""
+    fields = {name: record[name] for name in (HAND_DTYPE.names or ())[1:]}
+    fields = {name: float(value) if np.ndim(value) == 0 else value for name, value in fields.items()}
+    return HandShape(side=SIDES[0] if record["left"] else SIDES[1], **fields)
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a finished training set is made of."""
+
+    config: dict[str, Any]
+    """The settings that made it."""
+    marker_names: tuple[str, ...]
+    num_frames: int
+    min_cameras: int
+    """Cameras that must see a marker before it exists."""
+    files: dict[str, str]
+    """SHA-256 of every file, by name."""
+    units: str = "metres, radians, world frame"
+    schema: int = SCHEMA
+
+
+def rows_name(shard: int) -> str:
+    """File of a shard's rows."""
+    return f"rows-{shard:05d}.npy"
+
+
+def hands_name(shard: int) -> str:
+    """File of a shard's hands."""
+    return f"hands-{shard:05d}.npy"
+
+
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an `.npy` file, whole or not at all."""
+    with atomic_write(path) as temporary:
+        np.save(temporary, array, allow_pickle=False)
+
+
+def save_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file, whole or not at all."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def load_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        DatasetError: The file is no JSON object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise DatasetError(f"{path} is damaged: it holds no JSON") from error
+    if not isinstance(content, dict):
+        raise DatasetError(f"{path} is damaged: it holds no JSON object")
+    return content
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def save_manifest(out: Path, manifest: Manifest) -> None:
+    """Write the manifest, which makes the training set complete."""
+    save_json(out / MANIFEST, dataclasses.asdict(manifest))
+
+
+class Dataset:
+    """A finished training set, its rows memory-mapped.
+
+    Args:
+        path: The folder that `handsim generate` wrote.
+
+    Raises:
+        DatasetError: Not a training set, unfinished, of another schema, or damaged (the file is named).
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not (path / MANIFEST).is_file():
+            hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
+            raise DatasetError(f"wanted a training set with a {MANIFEST}, but {path} {hint}")
+        content = load_json(path / MANIFEST)
+        if content.get("schema") != SCHEMA:
+            raise DatasetError(f"{path} has schema {content.get('schema')}, wanted {SCHEMA}")
+        try:
+            self.manifest = Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
+        except (TypeError, KeyError) as error:
+            raise DatasetError(f"{path / MANIFEST} is damaged: a field is missing or unknown") from error
+        for name, wanted in self.manifest.files.items():
+            file = path / name
+            if not file.is_file():
+                raise DatasetError(
+                    f"{file} is missing; delete {path / MANIFEST} and run handsim generate again"
+                )
+            if checksum(file) != wanted:
+                raise DatasetError(
+                    f"{file} is damaged (its checksum is not the manifest's); delete it together with "
+                    f"{MANIFEST} and run handsim generate again"
+                )
+        self.path = path
+        names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
+        self.shards = [np.load(path / name, mmap_mode="r", allow_pickle=False) for name in names]
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers in label order."""
+        return self.manifest.marker_names
+
+    def rows(self) -> Shaped[np.ndarray, "T"]:
+        """All rows in order, read into memory."""
+        return np.concatenate(self.shards)
+
+    def hands(self, shard: int) -> list[HandShape]:
+        """The hands of a shard, which its rows count from 0."""
+        return [unpack_hand(record) for record in np.load(self.path / hands_name(shard), allow_pickle=False)]

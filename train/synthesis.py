@@ -1,0 +1,238 @@
+"""A simulated capture in shards: hands, gloves, poses and a rig, on all cores, resumable, always the same bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.attach import attach, vary_places
+from gloves.ghosts import GhostConfig, sample_ghosts
+from gloves.layout import MarkerLayout, load_layout
+from gloves.visibility import pack_cameras, visible_cameras
+from handsim.cameras import CameraRig, named_rig
+from handsim.errors import DatasetError, ShapeError
+from handsim.model import HandModel, join_qpos
+from handsim.shape import Population, sample_shape
+from handsim.topology import SIDES
+from handsim.transforms import random_quaternions
+from poses.samplers import PoseMix
+from poses.validity import resting_angles, sample_valid_angles
+from train.shards import (
+    CONFIG,
+    HAND_DTYPE,
+    Manifest,
+    checksum,
+    hands_name,
+    load_json,
+    pack_hand,
+    row_dtype,
+    rows_name,
+    save_array,
+    save_json,
+    save_manifest,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+ROWS_PER_SHARD: Final = 8192
+Progress = Callable[[int, int], None]
+"""Called with frames done and frames wanted."""
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetConfig:
+    """Everything that decides the bytes of a training set."""
+
+    glove: str = "dense19"
+    """Marker layout: a shipped name or the path of a .toml file."""
+    num_frames: int = 170_330
+    """Frames; the default is the paper's number."""
+    seed: int = 0
+    rig: str = "figure5"
+    """Camera rig by name."""
+    min_cameras: int = 2
+    """Cameras that must see a marker before it exists."""
+    frames_per_hand: int = 128
+    """Poses of one hand before the next person puts on the glove."""
+    slip_along: float = 0.08
+    """How far markers sit from their places along the bones, standard deviation [bone lengths]."""
+    slip_around: float = 10.0
+    """The same around the bones [deg]."""
+    volume: float = 0.3
+    """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
+    population: Population = dataclasses.field(default_factory=lambda: Population(children=0.2))
+    poses: PoseMix = dataclasses.field(default_factory=PoseMix)
+    ghosts: GhostConfig = dataclasses.field(default_factory=GhostConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("num_frames", "min_cameras", "frames_per_hand"):
+            if getattr(self, name) < 1:
+                raise DatasetError(f"{name} is {getattr(self, name)}, wanted at least 1")
+        if self.seed < 0:
+            raise DatasetError(f"seed is {self.seed}, wanted 0 or more")
+
+
+def generate_dataset(
+    config: DatasetConfig, out: Path, *, workers: int | None = None, progress: Progress | None = None
+) -> Manifest:
+    """Make a training set, or finish one that was stopped; the bytes depend on the config alone.
+
+    Args:
+        config: What to make.
+        out: Folder to make it in.
+        workers: Processes; all cores when not given.
+        progress: Told after every shard.
+
+    Raises:
+        DatasetError: `out` holds a set of another config, or a worker died.
+        LayoutError: The glove is unknown or does not fit.
+    """
+    layout, rig = load_layout(config.glove), named_rig(config.rig)
+    if config.min_cameras > len(rig.positions):
+        raise DatasetError(
+            f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
+        )
+    attach(layout, HandModel.named("M"))  # a glove that does not fit is told before anything is written
+    settings = {**dataclasses.asdict(config), "layout": dataclasses.asdict(layout)}
+    _claim(out, settings)
+    shards = range(-(-config.num_frames // ROWS_PER_SHARD))
+    todo = [shard for shard in shards if not _finished(out, shard)]
+    done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
+    for shard in _make_all(config, out, todo, workers or os.cpu_count() or 1):
+        done += _shard_size(config, shard)
+        if progress is not None:
+            progress(done, config.num_frames)
+    names = [name(shard) for shard in shards for name in (rows_name, hands_name)]
+    manifest = Manifest(
+        config=load_json(out / CONFIG),
+        marker_names=layout.names,
+        num_frames=config.num_frames,
+        min_cameras=config.min_cameras,
+        files={name: checksum(out / name) for name in sorted(names)},
+    )
+    save_manifest(out, manifest)
+    return manifest
+
+
+def _claim(out: Path, settings: dict[str, Any]) -> None:
+    """Mark the folder as this config's, or check that it is; clear what a killed run left half-written."""
+    if (out / CONFIG).is_file():
+        found = load_json(out / CONFIG)
+        known = {key: _plain(value) for key, value in settings.items()}
+        if found != known:
+            differing = sorted(key for key in found.keys() | known.keys() if found.get(key) != known.get(key))
+            raise DatasetError(
+                f"{out} was begun with other settings ({', '.join(differing)}); use them or another folder"
+            )
+        for leftover in out.glob(".*.tmp-*"):
+            leftover.unlink(missing_ok=True)
+    else:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise DatasetError(f"{out} is not empty and holds no training set; name another folder")
+        save_json(out / CONFIG, settings)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON makes of a value: tuples become lists."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _finished(out: Path, shard: int) -> bool:
+    return (out / rows_name(shard)).is_file() and (out / hands_name(shard)).is_file()
+
+
+def _shard_size(config: DatasetConfig, shard: int) -> int:
+    return min(ROWS_PER_SHARD, config.num_frames - shard * ROWS_PER_SHARD)
+
+
+def _make_all(config: DatasetConfig, out: Path, todo: list[int], workers: int) -> Iterator[int]:
+    """Make the shards and yield each one's number when it is on disk."""
+    if not todo:
+        return
+    yield make_shard(config, out, todo[0])  # also fills numba's cache before workers ask for it
+    if workers == 1:
+        yield from (make_shard(config, out, shard) for shard in todo[1:])
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, max(1, len(todo) - 1)), mp_context=context) as pool:
+        jobs = [pool.submit(make_shard, config, out, shard) for shard in todo[1:]]
+        try:
+            for job in as_completed(jobs):
+                yield job.result()
+        except BrokenProcessPool as error:
+            raise DatasetError(
+                "a worker died (out of memory?); run the same command again to go on"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:
+    """Write one shard's hands and rows; its number is all that its randomness hangs on besides the seed."""
+    rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(shard,)))
+    layout, rig = load_layout(config.glove), named_rig(config.rig)
+    size = _shard_size(config, shard)
+    rows = np.zeros(size, dtype=row_dtype(layout.num_markers))
+    hands = np.zeros(-(-size // config.frames_per_hand), dtype=HAND_DTYPE)
+    for number in range(len(hands)):
+        block = rows[number * config.frames_per_hand : (number + 1) * config.frames_per_hand]
+        model = sample_hand(config.population, rng=rng)
+        hands[number] = pack_hand(model.shape)
+        block["hand"] = number
+        simulate_frames(block, model, layout, rig, config, rng=rng)
+    save_array(out / hands_name(shard), hands)
+    save_array(out / rows_name(shard), rows)
+    return shard
+
+
+def sample_hand(population: Population, *, rng: np.random.Generator) -> HandModel:
+    """A random person's left or right hand whose fingers have room beside each other."""
+    side = SIDES[int(rng.integers(2))]
+    while True:
+        model = HandModel(sample_shape(population, side=side, rng=rng))
+        try:
+            resting_angles(model)
+        except ShapeError:
+            continue
+        return model
+
+
+def simulate_frames(
+    block: NDArray[np.void],
+    model: HandModel,
+    layout: MarkerLayout,
+    rig: CameraRig,
+    config: DatasetConfig,
+    *,
+    rng: np.random.Generator,
+) -> None:
+    """Fill rows with random poses of one gloved hand and what the rig sees of them."""
+    count = len(block)
+    slipped = vary_places(layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng)
+    attachment = attach(slipped, model)
+    position = np.array([0.0, 0.0, 1.1]) + rng.uniform(-config.volume, config.volume, size=(count, 3))
+    qpos = join_qpos(
+        sample_valid_angles(model, count, config.poses, rng=rng),
+        position=position,
+        quaternion=random_quaternions(count, rng=rng),
+    )
+    bones = model.forward_kinematics(qpos)
+    markers, normals = attachment.markers(model, bones)
+    segments, radii = model.capsules.posed(bones), model.capsules.radii
+    block["qpos"], block["markers"] = qpos, markers
+    block["cameras"] = pack_cameras(visible_cameras(markers, normals, rig, segments, radii))
+    block["ghosts"] = sample_ghosts(
+        markers, rig, segments, radii, config.ghosts, min_cameras=config.min_cameras, rng=rng
+    )
