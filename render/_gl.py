@@ -22,7 +22,9 @@ def load_pyrender() -> Any:
     try:
         import pyrender
     except ModuleNotFoundError as error:
-        raise HandSimError(f"drawing needs pyrender, and {error}; run `pip install pyrender-maintained`") from error
+        raise HandSimError(
+            f"drawing needs pyrender, and {error}; run `pip install pyrender-maintained`"
+        ) from error
     except Exception as error:  # PyOpenGL raises whatever it stumbles over
         raise _no_driver(error) from error
     if pyrender.__version__ == _BROKEN_PYRENDER:

@@ -91,9 +91,8 @@ def with_names(
     shown = np.flatnonzero(np.isfinite(pixels).all(axis=1))
     column = 2 * _PADDING + max((text_width(name) for name in names), default=0)
     width = picture.shape[1]
-    # The outer half on either side: splitting at the median keeps both columns equally long.
-    order = shown[np.argsort(pixels[shown, 0], kind="stable")]
-    left, right = order[: (len(order) + 1) // 2], order[(len(order) + 1) // 2 :]
+    left = shown[pixels[shown, 0] < width / 2]
+    right = shown[pixels[shown, 0] >= width / 2]
     step = round(_TEXT_HEIGHT * _LINE_STEP)
     rows = max(picture.shape[0], step * (max(len(left), len(right)) + 1))
     above = (rows - picture.shape[0]) // 2

@@ -21,7 +21,6 @@ from render.labels import captioned, pad, side_by_side, titled, with_names
 from render.materials import (
     BACKGROUND,
     HIDDEN_COLOR,
-    MARKER_COLOR,
     SEEN_COLOR,
     UNLABELED_COLOR,
     Covering,
@@ -205,7 +204,8 @@ def draw_labels(
     grey = render_rgb(HandScene(view, balls=(Balls(points, radius, UNLABELED_COLOR),)), size)
     double = (2 * size[0], 2 * size[1])
     balls = HandScene(view, balls=(Balls(points[~ghost], radius, palette[labels[~ghost]]),))
-    faint = render_rgb(HandScene(view, (hand,)), double).astype(np.float32)
+    bare = PosedHand(hand.model, hand.qpos, covering=hand.covering)
+    faint = render_rgb(HandScene(view, (bare,)), double).astype(np.float32)
     faint += 0.72 * (255 * np.array(BACKGROUND, dtype=np.float32) - faint)
     drawn = render_depth(balls, double)[..., None] > 0
     large = np.where(drawn, render_rgb(balls, double), np.rint(faint).astype(np.uint8))
