@@ -148,7 +148,7 @@ class Population:
     knuckle_spread: float = 0.001
     """Spread of each knuckle's place [m]."""
     angle_spread: float = 3.0
-    """Spread of each finger's base angles [deg]; twice this for the thumb."""
+    """Spread of each finger's base angles [deg]; three times this for the thumb."""
     girth_spread: float = 0.06
     """Log spread of a digit's girth."""
 
@@ -173,7 +173,7 @@ def sample_shape(
         return scale * np.clip(rng.standard_normal(shape), -2.5, 2.5)
 
     angles = spread(np.deg2rad(population.angle_spread), (len(DIGITS), 3))
-    angles[0] *= 2.0
+    angles[0] *= 3.0
     bones = np.exp(spread(population.digit_spread, (5, 1)) + spread(population.bone_spread, (5, 3)))
     return dataclasses.replace(
         mean,

@@ -22,7 +22,7 @@ from handsim.topology import NUM_BONES, PALM
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-# Share of the outer bone on a digit's rings: (bone of the digit, share) pairs, the rest goes to the bone before.
+# Bone of the digit and its share on each ring past the web; the rest goes to the bone before it.
 _FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))
 # Share of the thumb's metacarpal on the palm's rows around it: (row, place, share).
 _THENAR: Final = (

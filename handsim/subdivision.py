@@ -1,4 +1,4 @@
-"""Catmull-Clark subdivision as one sparse matrix: a fixed quad mesh in, the weights of every new vertex out."""
+"""Catmull-Clark subdivision of a fixed quad mesh as one sparse matrix."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def catmull_clark(
 ) -> tuple[sparse.csr_array, Int[np.ndarray, "Q4 4"]]:
     """One step of Catmull-Clark on a closed quad mesh.
 
-    New vertices are numbered: the old vertices, then one for each row of `edge_table`, then one for each quad.
+    New vertices are the old ones, then one for each row of `edge_table`, then one for each quad.
 
     Returns:
         Matrix (V + E + Q, V) from old positions to new ones, and the 4 Q new quads with the old winding.
@@ -55,7 +55,7 @@ def catmull_clark(
 
 
 def subdivided_loop(
-    loop: Int[np.ndarray, "K"], quads: Int[np.ndarray, "Q 4"], num_vertices: int
+    loop: Int[np.ndarray, " K"], quads: Int[np.ndarray, "Q 4"], num_vertices: int
 ) -> np.ndarray:
     """The 2 K vertices that a closed loop of edges passes through after one `catmull_clark` step."""
     edges, _ = edge_table(quads)

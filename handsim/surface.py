@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from handsim.skin_weights import cage_weights, strongest_weights
-from handsim.skeleton import build_skeleton
 from handsim.subdivision import catmull_clark, subdivided_loop
 from handsim.surface_cage import (
     KNUCKLES,
@@ -18,6 +18,7 @@ from handsim.surface_cage import (
     CageTopology,
     cage_topology,
     cage_vertices,
+    digit_frames,
     dorsal,
     first_scales,
     palmar,
@@ -28,7 +29,6 @@ from handsim.transforms import MIRROR
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
-    from scipy import sparse
 
     from handsim.shape import HandShape
 
@@ -79,13 +79,12 @@ def _template() -> _Template:
     topology = cage_topology()
     quads, count = topology.quads, topology.num_vertices
     loops = [ring for rings in topology.rings for ring in rings] + [topology.palm[KNUCKLES]]
-    subdivide = None
+    subdivide = sparse.eye_array(count, format="csr")
     for _ in range(_LEVELS):
         step, next_quads = catmull_clark(quads, count)
         loops = [subdivided_loop(loop, quads, count) for loop in loops]
-        subdivide = step if subdivide is None else step @ subdivide
+        subdivide = step @ subdivide
         quads, count = next_quads, step.shape[0]
-    assert subdivide is not None
     children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # a quad's four follow one another
     tips = [np.unique(quads[children[pair]]) for pair in topology.tips]
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
@@ -105,25 +104,27 @@ def build_surface(shape: HandShape) -> HandSurface:
     """
     template = _template()
     scales = first_scales()
+    frames = digit_frames(shape)
+    vertices = template.subdivide @ cage_vertices(shape, frames, template.topology, scales)
     for _ in range(_FIT_STEPS):
-        vertices = template.subdivide @ cage_vertices(shape, template.topology, scales)
-        _refit(scales, vertices, shape, template)
-    vertices = template.subdivide @ cage_vertices(shape, template.topology, scales)
+        _refit(scales, vertices, shape, frames, template)
+        vertices = template.subdivide @ cage_vertices(shape, frames, template.topology, scales)
     faces = template.faces
     if shape.side == "left":
         vertices, faces = vertices @ MIRROR, faces[:, ::-1]
     return HandSurface(vertices, faces, template.bone_indices, template.bone_weights)
 
 
-def _refit(scales: CageScales, vertices: np.ndarray, shape: HandShape, template: _Template) -> None:
+def _refit(
+    scales: CageScales, vertices: np.ndarray, shape: HandShape, frames: np.ndarray, template: _Template
+) -> None:
     """Corrects the scales by wanted over measured."""
-    rest = build_skeleton(shape.with_side("right")).rest_transforms()
     for digit in range(len(DIGITS)):
         loops = vertices[template.ring_loops[digit]]
         girths = np.linalg.norm(loops - np.roll(loops, 1, axis=1), axis=-1).sum(axis=1)
         scales.rings[digit][:-1] *= (ring_girths(shape, digit) / girths)[:-1]
         scales.rings[digit][-1] = scales.rings[digit][-2]
-        base, along = rest[1 + 3 * digit, :3, 3], rest[1 + 3 * digit, :3, 0]
+        base, along = frames[digit, :3, 3], frames[digit, :3, 0]
         reach = float(((vertices[template.tips[digit]] - base) @ along).max())
         scales.tips[digit] += shape.bone_lengths[digit].sum() - reach
     palm = template.topology.palm

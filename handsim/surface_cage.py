@@ -10,6 +10,7 @@ x axis: 90 is the back, 270 the pad.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +21,7 @@ from handsim.topology import DIGITS
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
+    from numpy.typing import ArrayLike
 
     from handsim.shape import HandShape
 
@@ -29,7 +31,6 @@ AROUND: Final = 18
 # Rings of a finger past the web, and of the thumb; the last two form the tip.
 FINGER_RINGS: Final = ("before 1", "at 1", "after 1", "before 2", "after 2", "pad", "tip")
 THUMB_RINGS: Final = ("metacarpal", *FINGER_RINGS)
-WEB_PLACE: Final = 0.45  # of the first phalanx, from its joint to the crotch
 
 # Height of the back above, and depth of the palm under, the metacarpals, in palm thicknesses, by column.
 _HEIGHTS: Final = np.array(
@@ -62,6 +63,15 @@ _CARPUS_RISE: Final = 0.42  # the carpus arches over the line from wrist to knuc
 _ARCH: Final = np.array([0.0, 0.0, 0.04, 0.08, 0.08, 0.02])  # and the metacarpals' backs over theirs, by row
 # Finger joints turn nearer to the back than to the pad: how far a section's middle lies below, in radii.
 _PALMWARD: Final = np.array([0.0, -0.14])
+# The web row along the first phalanges; webs slope from the back to the palm, the crotch comes out halfway.
+_WEB_PLACES: Final = np.array(
+    [
+        [0.43, 0.43, 0.31, 0.38, 0.45, 0.43],
+        [0.31, 0.43, 0.31, 0.38, 0.45, 0.38],
+        [0.31, 0.43, 0.31, 0.38, 0.45, 0.38],
+        [0.31, 0.43, 0.43, 0.43, 0.45, 0.38],
+    ]
+)
 
 _RING_ANGLES: Final = np.deg2rad(np.arange(30.0, 360.0, 60.0))
 _ROUND: Final = np.stack([1.03 * np.cos(_RING_ANGLES), 0.97 * np.sin(_RING_ANGLES)], axis=-1)
@@ -110,6 +120,12 @@ def palmar(column: int) -> int:
     return AROUND - 1 - column
 
 
+def _finger_slots(finger: int) -> list[int]:
+    """Places in a palm row of the six vertices around a finger (0 to 3), in a ring's order."""
+    columns = range(2 * finger, 2 * finger + 3)
+    return [dorsal(column) for column in columns] + [palmar(column) for column in reversed(columns)]
+
+
 def cage_topology() -> CageTopology:
     """Vertices and faces of the cage."""
     palm = np.arange(NUM_ROWS * AROUND).reshape(NUM_ROWS, AROUND)
@@ -133,13 +149,11 @@ def cage_topology() -> CageTopology:
     ]
     a, b, c = (palm[row] for row in three)
     bases = [np.array([a[front], a[back], b[back], c[back], c[front], b[front]])]
-    for column in range(0, 8, 2):
-        places = [dorsal(column + i) for i in range(3)] + [palmar(column + i) for i in (2, 1, 0)]
-        bases.append(palm[WEB, places])
+    bases += [palm[WEB, _finger_slots(finger)] for finger in range(4)]
     tips = []
     for base, digit_rings in zip(bases, rings, strict=True):
         loops = [base, *digit_rings]
-        for near, far in zip(loops[:-1], loops[1:], strict=True):
+        for near, far in itertools.pairwise(loops):
             quads += np.stack([near, np.roll(near, -1), np.roll(far, -1), far], axis=-1).tolist()
         tips.append([len(quads), len(quads) + 1])
         quads += loops[-1][[[1, 2, 3, 4], [4, 5, 0, 1]]].tolist()
@@ -150,9 +164,9 @@ def cage_topology() -> CageTopology:
 class CageScales:
     """What the fit to a shape's measures adjusts, so that subdivision does not shrink the hand."""
 
-    rings: list[Float[np.ndarray, "R"]]
+    rings: list[Float[np.ndarray, " R"]]
     """Factor on the radius of each ring of each digit."""
-    tips: Float[np.ndarray, "5"]
+    tips: Float[np.ndarray, " 5"]
     """How far the last ring of each digit is pushed out [m]."""
     breadth: float
     thickness: float
@@ -164,7 +178,7 @@ def first_scales() -> CageScales:
     return CageScales(rings, np.zeros(len(DIGITS)), 1.1, 1.1)
 
 
-def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
+def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
     """Distance of each ring from the digit's first joint, along the straight digit [m]."""
     first, second, third = shape.bone_lengths[digit]
     _, radius_1, radius_2, radius_3 = shape.radii[digit]
@@ -182,7 +196,7 @@ def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
     return np.array([0.5 * first, *places] if digit == 0 else places)
 
 
-def ring_girths(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
+def ring_girths(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
     """Girth of the skin at each ring [m]: a little more at the joints, a little less between them."""
     names = THUMB_RINGS if digit == 0 else FINGER_RINGS
     waist = np.array([_WAISTS.get(name, 1.0) for name in names])
@@ -190,32 +204,32 @@ def ring_girths(shape: HandShape, digit: int) -> Float[np.ndarray, "R"]:
     return girths
 
 
-def radius_at(shape: HandShape, digit: int, places: Float[np.ndarray, "R"]) -> Float[np.ndarray, "R"]:
+def radius_at(shape: HandShape, digit: int, places: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
     """Skin radius [m] at distances along a digit: straight between the shape's four radii."""
     first, second, third = shape.bone_lengths[digit]
     radii = shape.radii[digit]
     knots = [0.0, first, first + second, first + second + third - radii[3]]
-    return np.interp(places, knots, radii)
+    radius: np.ndarray = np.interp(places, knots, radii)
+    return radius
 
 
-class _Frames:
-    """Where things are in the wrist frame: a digit's frame, and points around it."""
-
-    def __init__(self, shape: HandShape) -> None:
-        rest = build_skeleton(shape.with_side("right")).rest_transforms()
-        self.rest = rest[1::3]
-
-    def around(self, digit: int, place: np.ndarray | float, offsets: np.ndarray) -> np.ndarray:
-        """Points at `offsets` (..., 2) (y, z) [m] from the axis, `place` (...) [m] along it."""
-        transform = self.rest[digit]
-        local = np.concatenate([np.broadcast_to(place, offsets.shape[:-1])[..., None], offsets], axis=-1)
-        points: np.ndarray = local @ transform[:3, :3].T + transform[:3, 3]
-        return points
+def digit_frames(shape: HandShape) -> Float[np.ndarray, "5 4 4"]:
+    """`T_wrist_bone` of each digit's first bone on the right hand at zero angles."""
+    return build_skeleton(shape.with_side("right")).rest_transforms()[1::3]
 
 
-def cage_vertices(shape: HandShape, topology: CageTopology, scales: CageScales) -> Float[np.ndarray, "K 3"]:
-    """Cage vertices of a right hand in the wrist frame [m]."""
-    frames = _Frames(shape)
+def _around(frame: Float[np.ndarray, "4 4"], place: ArrayLike, offsets: np.ndarray) -> np.ndarray:
+    """Points at `offsets` (..., 2) (y, z) [m] from a digit's axis, `place` (...) [m] along it."""
+    along = np.broadcast_to(np.asarray(place, dtype=np.float64), offsets.shape[:-1])
+    local = np.concatenate([along[..., None], offsets], axis=-1)
+    points: np.ndarray = local @ frame[:3, :3].T + frame[:3, 3]
+    return points
+
+
+def cage_vertices(
+    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], topology: CageTopology, scales: CageScales
+) -> Float[np.ndarray, "K 3"]:
+    """Cage vertices of a right hand in the wrist frame [m]; `frames` as `digit_frames` gives them."""
     vertices = np.empty((topology.num_vertices, 3))
     vertices[topology.palm] = _palm(shape, frames, scales)
     for digit, rings in enumerate(topology.rings):
@@ -225,12 +239,14 @@ def cage_vertices(shape: HandShape, topology: CageTopology, scales: CageScales) 
         sections[:-2] += _PALMWARD
         sections = sections * (radius_at(shape, digit, places) * scales.rings[digit])[:, None, None]
         places[-1] += scales.tips[digit]
-        vertices[rings] = frames.around(digit, places[:, None], sections)
+        vertices[rings] = _around(frames[digit], places[:, None], sections)
     _shape_thumb_base(shape, frames, vertices, topology)
     return vertices
 
 
-def _palm(shape: HandShape, frames: _Frames, scales: CageScales) -> Float[np.ndarray, "8 18 3"]:
+def _palm(
+    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], scales: CageScales
+) -> Float[np.ndarray, "8 18 3"]:
     rows = np.empty((NUM_ROWS, AROUND, 3))
     wrist = np.zeros((4, 3))
     wrist[:, 1] = _WRIST_COLUMNS * shape.breadth
@@ -252,36 +268,36 @@ def _palm(shape: HandShape, frames: _Frames, scales: CageScales) -> Float[np.nda
     rows[:6, :9], rows[:6, 9:] = columns, columns[:, ::-1]
     rows[:6, :9, 2] += (_HEIGHTS + _ARCH[:, None]) * thickness
     rows[:6, 9:, 2] -= _DEPTHS[:, ::-1] * thickness
-    rows[PAST_KNUCKLES] = _finger_bases(shape, frames, np.full(4, 0.75) * shape.radii[1:, 0], 0.12)
-    rows[WEB] = _finger_bases(shape, frames, WEB_PLACE * shape.bone_lengths[1:, 0], 0.0)
+    past = np.repeat(0.7 * shape.radii[1:, :1], 6, axis=1)
+    rows[PAST_KNUCKLES] = _finger_bases(shape, frames, past, 0.12)
+    rows[WEB] = _finger_bases(shape, frames, _WEB_PLACES * shape.bone_lengths[1:, :1], 0.0)
     return rows
 
 
 def _finger_bases(
-    shape: HandShape, frames: _Frames, places: Float[np.ndarray, "4"], deepen: float
+    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], places: Float[np.ndarray, "4 6"], deepen: float
 ) -> Float[np.ndarray, "18 3"]:
-    """A palm row across the four fingers, `places` [m] past their first joints; neighbours share their sides."""
+    """A palm row across the fingers, `places` [m] past their first joints; neighbours share their sides."""
     row = np.zeros((AROUND, 3))
     shared = np.zeros(AROUND)
     for finger, place in enumerate(places):
-        digit, column = finger + 1, 2 * finger
-        radius = 1.2 * radius_at(shape, digit, places[finger : finger + 1])
-        section = (_ROUND + _PALMWARD) * radius
-        section[3:, 1] -= deepen * radius
-        slots = [dorsal(column + i) for i in range(3)] + [palmar(column + i) for i in (2, 1, 0)]
-        row[slots] += frames.around(digit, place, section)
+        digit, slots = finger + 1, _finger_slots(finger)
+        radius = 1.2 * radius_at(shape, digit, place)
+        section = (_ROUND + _PALMWARD) * radius[:, None]
+        section[3:, 1] -= deepen * radius[3:]
+        row[slots] += _around(frames[digit], place, section)
         shared[slots] += 1.0
     return row / shared[:, None]
 
 
 def _shape_thumb_base(
-    shape: HandShape, frames: _Frames, vertices: np.ndarray, topology: CageTopology
+    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], vertices: np.ndarray, topology: CageTopology
 ) -> None:
     """Thenar muscle and first web: the palm's rows around the thumb's metacarpal, in the thumb's frame."""
     length, radius = shape.bone_lengths[0, 0], shape.radii[0, 0]
 
     def at(along: float, y: float, z: float) -> np.ndarray:
-        return frames.around(0, along * length, radius * np.array([y, z]))
+        return _around(frames[0], along * length, radius * np.array([y, z]))
 
     def move(row: int, place: int, target: np.ndarray, share: float) -> None:
         vertex = topology.palm[row, place]
@@ -289,17 +305,17 @@ def _shape_thumb_base(
 
     move(CARPUS, dorsal(0), at(-0.1, -0.9, 0.9), 0.5)
     move(CARPUS, palmar(0), at(-0.03, 1.18, 0.47), 0.8)
-    move(CARPUS, palmar(1), at(-0.02, 1.57, -0.29), 0.7)
+    move(CARPUS, palmar(1), at(-0.02, 1.68, -0.35), 0.75)
     move(CARPUS, palmar(2), at(-0.11, 1.57, -1.36), 0.5)
     move(THENAR, dorsal(0), at(0.25, -1.2, 0.5), 0.5)
-    move(THENAR, palmar(0), at(0.48, 1.33, -0.55), 0.9)
-    move(THENAR, palmar(1), at(0.48, 0.75, -1.35), 0.9)
+    move(THENAR, palmar(0), at(0.48, 1.08, -0.78), 0.9)
+    move(THENAR, palmar(1), at(0.50, 0.50, -1.32), 0.9)
     move(THENAR, palmar(2), at(0.41, 0.77, -1.94), 0.7)
     move(THENAR, palmar(3), at(0.29, 0.59, -2.77), 0.4)
-    move(METACARPUS, palmar(0), at(0.66, -0.50, -1.20), 0.9)
+    move(METACARPUS, palmar(0), at(0.65, -0.25, -1.20), 0.9)
     move(METACARPUS, palmar(1), at(0.68, -0.55, -1.75), 0.8)
     move(METACARPUS, palmar(2), at(0.69, -0.17, -2.31), 0.4)
     ring = topology.rings[0][0]
-    section = np.array([[1.1, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.05, -0.9], [1.12, -0.5]])
+    section = np.array([[1.02, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.2, -1.0], [0.95, -0.62]])
     along = np.array([0.55, 0.5, 0.55, 0.72, 0.77, 0.67]) * length
-    vertices[ring] = frames.around(0, along, 1.12 * radius * section)
+    vertices[ring] = _around(frames[0], along, 1.12 * radius * section)

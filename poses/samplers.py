@@ -20,12 +20,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
-_ABDUCTION_NOISE: Final = np.deg2rad(3.0)
+_ABDUCTION_NOISE: Final = np.deg2rad(2.0)
 _SWAY: Final = np.deg2rad(3.0)  # all fingers to one side
 _SPLIT: Final = np.array(
     [0.3, 0.2, 0.25]
 )  # how often the fingers part: index-middle, middle-ring, ring-little
-_ALIKE: Final = 0.98
+_ALIKE: Final = 0.993
+_SLOPE: Final = 0.15 * np.array(
+    [-1.5, -0.5, 0.5, 1.5]
+)  # from index to little, standard deviation in the latent
 _DIP_SHARE: Final = 0.68
 _DIP_LAG: Final = np.deg2rad(6.0)
 _DIP_NOISE: Final = np.deg2rad(9.0)
@@ -72,7 +75,7 @@ def _blend_gestures(count: int, rng: np.random.Generator) -> NDArray[np.float64]
 
 
 def _tremble(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    noise = rng.standard_normal((count, 5, 4)) * _FLEXION_NOISE
+    noise = np.stack([_shared_normals(count, rng, digits=5) for _ in range(4)], axis=2) * _FLEXION_NOISE
     noise[..., 0] *= _ABDUCTION_NOISE / _FLEXION_NOISE
     return noise.reshape(count, 20)
 
@@ -84,12 +87,20 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     splits = rng.random((count, 3)) < _SPLIT
     knuckles = _grouped(splits, rng.standard_normal((count, 4)))
     middles = within * knuckles + np.sqrt(1 - within**2) * _grouped(splits, rng.standard_normal((count, 4)))
+    knuckles += _SLOPE * rng.standard_normal((count, 1))
+    middles += _SLOPE * rng.standard_normal((count, 1))
     digits[:, 1:, 1] = _MCP_OPEN + (_MCP_CLOSED - _MCP_OPEN) * ndtr(1.15 * knuckles)
     digits[:, 1:, 2] = _PIP_OPEN + (_PIP_CLOSED - _PIP_OPEN) * ndtr(1.3 * middles)
-    digits[:, 1:, 3] = _DIP_SHARE * digits[:, 1:, 2] - _DIP_LAG + _DIP_NOISE * rng.standard_normal((count, 4))
+    digits[:, 1:, 3] = _DIP_SHARE * digits[:, 1:, 2] - _DIP_LAG + _DIP_NOISE * _shared_normals(count, rng)
     fan, sway = rng.standard_normal((2, count, 1))
     digits[:, 1:, 0] = fan * _SPREAD + sway * _SWAY + _ABDUCTION_NOISE * rng.standard_normal((count, 4))
     return angles
+
+
+def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) -> NDArray[np.float64]:
+    """Standard normals (T, digits) that are mostly the same for all digits of a pose."""
+    common, own = rng.standard_normal((count, 1)), rng.standard_normal((count, digits))
+    return np.sqrt(0.75) * common + np.sqrt(0.25) * own
 
 
 def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
+from handsim.topology import JOINTS
 from poses.couplings import HIGH, LOW
 from poses.library import gesture
 from poses.samplers import DEFAULT_MIX, PoseMix, sample_angles
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a pose that counts as valid: what skin gives way."""
 _HALVINGS: Final = 4
+_THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
+_ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
 _FAN: Final = np.deg2rad([1.0, 0.2, -0.6, -1.4])
 
 
@@ -50,19 +53,32 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
 def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
     """Poses [rad] moved towards rest just until they are valid; valid ones stay as they are.
 
-    The way back is halved a few times, so that a fist that was too tight ends as a fist whose fingers
-    touch. What is still invalid at the last halving takes the resting pose.
+    What is in the way gives way first: the thumb alone, then thumb and abductions, and only where that is not
+    enough the whole hand opens. The way back is halved a few times, so that a fist that was too tight ends as
+    a fist whose fingers touch.
     """
     resting = resting_angles(model)
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))
-    low, high = np.zeros(len(todo)), np.ones(len(todo))  # share of the wanted pose: valid, invalid
+    for moving in (_THUMB, _THUMB | _ABDUCTIONS, np.ones_like(_THUMB)):
+        wanted = result[todo]
+        end = np.where(moving, resting, wanted)
+        helps = is_valid(model, end)
+        result[todo[helps]] = _nearest_valid(model, end[helps], wanted[helps])
+        todo = todo[~helps]
+    return result
+
+
+def _nearest_valid(
+    model: HandModel, valid_end: NDArray[np.float64], wanted: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """The last valid poses found by halving the ways from valid ends to wanted poses."""
+    low, high = np.zeros(len(wanted)), np.ones(len(wanted))  # share of the wanted pose: valid, invalid
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        valid = is_valid(model, resting + middle[:, None] * (result[todo] - resting))
+        valid = is_valid(model, valid_end + middle[:, None] * (wanted - valid_end))
         low, high = np.where(valid, middle, low), np.where(valid, high, middle)
-    result[todo] = resting + low[:, None] * (result[todo] - resting)
-    return result
+    return valid_end + low[:, None] * (wanted - valid_end)
 
 
 def sample_valid_angles(

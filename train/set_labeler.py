@@ -23,9 +23,9 @@ class SetLabelerConfig:
     """Size of the network."""
 
     num_labels: int = 19
-    width: int = 96
+    width: int = 64
     """Channels of a point."""
-    gates: int = 24
+    gates: int = 16
     """Message channels share a gate in groups: this many groups."""
     depth: int = 5
     """Rounds of messages."""

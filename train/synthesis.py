@@ -64,7 +64,7 @@ class DatasetConfig:
     """Cameras that must see a marker before it exists."""
     frames_per_hand: int = 128
     """Poses of one hand before the next person puts on the glove."""
-    slip_along: float = 0.08
+    slip_along: float = 0.1
     """How far markers sit from their places along the bones, standard deviation [bone lengths]."""
     slip_around: float = 10.0
     """The same around the bones [deg]."""
