@@ -11,7 +11,8 @@ from typing import Final
 from handsim.io import atomic_write
 
 _STYLE: Final = """
-:root { color-scheme: light dark; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --card: #f4f5f7; --line: #d9dde3; }
+:root { color-scheme: light dark; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --card: #f4f5f7;
+  --line: #d9dde3; }
 @media (prefers-color-scheme: dark) {
   :root { --ink: #e6e8ec; --soft: #a3abb8; --paper: #16181c; --card: #f4f5f7; --line: #3a3f48; }
 }
@@ -20,7 +21,8 @@ body { margin: 0 auto; padding: 2rem 1.2rem 4rem; max-width: 70rem; background: 
 h1 { font-size: 1.9rem; margin: 0 0 .2rem; } h2 { font-size: 1.3rem; margin: 2.6rem 0 .4rem; }
 p { max-width: 46rem; margin: .4rem 0 1rem; } .lead, figcaption, .note { color: var(--soft); }
 figure { margin: 1rem 0 1.6rem; }
-figure a { display: block; background: var(--card); border: 1px solid var(--line); border-radius: .6rem; padding: .6rem; }
+figure a { display: block; background: var(--card); border: 1px solid var(--line); border-radius: .6rem;
+  padding: .6rem; }
 img { display: block; max-width: 100%; max-height: 44rem; margin: 0 auto; }
 figcaption, .note { font-size: .92rem; margin-top: .4rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }

@@ -28,7 +28,7 @@ def hand(
     """Write a hand as a MuJoCo model, and its skin as a mesh.
 
     Args:
-        out: The model, a .xml file: free joint, twenty hinges, one capsule a bone; metres, radians, kilograms.
+        out: The model, a .xml file: free joint, twenty hinges, capsules; metres, radians, kilograms.
         size: Size of the hand.
         side: Which hand.
         mesh: File for the skin in the flat pose, .glb, .obj, .ply or .stl; in metres, in the wrist's frame.

@@ -91,6 +91,7 @@ def with_names(
     shown = np.flatnonzero(np.isfinite(pixels).all(axis=1))
     column = 2 * _PADDING + max((text_width(name) for name in names), default=0)
     width = picture.shape[1]
+    shown = shown[np.argsort(pixels[shown, 1], kind="stable")]
     left = shown[pixels[shown, 0] < width / 2]
     right = shown[pixels[shown, 0] >= width / 2]
     step = round(_TEXT_HEIGHT * _LINE_STEP)
@@ -98,8 +99,7 @@ def with_names(
     above = (rows - picture.shape[0]) // 2
     result = pad(picture, (above, rows - picture.shape[0] - above), (column, column))
     shift = np.array([column, above])
-    for side, marks in (("left", left), ("right", right)):
-        marks = marks[np.argsort(pixels[marks, 1], kind="stable")]
+    for side, marks in (("left", left), ("right", right)):  # from top to bottom, or the lines would cross
         heights = spread_out(pixels[marks, 1] + above, step, _TEXT_HEIGHT, rows - _TEXT_HEIGHT)
         for mark, height in zip(marks, heights, strict=True):
             ink = _INK if colors is None else tuple(int(level) for level in np.rint(255 * colors[mark]))

@@ -45,12 +45,12 @@ def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) ->
 
 
 def covering_material(covering: Covering) -> Any:
-    """pyrender material of bare skin or of a dark glove."""
+    """Material of bare skin or of a dark glove."""
     return _material(_BASE[covering], _ROUGHNESS[covering])
 
 
 def ball_material() -> Any:
-    """pyrender material of markers, to be coloured by vertex; it glows a little, so that no shadow swallows it."""
+    """Material of markers, coloured by vertex; it glows a little, so that no shadow swallows it."""
     return _material((1.0, 1.0, 1.0), 0.45, glow=0.2)
 
 
@@ -65,7 +65,7 @@ def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
         mine = (surface.bone_weights * (surface.bone_indices == last)).sum(axis=1)
         reddening += mine * np.clip(share, 0.0, 1.0)
     pale = np.clip(-surface.vertex_normals()[:, 2], 0.0, 1.0)[:, None]
-    tint = 1.0 + pale * np.array([0.10, 0.06, 0.06]) - reddening[:, None] * np.array([0.0, 0.16, 0.13])
+    tint: NDArray[np.float64] = 1.0 + pale * np.array([0.10, 0.06, 0.06]) - reddening[:, None] * np.array([0.0, 0.16, 0.13])
     return tint
 
 

@@ -25,14 +25,16 @@ def render_rgb(scene: HandScene, size: tuple[int, int]) -> UInt8[np.ndarray, "H 
         HandSimError: Drawing is impossible on this machine; the sentence says what to install.
     """
     renderer = offscreen_renderer(*size)
-    flags = load_pyrender().RenderFlags.SHADOWS_DIRECTIONAL
-    color, _ = renderer.render(build_scene(scene), flags=flags)
+    built = build_scene(scene)
+    flags = load_pyrender().RenderFlags
+    # pyrender fails over the shadows of nothing
+    color, _ = renderer.render(built, flags=flags.SHADOWS_DIRECTIONAL if built.mesh_nodes else flags.NONE)
     picture: NDArray[np.uint8] = np.array(color[..., :3])
     return picture
 
 
 def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
-    """Depth picture: distance along the camera's axis [m], 0 where there is nothing.
+    """Depth picture: distance along the camera's axis [m] at each pixel's centre, 0 where there is nothing.
 
     Args:
         scene: What to draw.
@@ -42,7 +44,11 @@ def render_depth(scene: HandScene, size: tuple[int, int]) -> Float32[np.ndarray,
         HandSimError: Drawing is impossible on this machine; the sentence says what to install.
     """
     renderer = offscreen_renderer(*size)
-    depth = renderer.render(build_scene(scene), flags=load_pyrender().RenderFlags.DEPTH_ONLY)
+    built = build_scene(scene)
+    # Of all of pyrender's passes only this one takes a pixel's centre; the others take some sample off it.
+    everything = dict.fromkeys(built.mesh_nodes, (255, 255, 255))
+    flags = load_pyrender().RenderFlags.SEG
+    _, depth = renderer.render(built, flags=flags, seg_node_map=everything)
     picture: NDArray[np.float32] = np.asarray(depth, dtype=np.float32)
     return picture
 

@@ -221,7 +221,7 @@ def draw_labels(
 
 
 def marker_colors(layout: MarkerLayout) -> Float[np.ndarray, "M 3"]:
-    """sRGB colour of each marker's digit."""
+    """Colour (sRGB) of each marker's digit."""
     bones = [BONE_NAMES.index(marker.bone) for marker in layout.markers]
     colors: NDArray[np.float64] = bone_colors()[bones]
     return colors

@@ -62,7 +62,7 @@ class View:
     def project(
         self, points: Float[np.ndarray, "*batch 3"], size: tuple[int, int]
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels (x right, y down, the first pixel's centre at 0.5) of world points, in a picture (width, height)."""
+        """Pixels of world points in a picture (width, height): x right, y down, first pixel's centre at 0.5."""
         rotation, centre = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         local = (points - centre) @ rotation
         focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
@@ -97,7 +97,10 @@ class PosedHand:
     """sRGB in [0, 1], one for all markers or one each."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "qpos", check_array("qpos", self.qpos, (NUM_QPOS,)))
+        qpos = check_array("qpos", self.qpos, (NUM_QPOS,))
+        if qpos.ndim != 1:
+            raise HandSimError(f"qpos has shape {qpos.shape}, wanted ({NUM_QPOS},): one pose a hand")
+        object.__setattr__(self, "qpos", qpos)
 
     def vertices(self) -> Float[np.ndarray, "V 3"]:
         """Skin in the world [m]."""
@@ -108,7 +111,9 @@ class PosedHand:
         """Marker centres in the world [m]; none without a glove."""
         if self.attachment is None:
             return np.empty((0, 3))
-        return self.attachment.markers(self.model, self.model.forward_kinematics(self.qpos[None]))[0][0]
+        transforms = self.model.forward_kinematics(self.qpos[None])
+        markers: NDArray[np.float64] = self.attachment.markers(self.model, transforms)[0][0]
+        return markers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,9 +189,10 @@ def _add_lights(pyrender: Any, built: Any, view: View) -> None:
     pose = np.eye(4)
     pose[:3, :3] = _frame_with_z(rotation @ np.array(_KEY))
     key = pyrender.DirectionalLight(intensity=_KEY_INTENSITY)
-    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin: more depth, more bias.
+    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; more depth, more bias.
     # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
-    key._get_shadow_camera = lambda diagonal: pyrender.OrthographicCamera(
+    diagonal = max(float(built.scale), 1e-3)  # an empty scene has none
+    key._get_shadow_camera = lambda _: pyrender.OrthographicCamera(
         xmag=0.52 * diagonal, ymag=0.52 * diagonal, znear=0.3 * diagonal, zfar=_SHADOW_DEPTH * diagonal
     )
     built.add(key, pose=pose)
