@@ -20,7 +20,7 @@ from handsim.errors import HandSimError, choices
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "demo": ("handsim.demo:demo", "Run the whole chain on a built-in example; ends with a page of pictures."),
     "hand": ("handsim.commands:hand", "Write a hand as a MuJoCo model, and its skin as a mesh."),
-    "glove": ("gloves.commands:COMMANDS", "List, show, start and check marker layouts."),
+    "glove": ("render.commands:GLOVE", "List, show, start and check marker layouts."),
     "generate": ("train.commands:generate", "Make a training set; goes on where it was stopped."),
     "train": ("train.commands:train", "Train a labeler on a training set; goes on where it was stopped."),
     "label": ("train.commands:label", "Label every frame of a marker capture."),
@@ -113,15 +113,18 @@ def _call(target: str, *, prog: str, help_line: str, args: Sequence[str]) -> int
     """Load "module:name", hand it the arguments through tyro, and return its exit code."""
     import tyro
 
-    module, _, attribute = target.partition(":")
-    command: Callable[..., Any] | dict[str, Callable[..., Any]] = getattr(
-        importlib.import_module(module), attribute
-    )
+    command: Callable[..., Any] | dict[str, Callable[..., Any]] = load(target)
     if isinstance(command, dict):
         result = tyro.extras.subcommand_cli_from_dict(command, prog=prog, description=help_line, args=args)
     else:
         result = tyro.cli(command, prog=prog, args=args)
     return result if isinstance(result, int) else 0
+
+
+def load(target: str) -> Any:
+    """What "module:name" stands for, imported now and not before."""
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 def _print_overview(commands: Mapping[str, tuple[str, str]]) -> None:

@@ -1,0 +1,79 @@
+"""What surfaces look like: skin, glove and markers. Colours are sRGB in [0, 1]."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from handsim.model import HandModel
+from handsim.topology import BONES, DIGITS
+from render._gl import load_pyrender
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+Covering = Literal["skin", "glove"]
+BACKGROUND: Final = (0.957, 0.961, 0.969)
+MARKER_COLOR: Final = (0.98, 0.98, 1.0)
+SEEN_COLOR: Final = (0.13, 0.72, 0.33)
+HIDDEN_COLOR: Final = (0.89, 0.2, 0.2)
+UNLABELED_COLOR: Final = (0.5, 0.52, 0.56)
+_DIGIT_COLORS: Final = (
+    (0.85, 0.33, 0.1),
+    (0.93, 0.66, 0.08),
+    (0.15, 0.62, 0.35),
+    (0.1, 0.47, 0.82),
+    (0.56, 0.27, 0.68),
+)
+_PALM_COLOR: Final = (0.32, 0.36, 0.42)
+_BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": (0.235, 0.25, 0.29)}
+_ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
+
+
+def bone_colors() -> Float[np.ndarray, "L 3"]:
+    """One colour a digit, and one for the palm, in the order of `topology.BONES`."""
+    colors = [_PALM_COLOR if bone.digit < 0 else _DIGIT_COLORS[bone.digit] for bone in BONES]
+    return np.array(colors)
+
+
+def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) -> NDArray[np.float64]:
+    """Linear light of an sRGB colour, with the plain 2.2 power that pyrender's shader undoes."""
+    light: NDArray[np.float64] = np.asarray(color, dtype=np.float64) ** 2.2
+    return light
+
+
+def covering_material(covering: Covering) -> Any:
+    """Material of bare skin or of a dark glove."""
+    return _material(_BASE[covering], _ROUGHNESS[covering])
+
+
+def ball_material() -> Any:
+    """Material of markers, coloured by vertex; it glows a little, so that no shadow swallows it."""
+    return _material((1.0, 1.0, 1.0), 0.45, glow=0.2)
+
+
+def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
+    """Factors on the skin's colour: redder towards the finger tips, paler on the palm's side."""
+    surface = model.surface
+    reddening = np.zeros(len(surface.vertices))
+    for digit in range(len(DIGITS)):
+        last = 3 + 3 * digit
+        origin, along = model.rest_transforms[last, :3, 3], model.rest_transforms[last, :3, 0]
+        share = ((surface.vertices - origin) @ along) / model.skeleton.lengths[last]
+        mine = (surface.bone_weights * (surface.bone_indices == last)).sum(axis=1)
+        reddening += mine * np.clip(share, 0.0, 1.0)
+    pale = np.clip(-surface.vertex_normals()[:, 2], 0.0, 1.0)[:, None]
+    tint: NDArray[np.float64] = 1.0 + pale * np.array([0.10, 0.06, 0.06]) - reddening[:, None] * np.array([0.0, 0.16, 0.13])
+    return tint
+
+
+def _material(color: tuple[float, float, float], roughness: float, *, glow: float = 0.0) -> Any:
+    base = linear(color)
+    return load_pyrender().MetallicRoughnessMaterial(
+        baseColorFactor=[*base, 1.0],
+        metallicFactor=0.0,
+        roughnessFactor=roughness,
+        emissiveFactor=np.sqrt(glow * base),  # the shader squares it
+    )

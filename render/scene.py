@@ -1,0 +1,268 @@
+"""What is in a picture: posed hands, markers, free points, and the camera that looks at them."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import trimesh
+
+from gloves.attach import Attachment
+from handsim._checks import check_array
+from handsim.errors import HandSimError
+from handsim.model import HandModel
+from handsim.topology import NUM_QPOS
+from render._gl import load_pyrender
+from render.materials import (
+    BACKGROUND,
+    MARKER_COLOR,
+    Covering,
+    ball_material,
+    covering_material,
+    linear,
+    skin_tint,
+)
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
+_NEAR, _FAR = 0.01, 20.0  # [m]
+# Where the light comes from, in camera axes (x right, y down, z ahead), and how strong it is.
+_KEY: Final = (-0.45, -0.7, -1.0)
+_KEY_INTENSITY: Final = 2.9
+_LAMPS: Final = (((0.85, -0.1, -0.5), 1.3), ((0.15, -0.85, 0.5), 1.2))  # fill, rim
+_LAMP_DISTANCE: Final = 30.0  # [m], so far that its rays are as good as parallel
+_SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
+_AMBIENT: Final = 0.16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera: its pose and how wide it sees.
+
+    Raises:
+        HandSimError: The pose is not (4, 4), or the angle is no camera's.
+    """
+
+    T_world_camera: Float[np.ndarray, "4 4"]
+    """Pose in the world [m], OpenCV axes: x right, y down, z into the picture."""
+    field_of_view: float
+    """Full vertical opening angle [rad]."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
+        if not 0.0 < self.field_of_view < np.pi:
+            raise HandSimError(f"field_of_view is {self.field_of_view:g}, wanted radians between 0 and pi")
+
+    def project(
+        self, points: Float[np.ndarray, "*batch 3"], size: tuple[int, int]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of world points in a picture (width, height): x right, y down, first pixel's centre at 0.5."""
+        rotation, centre = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        local = (points - centre) @ rotation
+        focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
+        pixels: NDArray[np.float64] = focal * local[..., :2] / local[..., 2:] + np.array(size) / 2
+        return pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Balls:
+    """Spheres of one radius, such as markers or the points that an optical system sees."""
+
+    centers: Float[np.ndarray, "N 3"]
+    """Centres in the world [m]; NaN rows are not drawn."""
+    radius: float
+    """Radius [m]."""
+    colors: Float[np.ndarray, "N 3"] | tuple[float, float, float] = MARKER_COLOR
+    """sRGB in [0, 1], one for all or one each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedHand:
+    """A hand in a pose, with or without a glove's markers."""
+
+    model: HandModel
+    qpos: Float[np.ndarray, "27"]
+    """Wrist position [m], wrist orientation (wxyz), hinge angles [rad]."""
+    attachment: Attachment | None = None
+    """The glove whose markers are drawn."""
+    covering: Covering = "skin"
+    """Bare skin or a dark glove."""
+    marker_colors: Float[np.ndarray, "M 3"] | tuple[float, float, float] = MARKER_COLOR
+    """sRGB in [0, 1], one for all markers or one each."""
+
+    def __post_init__(self) -> None:
+        qpos = check_array("qpos", self.qpos, (NUM_QPOS,))
+        if qpos.ndim != 1:
+            raise HandSimError(f"qpos has shape {qpos.shape}, wanted ({NUM_QPOS},): one pose a hand")
+        object.__setattr__(self, "qpos", qpos)
+
+    def vertices(self) -> Float[np.ndarray, "V 3"]:
+        """Skin in the world [m]."""
+        vertices: NDArray[np.float64] = self.model.skin(self.qpos[None])[0]
+        return vertices
+
+    def markers(self) -> Float[np.ndarray, "M 3"]:
+        """Marker centres in the world [m]; none without a glove."""
+        if self.attachment is None:
+            return np.empty((0, 3))
+        transforms = self.model.forward_kinematics(self.qpos[None])
+        markers: NDArray[np.float64] = self.attachment.markers(self.model, transforms)[0][0]
+        return markers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandScene:
+    """All that one picture shows."""
+
+    view: View
+    hands: tuple[PosedHand, ...] = ()
+    balls: tuple[Balls, ...] = ()
+    background: tuple[float, float, float] = BACKGROUND
+    """sRGB in [0, 1]."""
+
+
+def view_along(
+    direction: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"],
+    points: Float[np.ndarray, "N 3"],
+    size: tuple[int, int],
+    *,
+    field_of_view: float = np.deg2rad(24.0),
+    margin: float = 0.06,
+) -> View:
+    """The nearest view in a given direction that has all points in the picture.
+
+    Args:
+        direction: Where the camera looks, in the world.
+        up: What shall point up in the picture.
+        points: What must be seen [m].
+        size: Width and height of the picture [pixels].
+        field_of_view: Full vertical opening angle [rad].
+        margin: Room left free on each side [share of the picture].
+    """
+    ahead = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    local = points @ rotation
+    slope = np.tan(field_of_view / 2) * (1 - 2 * margin) * np.array([size[0] / size[1], 1.0])
+    # A point is inside when |x - x0| <= slope (z + distance), two linear limits; so is y.
+    above = (local[:, :2] - slope * local[:, 2:]).max(axis=0)
+    below = (-local[:, :2] - slope * local[:, 2:]).max(axis=0)
+    distance = ((above + below) / (2 * slope)).max()
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
+    return View(pose, field_of_view)
+
+
+def build_scene(scene: HandScene) -> Any:
+    """The pyrender scene: meshes with smooth normals, three lights that go with the camera, the camera.
+
+    Raises:
+        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+    """
+    pyrender = load_pyrender()
+    built = pyrender.Scene(bg_color=[*scene.background, 1.0], ambient_light=[_AMBIENT] * 3)
+    for hand in scene.hands:
+        built.add(_hand_mesh(pyrender, hand))
+        if hand.attachment is not None:
+            radius = hand.attachment.layout.radius
+            _add_balls(pyrender, built, Balls(hand.markers(), radius, hand.marker_colors))
+    for balls in scene.balls:
+        _add_balls(pyrender, built, balls)
+    camera = pyrender.PerspectiveCamera(yfov=scene.view.field_of_view, znear=_NEAR, zfar=_FAR)
+    built.add(camera, pose=scene.view.T_world_camera @ OPENGL_FROM_OPENCV)
+    _add_lights(pyrender, built, scene.view)
+    return built
+
+
+def _add_lights(pyrender: Any, built: Any, view: View) -> None:
+    """A key light that casts shadows, and two far lamps that cast none: grazing shadows look like dirt."""
+    rotation = view.T_world_camera[:3, :3]
+    pose = np.eye(4)
+    pose[:3, :3] = _frame_with_z(rotation @ np.array(_KEY))
+    key = pyrender.DirectionalLight(intensity=_KEY_INTENSITY)
+    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; more depth, more bias.
+    # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
+    diagonal = max(float(built.scale), 1e-3)  # an empty scene has none
+    key._get_shadow_camera = lambda _: pyrender.OrthographicCamera(
+        xmag=0.52 * diagonal, ymag=0.52 * diagonal, znear=0.3 * diagonal, zfar=_SHADOW_DEPTH * diagonal
+    )
+    built.add(key, pose=pose)
+    for place, intensity in _LAMPS:
+        lamp = np.eye(4)
+        lamp[:3, 3] = view.T_world_camera[:3, 3] + rotation @ np.array(place) * _LAMP_DISTANCE
+        built.add(pyrender.PointLight(intensity=intensity * _LAMP_DISTANCE**2), pose=lamp)
+
+
+def _hand_mesh(pyrender: Any, hand: PosedHand) -> Any:
+    vertices, faces = hand.vertices(), hand.model.surface.faces
+    colors = np.ones((len(vertices), 4))
+    if hand.covering == "skin":
+        colors[:, :3] = skin_tint(hand.model)
+    return _mesh(pyrender, vertices, faces, colors, covering_material(hand.covering))
+
+
+def _add_balls(pyrender: Any, built: Any, balls: Balls) -> None:
+    """One mesh for all balls, told apart by vertex colours: a mesh a ball would cost a draw call each."""
+    known = np.isfinite(balls.centers).all(axis=-1)
+    centers = balls.centers[known]
+    if not len(centers):
+        return
+    template = _unit_ball()
+    each = len(template.vertices)
+    vertices = (centers[:, None] + balls.radius * template.vertices).reshape(-1, 3)
+    faces = (template.faces + each * np.arange(len(centers))[:, None, None]).reshape(-1, 3)
+    colors = np.ones((len(vertices), 4))
+    tint = linear(np.broadcast_to(np.asarray(balls.colors, dtype=np.float64), balls.centers.shape)[known])
+    colors[:, :3] = np.repeat(tint, each, axis=0)
+    built.add(_mesh(pyrender, vertices, faces, colors, ball_material()))
+
+
+def _mesh(
+    pyrender: Any,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    colors: NDArray[np.float64],
+    material: Any,
+) -> Any:
+    primitive = pyrender.Primitive(
+        positions=vertices,
+        normals=vertex_normals(vertices, faces),
+        indices=faces,
+        color_0=colors,
+        material=material,
+    )
+    return pyrender.Mesh(primitives=[primitive])
+
+
+@functools.cache
+def _unit_ball() -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=3)
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Outward unit normals, each the area-weighted mean of the faces around its vertex."""
+    corners = vertices[faces]
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = [np.bincount(faces.ravel(), np.repeat(crosses[:, axis], 3), len(vertices)) for axis in range(3)]
+    normals = np.stack(sums, axis=1)
+    unit: NDArray[np.float64] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return unit
+
+
+def _frame_with_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Any rotation whose z axis is `direction`."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
