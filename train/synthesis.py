@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gloves.attach import attach, vary_places
+from gloves.attach import Attachment, attach, vary_places
 from gloves.ghosts import GhostConfig, sample_ghosts
 from gloves.layout import MarkerLayout, load_layout
 from gloves.visibility import pack_cameras, visible_cameras
 from handsim.cameras import CameraRig, named_rig
-from handsim.errors import DatasetError, ShapeError
+from handsim.errors import DatasetError, LayoutError, ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.shape import Population, sample_shape
 from handsim.topology import SIDES, Side
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROWS_PER_SHARD: Final = 8192
+_MOST_FITTINGS: Final = 20
 Progress = Callable[[int, int], None]
 """Called with frames done and frames wanted."""
 
@@ -209,6 +210,23 @@ def sample_hand(population: Population, *, rng: np.random.Generator) -> HandMode
         return model
 
 
+def wear(
+    layout: MarkerLayout, model: HandModel, config: DatasetConfig, *, rng: np.random.Generator
+) -> Attachment:
+    """The glove put on with its markers slipped a little, drawn again while one has slipped off the hand.
+
+    Raises:
+        LayoutError: A marker finds no skin however it slips.
+    """
+    for _ in range(_MOST_FITTINGS):
+        slipped = vary_places(layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng)
+        try:
+            return attach(slipped, model)
+        except LayoutError:
+            continue
+    return attach(layout, model)
+
+
 def simulate_frames(
     block: NDArray[np.void],
     model: HandModel,
@@ -220,8 +238,7 @@ def simulate_frames(
 ) -> None:
     """Fill rows with random poses of one gloved hand and what the rig sees of them."""
     count = len(block)
-    slipped = vary_places(layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng)
-    attachment = attach(slipped, model)
+    attachment = wear(layout, model, config, rng=rng)
     position = np.array([0.0, 0.0, 1.1]) + rng.uniform(-config.volume, config.volume, size=(count, 3))
     qpos = join_qpos(
         sample_valid_angles(model, count, config.poses, rng=rng),
