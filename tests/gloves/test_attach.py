@@ -1,0 +1,75 @@
+"""Gloves on hands: on the skin, carried by bones, mirrored with the hand."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from gloves.attach import attach, vary_places
+from gloves.layout import load_layout
+from handsim.errors import LayoutError
+from handsim.mjcf import build_spec
+from handsim.model import HandModel, join_qpos
+from handsim.shape import EVERYBODY, sample_shape
+from handsim.transforms import MIRROR
+
+
+@pytest.mark.parametrize("glove", ["dense19", "sparse13"])
+def test_markers_sit_one_radius_above_the_skin(glove, rng):
+    model = HandModel(sample_shape(EVERYBODY, rng=rng))
+    layout = load_layout(glove)
+    attachment = attach(layout, model)
+    skin = trimesh.Trimesh(model.surface.vertices, model.surface.faces, process=False)
+    _, distance, _ = trimesh.proximity.closest_point_naive(skin, attachment.points)
+    np.testing.assert_allclose(distance, layout.radius, atol=0.0004)
+    np.testing.assert_allclose(np.linalg.norm(attachment.normals, axis=1), 1.0)
+    np.testing.assert_allclose(attachment.bone_weights.sum(axis=1), 1.0)
+
+
+def test_left_glove_is_the_mirror_image(rng):
+    shape = sample_shape(side="right", rng=rng)
+    layout = load_layout("dense19")
+    right = attach(layout, HandModel(shape))
+    left = attach(layout, HandModel(shape.with_side("left")))
+    np.testing.assert_allclose(left.points, right.points @ MIRROR, atol=1e-9)
+
+
+def test_markers_move_with_the_hand(rng):
+    model = HandModel.named("M")
+    attachment = attach(load_layout("dense19"), model)
+    qpos = join_qpos(np.zeros((1, 20)), position=np.array([[0.1, 0.2, 0.3]]))
+    markers, normals = attachment.markers(model, model.forward_kinematics(qpos))
+    np.testing.assert_allclose(markers[0], attachment.points + [0.1, 0.2, 0.3], atol=1e-12)
+    np.testing.assert_allclose(normals[0], attachment.normals, atol=1e-12)
+
+
+def test_sites_stand_where_the_markers_do():
+    model = HandModel.named("L", side="left")
+    attachment = attach(load_layout("dense19"), model)
+    compiled = build_spec(model.skeleton, model.capsules, sites=attachment.sites(model)).compile()
+    data = mujoco.MjData(compiled)
+    mujoco.mj_kinematics(compiled, data)
+    np.testing.assert_allclose(data.site_xpos, attachment.points, atol=1e-9)
+    assert compiled.nsite == 19
+
+
+def test_a_marker_in_the_air_is_told():
+    layout = load_layout("dense19")
+    markers = list(layout.markers)
+    markers[6] = dataclasses.replace(markers[6], along=1.3)
+    with pytest.raises(LayoutError, match="marker 'IndexTip' finds no skin from index_distal at along 1.3"):
+        attach(dataclasses.replace(layout, markers=tuple(markers)), HandModel.named("M"))
+
+
+def test_slipped_markers_keep_their_bones_and_names(rng):
+    layout = load_layout("dense19")
+    slipped = vary_places(layout, along=0.1, around=0.2, rng=rng)
+    assert slipped.names == layout.names
+    assert [m.bone for m in slipped.markers] == [m.bone for m in layout.markers]
+    moved = np.array([a.along - b.along for a, b in zip(slipped.markers, layout.markers, strict=True)])
+    assert 0.02 < moved.std() < 0.2
+    assert vary_places(layout, along=0.0, around=0.0, rng=rng) == layout
