@@ -34,7 +34,7 @@ PAPER: Final = Corruption()
 class TrainConfig:
     """How a labeler is trained; the defaults made the shipped weights."""
 
-    samples: int = 2_500_000
+    samples: int = 2_000_000
     """Clouds to learn from; rows come round again, corrupted anew each time."""
     batch: int = 256
     learning_rate: float = 2e-3
