@@ -77,7 +77,7 @@ def test_markers_that_face_away_or_lie_outside_the_view_are_not_seen(scene):
     seen = visible_cameras(markers, normals, rig, far, np.zeros(0))
     behind = visible_cameras(markers, -normals, rig, far, np.zeros(0))
     assert not (seen & behind).all(axis=-1).any()
-    assert visible_cameras(markers + 50.0, normals, rig, far, np.zeros(0)).sum() == 0
+    assert visible_cameras(markers + [0.0, 0.0, 50.0], normals, rig, far, np.zeros(0)).sum() == 0
     assert not visible_cameras(markers, normals, rig, segments, model.capsules.radii)[~seen].any()
 
 
