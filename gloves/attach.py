@@ -133,7 +133,7 @@ def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], ND
 def _first_way_out(
     origin: NDArray[np.float64], direction: NDArray[np.float64], triangles: NDArray[np.float64]
 ) -> tuple[int, NDArray[np.float64], float] | None:
-    """First way out of the closed mesh along a ray: face, barycentric weights, distance (Moeller-Trumbore)."""
+    """First way out of a closed mesh along a ray: face, barycentric weights, distance (Moeller-Trumbore)."""
     edge1, edge2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     across = np.cross(direction, edge2)
     determinant = np.einsum("fi,fi->f", edge1, across)

@@ -64,7 +64,9 @@ def visible_cameras(
     to_camera = rig.positions - markers[:, :, None]
     ahead = np.einsum("tmci,tmi->tmc", to_camera, normals)
     facing = ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
-    return rig.in_view(markers) & facing & free_rays(markers, rig.positions, segments, radii)
+    clear = free_rays(markers, rig.positions, segments, radii)
+    seen: NDArray[np.bool_] = rig.in_view(markers) & facing & clear
+    return seen
 
 
 def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:

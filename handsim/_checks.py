@@ -22,7 +22,7 @@ def check_side(side: str) -> Side:
 
 
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-    """`array` as finite float64 whose last dimensions are `shape` (None: any length); leading ones are free."""
+    """`array` as finite float64 whose last dimensions are `shape` (None: any length)."""
     values = np.asarray(array, dtype=np.float64)
     tail = values.shape[values.ndim - len(shape) :] if values.ndim >= len(shape) else ()
     if len(tail) != len(shape) or any(

@@ -50,7 +50,7 @@ class CameraRig:
 
 
 def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """Pose of a camera that stands at `position`, looks at `target`, and holds its picture upright (world z)."""
+    """Pose of a camera at `position` that looks at `target` and holds its picture upright (world z)."""
     forward = (target - position) / np.linalg.norm(target - position)
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
     right = np.cross(forward, up)

@@ -50,7 +50,7 @@ class Capsules:
         return posed
 
     def touching_pairs(self) -> NDArray[np.int64]:
-        """Pairs (P, 2) that may collide: of different bones that do not share a joint, as MuJoCo filters them."""
+        """Pairs (P, 2) that may collide: of different bones without a common joint, MuJoCo's own rule."""
         parents = np.array([bone.parent for bone in BONES])
         first, second = np.triu_indices(len(self.bones), 1)
         a, b = self.bones[first], self.bones[second]

@@ -10,12 +10,12 @@ from __future__ import annotations
 from typing import Final, Literal, NamedTuple
 
 Side = Literal["left", "right"]
-SIDES: Final = ("left", "right")
+SIDES: Final[tuple[Side, Side]] = ("left", "right")
 DIGITS: Final = ("thumb", "index", "middle", "ring", "little")
 
 
 class Bone(NamedTuple):
-    """A rigid segment: its name, its parent's place in `BONES` (-1 for the palm), and its digit (-1: palm)."""
+    """A rigid segment: its name, its parent's place in `BONES` (palm: -1), and its digit (palm: -1)."""
 
     name: str
     parent: int

@@ -49,8 +49,9 @@ def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
 
 def random_quaternions(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:
     """Uniform random rotations as wxyz quaternions (count, 4)."""
-    raw = rng.standard_normal((count, 4))
-    return raw / np.linalg.norm(raw, axis=1, keepdims=True)
+    raw: NDArray[np.float64] = rng.standard_normal((count, 4))
+    raw /= np.linalg.norm(raw, axis=1, keepdims=True)
+    return raw
 
 
 def rigid_fit(

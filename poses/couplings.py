@@ -30,7 +30,8 @@ _MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]:
     """The same angles, a digit a row; a view, so writing to it writes to `angles`."""
-    return angles.reshape(*angles.shape[:-1], 5, 4)
+    view: np.ndarray = angles.reshape(*angles.shape[:-1], 5, 4)
+    return view
 
 
 def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
@@ -46,4 +47,5 @@ def apply_couplings(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 2
     fingers[..., 0] = np.clip(fingers[..., 0], low * left, high * left)
     follow = _DIP_SHARE * np.maximum(fingers[..., 2], 0.0)
     fingers[..., 3] = np.clip(fingers[..., 3], follow - _DIP_BELOW, follow + _DIP_ABOVE)
-    return np.clip(coupled, LOW, HIGH)
+    inside: np.ndarray = np.clip(coupled, LOW, HIGH)
+    return inside

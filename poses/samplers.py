@@ -1,4 +1,4 @@
-"""Random poses: gestures and blends of them, fingers that curl together or alone, and the corners of the ranges.
+"""Random poses: gestures and their blends, fingers that curl together or alone, corners of the ranges.
 
 No recorded motion stands behind these: three sources are mixed so that what people do often is dense and what
 they can do at all is reached.
@@ -70,14 +70,16 @@ def _blend_gestures(count: int, rng: np.random.Generator) -> NDArray[np.float64]
     first, second = library[rng.integers(len(library), size=(2, count))]
     progress = rng.uniform(-0.1, 1.1, size=(count, 1)) + 0.12 * rng.standard_normal((count, 5))
     weight = np.repeat(np.clip(progress, 0.0, 1.0), 4, axis=1)
-    angles = (1.0 - weight) * first + weight * second
-    return angles + _tremble(count, rng)
+    angles: NDArray[np.float64] = (1.0 - weight) * first + weight * second
+    angles += _tremble(count, rng)
+    return angles
 
 
 def _tremble(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     noise = np.stack([_shared_normals(count, rng, digits=5) for _ in range(4)], axis=2) * _FLEXION_NOISE
     noise[..., 0] *= _ABDUCTION_NOISE / _FLEXION_NOISE
-    return noise.reshape(count, 20)
+    flat: NDArray[np.float64] = noise.reshape(count, 20)
+    return flat
 
 
 def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -100,7 +102,8 @@ def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) -> NDArray[np.float64]:
     """Standard normals (T, digits) that are mostly the same for all digits of a pose."""
     common, own = rng.standard_normal((count, 1)), rng.standard_normal((count, digits))
-    return np.sqrt(0.75) * common + np.sqrt(0.25) * own
+    mixed: NDArray[np.float64] = np.sqrt(0.75) * common + np.sqrt(0.25) * own
+    return mixed
 
 
 def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:

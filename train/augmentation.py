@@ -1,7 +1,7 @@
 """What training does to a clean row before the labeler sees it: jitter, occlusion, ghosts, a shuffled order.
 
-Half of the rows keep what the simulated rig saw of them, the other half go through the paper's recipe (Han et
-al. 2018, section 3.3): zero to five draws of markers to drop, zero to two ghosts anywhere in the sample's box.
+Some batches keep what the simulated rig saw of them, the others go through the paper's recipe (Han et al.
+2018, section 3.3): zero to five draws of markers to drop, zero to two ghosts anywhere in the sample's box.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _draw_ghosts(
     high = np.where(known[..., None], positions, -np.inf).max(1)
     side = np.where(np.isfinite(high - low), high - low, np.nan)
     uniform = rng.uniform(-corruption.margin / 2, 1 + corruption.margin / 2, size=(batch, most, 3))
-    ghosts = low[:, None] + uniform * side[:, None]
+    ghosts: NDArray[np.float64] = low[:, None] + uniform * side[:, None]
     wanted = rng.integers(0, most + 1, size=batch)
     ghosts[np.arange(most) >= wanted[:, None]] = np.nan
     return ghosts

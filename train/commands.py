@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from gloves.captures import read_capture, write_capture
@@ -100,12 +100,14 @@ def label(
     points = sum(len(label) for label in labels)
     sure = np.concatenate([labelling.confidence for labelling in labellings]) if points else np.ones(1)
     Console().print(
-        f"{out}: {len(frames)} frames, {named} of {points} points labelled, median confidence {np.median(sure):.3f}"
+        f"{out}: {len(frames)} frames, {named} of {points} points labelled, "
+        f"median confidence {np.median(sure):.3f}"
     )
 
 
 def evaluate(
     captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    *,
     glove: str = "dense19",
     labeler: str | None = None,
     occlude: int = 0,
@@ -156,8 +158,8 @@ def labeler_of(glove: str, labeler: str | None) -> TrainedSetLabeler:
     layout = load_layout(glove)
     if labeler is None and glove not in shipped_labelers():
         raise WeightsError(
-            f"no labeler comes with glove '{glove}' (shipped: {', '.join(shipped_labelers())}); train one with "
-            f"handsim generate and handsim train, and give its folder as --labeler"
+            f"no labeler comes with glove '{glove}' (shipped: {', '.join(shipped_labelers())}); train one "
+            f"with handsim generate and handsim train, and give its folder as --labeler"
         )
     network = load_labeler(glove if labeler is None else Path(labeler))
     if network.marker_names != layout.names:
@@ -169,7 +171,7 @@ def labeler_of(glove: str, labeler: str | None) -> TrainedSetLabeler:
 
 
 @contextmanager
-def progress_bar(unit: str) -> Iterator[tuple[Progress, int]]:
+def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
     """A progress bar on standard error and the one task in it."""
     columns = (
         TextColumn("{task.description}"),

@@ -47,6 +47,8 @@ class LabelScores(NamedTuple):
 class SetLabeler(nn.Module):
     """Scores of every point against every label, for clouds of any size."""
 
+    centres: Tensor
+
     def __init__(self, config: SetLabelerConfig) -> None:
         super().__init__()
         self.config = config
@@ -114,7 +116,8 @@ class MessageRound(nn.Module):
         values = self.values(normed).view(batch, count, self.gates, -1).transpose(1, 2)  # (B, G, N, W/G)
         gathered = (gate @ values).transpose(1, 2).reshape(batch, count, width) / 5.0
         features = features + self.mix(gathered)
-        return features + self.think(features)
+        thought: Tensor = self.think(features)
+        return features + thought
 
 
 def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor) -> Tensor:

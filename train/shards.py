@@ -31,7 +31,7 @@ CONFIG: Final = "config.json"
 
 
 def row_dtype(num_markers: int) -> np.dtype[np.void]:
-    """One frame: qpos; the hand's place in the shard; markers [m]; cameras that see each (bits); ghosts [m]."""
+    """One frame: qpos, hand (its place in the shard), markers [m], cameras that see it (bits), ghosts [m]."""
     return np.dtype(
         [
             ("qpos", "<f4", (NUM_QPOS,)),

@@ -1,4 +1,4 @@
-"""A simulated capture in shards: hands, gloves, poses and a rig, on all cores, resumable, always the same bytes."""
+"""A simulated capture in shards: hands, gloves, poses and a rig, on all cores, resumable, reproducible."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gloves.attach import attach, vary_places
+from gloves.attach import Attachment, attach, vary_places
 from gloves.ghosts import GhostConfig, sample_ghosts
 from gloves.layout import MarkerLayout, load_layout
 from gloves.visibility import pack_cameras, visible_cameras
 from handsim.cameras import CameraRig, named_rig
-from handsim.errors import DatasetError, ShapeError
+from handsim.errors import DatasetError, LayoutError, ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.shape import Population, sample_shape
-from handsim.topology import SIDES
+from handsim.topology import SIDES, Side
 from handsim.transforms import random_quaternions
 from poses.samplers import PoseMix
 from poses.validity import resting_angles, sample_valid_angles
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROWS_PER_SHARD: Final = 8192
+_MOST_FITTINGS: Final = 20
 Progress = Callable[[int, int], None]
 """Called with frames done and frames wanted."""
 
@@ -199,7 +200,7 @@ def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:
 
 def sample_hand(population: Population, *, rng: np.random.Generator) -> HandModel:
     """A random person's left or right hand whose fingers have room beside each other."""
-    side = SIDES[int(rng.integers(2))]
+    side: Side = SIDES[int(rng.integers(2))]
     while True:
         model = HandModel(sample_shape(population, side=side, rng=rng))
         try:
@@ -207,6 +208,23 @@ def sample_hand(population: Population, *, rng: np.random.Generator) -> HandMode
         except ShapeError:
             continue
         return model
+
+
+def wear(
+    layout: MarkerLayout, model: HandModel, config: DatasetConfig, *, rng: np.random.Generator
+) -> Attachment:
+    """The glove put on with its markers slipped a little, drawn again while one has slipped off the hand.
+
+    Raises:
+        LayoutError: A marker finds no skin however it slips.
+    """
+    for _ in range(_MOST_FITTINGS):
+        slipped = vary_places(layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng)
+        try:
+            return attach(slipped, model)
+        except LayoutError:
+            continue
+    return attach(layout, model)
 
 
 def simulate_frames(
@@ -220,8 +238,7 @@ def simulate_frames(
 ) -> None:
     """Fill rows with random poses of one gloved hand and what the rig sees of them."""
     count = len(block)
-    slipped = vary_places(layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng)
-    attachment = attach(slipped, model)
+    attachment = wear(layout, model, config, rng=rng)
     position = np.array([0.0, 0.0, 1.1]) + rng.uniform(-config.volume, config.volume, size=(count, 3))
     qpos = join_qpos(
         sample_valid_angles(model, count, config.poses, rng=rng),
