@@ -144,8 +144,8 @@ def _draw_glove(out: Path) -> Section:
     load("render.labels:write_png")(out / "glove.png", picture)
     return Section(
         "The glove",
-        f"{GLOVE}: {attachment.layout.num_markers} markers of {2e3 * attachment.layout.radius:.1f} mm, carried "
-        "by the skin; the same file fits every hand. Yours is one TOML file away: "
+        f"{GLOVE}: {attachment.layout.num_markers} markers of {2e3 * attachment.layout.radius:.1f} mm, "
+        "carried by the skin; the same file fits every hand. Yours is one TOML file away: "
         "<code>handsim glove new</code>.",
         pictures=[("glove.png", "Names of the markers that each side shows, coloured by digit.")],
     )
@@ -204,8 +204,8 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
         pictures=[
             (
                 "labels.png",
-                f"Left: all that it is given, {len(points)} points, {int((truth < 0).sum())} of them ghosts, "
-                f"{int((~seen).sum())} markers hidden. Right: its labels, {right} of {len(points)} right; "
+                f"Left: all that it is given, {len(points)} points; ghosts: {int((truth < 0).sum())}, "
+                f"hidden markers: {int((~seen).sum())}. Right: its labels, {right} of {len(points)} right; "
                 "the hand behind them is the simulation's.",
             )
         ],
@@ -219,14 +219,13 @@ def _telling_frame(chain: _Chain) -> int:
     for number in range(min(400, len(chain.rows))):
         row = chain.rows[number]
         seen = _seen(row["cameras"], chain.dataset.manifest.min_cameras)
-        if not seen.sum() >= 0.7 * len(seen):
+        if not 0.7 * len(seen) <= seen.sum() < len(seen):
             continue
         wrist = model.forward_kinematics(row["qpos"][None].astype(np.float64))[0, 0, :3, :3]
         flat = row["markers"][seen] @ wrist[:, :2]
         gaps = np.linalg.norm(flat[:, None] - flat, axis=-1) + np.eye(len(flat))
-        width = float(gaps.min()) + 0.001 * bool((~seen).any())
-        if width > widest:
-            best, widest = number, width
+        if gaps.min() > widest:
+            best, widest = number, float(gaps.min())
     return best
 
 
@@ -269,7 +268,8 @@ def _figures_section(table: list[list[str]], num_frames: int, seed: int, speed: 
     return Section(
         "Figures of this run",
         f"{num_frames} freshly generated frames (seed {seed}) of random people, none of them seen in "
-        f"training. Occluded: 0 to {_PAPER_DROPS} draws of a marker to drop and 0 to {_PAPER_GHOSTS} ghosts a frame.",
+        f"training. Occluded: 0 to {_PAPER_DROPS} draws of a marker to drop and "
+        f"0 to {_PAPER_GHOSTS} ghosts a frame.",
         table=table,
         notes=[
             f"Speed: {speed}, on {cores} CPU cores.",

@@ -155,7 +155,7 @@ def view_along(
     # A point is inside when |x - x0| <= slope (z + distance), two linear limits; so is y.
     above = (local[:, :2] - slope * local[:, 2:]).max(axis=0)
     below = (-local[:, :2] - slope * local[:, 2:]).max(axis=0)
-    distance = ((above + below) / (2 * slope)).max()
+    distance = max(*((above + below) / (2 * slope)), 2 * _NEAR - local[:, 2].min())
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
