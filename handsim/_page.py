@@ -16,8 +16,8 @@ _STYLE: Final = """
 @media (prefers-color-scheme: dark) {
   :root { --ink: #e6e8ec; --soft: #a3abb8; --paper: #16181c; --card: #f4f5f7; --line: #3a3f48; }
 }
-body { margin: 0 auto; padding: 2rem 1.2rem 4rem; max-width: 70rem; background: var(--paper); color: var(--ink);
-  font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "DejaVu Sans", sans-serif; }
+body { margin: 0 auto; padding: 2rem 1.2rem 4rem; max-width: 70rem; background: var(--paper);
+  color: var(--ink); font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
 h1 { font-size: 1.9rem; margin: 0 0 .2rem; } h2 { font-size: 1.3rem; margin: 2.6rem 0 .4rem; }
 p { max-width: 46rem; margin: .4rem 0 1rem; } .lead, figcaption, .note { color: var(--soft); }
 figure { margin: 1rem 0 1.6rem; }
@@ -65,7 +65,8 @@ def _section(section: Section) -> str:
     for file, caption in section.pictures:
         name, text = escape(file), escape(caption)
         parts.append(
-            f'<figure><a href="{name}"><img src="{name}" alt="{text}"></a><figcaption>{text}</figcaption></figure>'
+            f'<figure><a href="{name}"><img src="{name}" alt="{text}"></a>'
+            f"<figcaption>{text}</figcaption></figure>"
         )
     if section.table:
         header, *rows = section.table

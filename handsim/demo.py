@@ -28,7 +28,7 @@ from handsim.errors import HandSimError
 from handsim.model import HandModel, join_qpos
 
 GLOVE: Final = "dense19"
-GESTURES: Final = ("thumb_up", "spread", "pinch_index", "relaxed", "pinch_little")
+GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")
 """Drawn in a row; the last one is the thumb's opposition to the little finger."""
 _PAPER_DROPS, _PAPER_GHOSTS = 5, 2
 _RAISED: Final = np.deg2rad(35.0)
@@ -129,7 +129,7 @@ def _draw_hands(out: Path, status: Any) -> Section:
     write_png(out / "gestures.png", load("render.report:draw_gestures")(HandModel.named("M"), GESTURES))
     return Section(
         "The hand",
-        "A MuJoCo hand of 26 degrees of freedom whose skeleton, flesh and skin are functions of its measures.",
+        "A MuJoCo hand of 26 degrees of freedom whose skeleton, flesh and skin follow its measures.",
         pictures=[
             ("sizes.png", "Five sizes, length by breadth, at one scale."),
             ("gestures.png", "Some of the named gestures; the last one opposes thumb and little finger."),
@@ -144,8 +144,9 @@ def _draw_glove(out: Path) -> Section:
     load("render.labels:write_png")(out / "glove.png", picture)
     return Section(
         "The glove",
-        f"{GLOVE}: {attachment.layout.num_markers} markers of {2e3 * attachment.layout.radius:.1f} mm, carried by "
-        "the skin; the same file fits every hand. Yours is one TOML file away: <code>handsim glove new</code>.",
+        f"{GLOVE}: {attachment.layout.num_markers} markers of {2e3 * attachment.layout.radius:.1f} mm, "
+        "carried by the skin; the same file fits every hand. Yours is one TOML file away: "
+        "<code>handsim glove new</code>.",
         pictures=[("glove.png", "Names of the markers that each side shows, coloured by digit.")],
     )
 
@@ -164,13 +165,13 @@ def _draw_camera(out: Path, status: Any) -> Section:
     load("render.labels:write_png")(out / "camera.png", picture)
     return Section(
         "What a camera sees",
-        "A ray from every marker to every camera, against the hand's own flesh, decides who sees what. A marker "
-        "exists when at least two cameras see it.",
+        "A ray from every marker to every camera, against the hand's own flesh, decides who sees what. A "
+        "marker exists when at least two cameras see it.",
         pictures=[
             (
                 "camera.png",
-                f"Camera {camera + 1} of {len(rig.positions)} of the rig, zoomed in: {int(seen.sum())} markers "
-                f"seen (green), {int((~seen).sum())} turned away or hidden (red).",
+                f"Camera {camera + 1} of {len(rig.positions)} of the rig, zoomed in: {int(seen.sum())} "
+                f"markers seen (green), {int((~seen).sum())} turned away or hidden (red).",
             )
         ],
     )
@@ -198,14 +199,14 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
     right = int((labelling.labels == truth).sum())
     return Section(
         "A frame and its labels",
-        "A frame is a handful of points in random order: some markers are hidden, some points are ghosts, which "
-        "no marker made. The labeler names each point from this one frame alone.",
+        "A frame is a handful of points in random order: some markers are hidden, some points are ghosts, "
+        "which no marker made. The labeler names each point from this one frame alone.",
         pictures=[
             (
                 "labels.png",
-                f"Left: all that it is given, {len(points)} points, {int((truth < 0).sum())} of them ghosts, "
-                f"{int((~seen).sum())} markers hidden. Right: its labels, {right} of {len(points)} right; the "
-                "hand behind them is the simulation's.",
+                f"Left: all that it is given, {len(points)} points; ghosts: {int((truth < 0).sum())}, "
+                f"hidden markers: {int((~seen).sum())}. Right: its labels, {right} of {len(points)} right; "
+                "the hand behind them is the simulation's.",
             )
         ],
     )
@@ -218,14 +219,13 @@ def _telling_frame(chain: _Chain) -> int:
     for number in range(min(400, len(chain.rows))):
         row = chain.rows[number]
         seen = _seen(row["cameras"], chain.dataset.manifest.min_cameras)
-        if not seen.sum() >= 0.7 * len(seen):
+        if not 0.7 * len(seen) <= seen.sum() < len(seen):
             continue
         wrist = model.forward_kinematics(row["qpos"][None].astype(np.float64))[0, 0, :3, :3]
         flat = row["markers"][seen] @ wrist[:, :2]
         gaps = np.linalg.norm(flat[:, None] - flat, axis=-1) + np.eye(len(flat))
-        width = float(gaps.min()) + 0.001 * bool((~seen).any())
-        if width > widest:
-            best, widest = number, width
+        if gaps.min() > widest:
+            best, widest = number, float(gaps.min())
     return best
 
 
@@ -267,8 +267,9 @@ def _figures_section(table: list[list[str]], num_frames: int, seed: int, speed: 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return Section(
         "Figures of this run",
-        f"{num_frames} freshly generated frames (seed {seed}) of random people, none of them seen in training. "
-        f"Occluded: 0 to {_PAPER_DROPS} draws of a marker to drop and 0 to {_PAPER_GHOSTS} ghosts a frame.",
+        f"{num_frames} freshly generated frames (seed {seed}) of random people, none of them seen in "
+        f"training. Occluded: 0 to {_PAPER_DROPS} draws of a marker to drop and "
+        f"0 to {_PAPER_GHOSTS} ghosts a frame.",
         table=table,
         notes=[
             f"Speed: {speed}, on {cores} CPU cores.",

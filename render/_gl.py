@@ -63,6 +63,6 @@ def _no_driver(error: Exception) -> HandSimError:
     reason = " ".join(str(error).split())[:120] or type(error).__name__
     platform = os.environ["PYOPENGL_PLATFORM"]
     return HandSimError(
-        f"drawing without a screen failed ({platform}: {reason}); run `apt-get install {EGL_PACKAGES}` as root "
-        "or install your system's counterparts"
+        f"drawing without a screen failed ({platform}: {reason}); run `apt-get install {EGL_PACKAGES}` as "
+        "root or install your system's counterparts"
     )

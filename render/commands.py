@@ -54,8 +54,8 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
     console = Console()
     console.print(table)
     console.print(
-        f"Radius {1e3 * layout.radius:.1f} mm. Along: 0 at the bone's near end, 1 at its far end. Around: 0 on "
-        "the back, 90 on the thumb's side. Across: hand breadths from the palm's middle towards the thumb."
+        f"Radius {1e3 * layout.radius:.1f} mm. Along: 0 at the bone's near end, 1 at its far end. Around: 0 "
+        "on the back, 90 on the thumb's side. Across: hand breadths from the palm's middle towards the thumb."
     )
 
 
@@ -101,7 +101,8 @@ def check_glove(
     console.print(table)
     if overlaps:
         raise LayoutError(
-            f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps)}; move them apart"
+            f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps)}; "
+            "move them apart"
         )
     from render.labels import write_png
     from render.report import draw_glove

@@ -116,7 +116,7 @@ def with_names(
 def spread_out(wanted: Float[np.ndarray, "N"], step: float, low: float, high: float) -> NDArray[np.float64]:
     """Ascending places near the wanted ascending ones, at least `step` apart, between `low` and `high`.
 
-    They are the nearest such places in the sense of least squares, by pooling neighbours that push each other.
+    They are the nearest such places in the sense of least squares, by pooling neighbours that meet.
     """
     slots = step * np.arange(len(wanted))
     blocks: list[tuple[float, int]] = []  # mean of wanted - slot, how many

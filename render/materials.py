@@ -65,9 +65,8 @@ def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
         mine = (surface.bone_weights * (surface.bone_indices == last)).sum(axis=1)
         reddening += mine * np.clip(share, 0.0, 1.0)
     pale = np.clip(-surface.vertex_normals()[:, 2], 0.0, 1.0)[:, None]
-    tint: NDArray[np.float64] = (
-        1.0 + pale * np.array([0.10, 0.06, 0.06]) - reddening[:, None] * np.array([0.0, 0.16, 0.13])
-    )
+    paleness, redness = np.array([0.10, 0.06, 0.06]), np.array([0.0, -0.16, -0.13])
+    tint: NDArray[np.float64] = 1.0 + pale * paleness + reddening[:, None] * redness
     return tint
 
 

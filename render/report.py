@@ -167,7 +167,7 @@ def draw_camera(
 def zoom(
     towards: NDArray[np.float64], points: NDArray[np.float64], up: NDArray[np.float64], size: tuple[int, int]
 ) -> float:
-    """Vertical opening angle [rad] at which a camera `towards` away from the points' middle just holds them."""
+    """Vertical opening angle [rad] at which a camera `towards` away from the points just holds them."""
     angle = 0.2
     for _ in range(20):  # the nearest place for an angle is known; find the angle whose place is the camera's
         view = view_along(towards, up, points, size, field_of_view=angle)

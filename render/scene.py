@@ -62,7 +62,7 @@ class View:
     def project(
         self, points: Float[np.ndarray, "*batch 3"], size: tuple[int, int]
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of world points in a picture (width, height): x right, y down, first pixel's centre at 0.5."""
+        """Pixels of world points in a picture (width, height): x right, y down, first centre at 0.5."""
         rotation, centre = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         local = (points - centre) @ rotation
         focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
@@ -155,7 +155,7 @@ def view_along(
     # A point is inside when |x - x0| <= slope (z + distance), two linear limits; so is y.
     above = (local[:, :2] - slope * local[:, 2:]).max(axis=0)
     below = (-local[:, :2] - slope * local[:, 2:]).max(axis=0)
-    distance = ((above + below) / (2 * slope)).max()
+    distance = max(*((above + below) / (2 * slope)), 2 * _NEAR - local[:, 2].min())
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
@@ -189,7 +189,7 @@ def _add_lights(pyrender: Any, built: Any, view: View) -> None:
     pose = np.eye(4)
     pose[:3, :3] = _frame_with_z(rotation @ np.array(_KEY))
     key = pyrender.DirectionalLight(intensity=_KEY_INTENSITY)
-    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; more depth, more bias.
+    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; depth adds bias.
     # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
     diagonal = max(float(built.scale), 1e-3)  # an empty scene has none
     key._get_shadow_camera = lambda _: pyrender.OrthographicCamera(

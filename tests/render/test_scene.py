@@ -27,11 +27,13 @@ def test_view_along_holds_all_points_and_touches_the_margin(seed: int, angle: fl
     direction, up = rng.standard_normal((2, 3))
     view = view_along(direction, up, points, SIZE, field_of_view=angle, margin=margin)
     share = view.project(points, SIZE) / SIZE
-    assert ((points - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2] > 0).all()
+    ahead = (points - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2]
+    assert ahead.min() > 0.019  # or the camera would cut it off
     assert share.min() >= margin - 1e-9
     assert share.max() <= 1 - margin + 1e-9
     low, high = share.min(axis=0), share.max(axis=0)
-    assert np.isclose(np.maximum(high - low, 0), 1 - 2 * margin).any()  # no nearer view would do
+    touching = np.isclose(high - low, 1 - 2 * margin).any()
+    assert touching or ahead.min() < 0.021  # no nearer view would do
     assert view.T_world_camera[:3, 1] @ up < 0  # y is down
     assert np.isclose(np.linalg.det(view.T_world_camera[:3, :3]), 1.0)
 
