@@ -17,12 +17,12 @@ from gloves.captures import read_capture, write_capture
 from gloves.captures.markers import labelled_capture, select_markers, unlabelled_frames
 from gloves.layout import load_layout
 from handsim.errors import CaptureError, HandSimError, WeightsError
+from train.config import TrainConfig
 from train.shards import Dataset, save_json
 from train.synthesis import DatasetConfig, generate_dataset
 
 if TYPE_CHECKING:
     from train.labeler import TrainedSetLabeler
-    from train.loop import TrainConfig
 
 
 def generate(
@@ -48,7 +48,7 @@ def generate(
 def train(
     dataset: Annotated[Path, tyro.conf.Positional],
     out: Path,
-    config: "Annotated[TrainConfig, tyro.conf.arg(name='')]",
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")],
     labeler: Literal["set"] = "set",
 ) -> None:
     """Train a labeler on a training set; run it again to go on where it was stopped.
@@ -180,7 +180,8 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield bar, bar.add_task("", total=1)
 
 

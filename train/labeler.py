@@ -15,8 +15,9 @@ from safetensors.torch import load_file, save_file
 
 from handsim.errors import ShapeError, WeightsError, choices
 from handsim.io import atomic_write
+from train.config import SetLabelerConfig
 from train.matching import match_scores
-from train.set_labeler import SetLabeler, SetLabelerConfig
+from train.set_labeler import SetLabeler
 from train.shards import save_json
 
 if TYPE_CHECKING:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -16,9 +16,10 @@ from handsim._version import __version__
 from handsim.errors import DatasetError, WeightsError
 from handsim.io import atomic_write
 from train.augmentation import Cloud, Corruption, corrupt
+from train.config import TrainConfig
 from train.evaluation import evaluate_labeler
 from train.labeler import TrainedSetLabeler, save_labeler
-from train.set_labeler import SetLabeler, SetLabelerConfig, labeling_loss
+from train.set_labeler import SetLabeler, labeling_loss
 from train.shards import Dataset, load_json, save_json
 
 if TYPE_CHECKING:
@@ -28,28 +29,6 @@ CHECKPOINT: Final = "checkpoint.pt"
 _CONFIG: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
 PAPER: Final = Corruption()
-
-
-@dataclass(frozen=True, slots=True)
-class TrainConfig:
-    """How a labeler is trained; the defaults made the shipped weights."""
-
-    samples: int = 2_000_000
-    """Clouds to learn from; rows come round again, corrupted anew each time."""
-    batch: int = 256
-    learning_rate: float = 2e-3
-    """Peak; warms up over the first hundredth and falls to zero as a half cosine."""
-    weight_decay: float = 0.01
-    average: float = 0.999
-    """Decay of the running mean of the weights, which is what is kept."""
-    jitter: float = 0.0035
-    """Largest half width of the uniform noise on each coordinate [m]; each batch draws its own."""
-    rig_share: float = 0.4
-    """Share of batches that keep what the rig saw; the others go through the paper's recipe."""
-    anisotropy: float = 0.06
-    """Stretch of each hand along three random directions, log standard deviation."""
-    seed: int = 0
-    network: SetLabelerConfig = dataclasses.field(default_factory=SetLabelerConfig)
 
 
 Progress = Callable[[int, int, float], None]
@@ -119,7 +98,7 @@ class _State:
         progress = self.done / self.config.samples
         rate = min(1.0, progress / 0.01 + 1e-3) * 0.5 * (1.0 + np.cos(np.pi * min(1.0, progress)))
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * rate
+            group["lr"] = float(self.config.learning_rate * rate)
         points = torch.from_numpy(cloud.points.astype(np.float32))
         present, truth = torch.from_numpy(cloud.present), torch.from_numpy(cloud.truth)
         loss = labeling_loss(self.network(points, present), truth, present)
@@ -160,7 +139,7 @@ class _State:
             self.network.load_state_dict(content["network"])
             self.optimizer.load_state_dict(content["optimizer"])
             self.mean, self.done = content["mean"], content["done"]
-        except (RuntimeError, KeyError, EOFError, ValueError) as error:
+        except (RuntimeError, KeyError, EOFError, ValueError, pickle.UnpicklingError) as error:
             raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
 
 

@@ -8,31 +8,15 @@ together: which label, or ghost, a point is; and which point, or none, a label h
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from train.config import SetLabelerConfig
+
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
-
-
-@dataclass(frozen=True, slots=True)
-class SetLabelerConfig:
-    """Size of the network."""
-
-    num_labels: int = 19
-    width: int = 64
-    """Channels of a point."""
-    gates: int = 16
-    """Message channels share a gate in groups: this many groups."""
-    depth: int = 5
-    """Rounds of messages."""
-    num_distances: int = 24
-    """Gaussian bumps a distance is spread over."""
-    reach: float = 0.24
-    """Largest distance [m] that has a bump of its own; a hand's markers span about this much."""
 
 
 class LabelScores(NamedTuple):

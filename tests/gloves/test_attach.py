@@ -62,7 +62,7 @@ def test_a_marker_in_the_air_is_told():
     layout = load_layout("dense19")
     markers = list(layout.markers)
     markers[6] = dataclasses.replace(markers[6], along=1.3)
-    with pytest.raises(LayoutError, match="marker 'IndexTip' finds no skin from index_distal at along 1.3"):
+    with pytest.raises(LayoutError, match=r"marker 'IndexTip' finds no skin from index_distal at along 1\.3"):
         attach(dataclasses.replace(layout, markers=tuple(markers)), HandModel.named("M"))
 
 

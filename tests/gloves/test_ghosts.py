@@ -34,7 +34,9 @@ def test_reflection_is_its_own_inverse_and_keeps_distances(seed):
 
 def test_without_sources_there_are_no_ghosts(rng):
     config = GhostConfig(mirror_rate=0.0, stray_rate=0.0)
-    ghosts = sample_ghosts(hand_sized_cloud(rng), named_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng)
+    ghosts = sample_ghosts(
+        hand_sized_cloud(rng), named_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
+    )
     assert ghosts.shape == (200, MAX_GHOSTS, 3)
     assert np.isnan(ghosts).all()
 
@@ -47,13 +49,13 @@ def test_mirror_ghosts_lie_behind_the_surface_and_need_cameras(rng):
     assert there.any()
     low, high = markers.min(axis=(0, 1)) - 0.6, markers.max(axis=(0, 1)) + 0.6
     assert ((ghosts[there] > low) & (ghosts[there] < high)).all()
-    strict = sample_ghosts(
-        markers, rig, *NOTHING, config, min_cameras=12, rng=np.random.default_rng(0)
-    )
+    strict = sample_ghosts(markers, rig, *NOTHING, config, min_cameras=12, rng=np.random.default_rng(0))
     assert np.isfinite(strict[..., 0]).sum() < there.sum()
 
 
 def test_strays_follow_their_rate(rng):
     config = dataclasses.replace(GhostConfig(), mirror_rate=0.0, stray_rate=0.5)
-    ghosts = sample_ghosts(hand_sized_cloud(rng), named_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng)
+    ghosts = sample_ghosts(
+        hand_sized_cloud(rng), named_rig("figure5"), *NOTHING, config, min_cameras=2, rng=rng
+    )
     assert 0.35 < np.isfinite(ghosts[..., 0]).sum(axis=1).mean() < 0.65

@@ -146,5 +146,5 @@ def test_bad_qpos_is_told(qpos, sentence):
 
 
 def test_unknown_size_is_told():
-    with pytest.raises(ShapeError, match="unknown size 'XXL' .* valid names: XS, S, M, L, XL"):
+    with pytest.raises(ShapeError, match=r"unknown size 'XXL' .* valid names: XS, S, M, L, XL"):
         named_shape("XXL")

@@ -74,7 +74,7 @@ def test_gestures_are_inside_ranges_and_named():
     assert len(gesture_names()) == len(all_gestures()) > 40
     assert (all_gestures() >= LOW).all()
     assert (all_gestures() <= HIGH).all()
-    with pytest.raises(ShapeError, match="unknown gesture 'fits' .*did you mean 'fist'"):
+    with pytest.raises(ShapeError, match=r"unknown gesture 'fits' .*did you mean 'fist'"):
         gesture("fits")
 
 

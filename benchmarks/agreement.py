@@ -1,0 +1,84 @@
+"""How exactly the fast paths agree with MuJoCo, and how valid sampled poses are.
+
+    python benchmarks/agreement.py [--hands 50 --poses 2000]
+
+Random people of both sides and all ages: kinematics against mj_kinematics, sight against mj_multiRay (300 rays'
+worth of frames a hand), ranges, and the deepest self-penetration of any sampled pose.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import mujoco
+import numpy as np
+from machine import describe
+
+from gloves.attach import attach
+from gloves.layout import load_layout
+from gloves.visibility import free_rays
+from handsim.cameras import named_rig
+from handsim.model import HandModel, join_qpos
+from handsim.shape import EVERYBODY
+from handsim.transforms import random_quaternions
+from poses.couplings import HIGH, LOW
+from poses.validity import sample_valid_angles
+from train.synthesis import sample_hand
+
+CHECKED = 20  # frames a hand that MuJoCo repeats
+
+
+def blocked_rays(
+    model: HandModel, data: mujoco.MjData, markers: np.ndarray, cameras: np.ndarray
+) -> np.ndarray:
+    """MuJoCo's answer for one frame: which rays (M, C) meet the hand before the camera."""
+    blocked = np.zeros((len(markers), len(cameras)), dtype=bool)
+    hits, distances = np.zeros(len(cameras), dtype=np.int32), np.zeros(len(cameras))
+    for number, marker in enumerate(markers):
+        rays = cameras - marker
+        lengths = np.linalg.norm(rays, axis=1)
+        unit = (rays / lengths[:, None]).ravel()
+        mujoco.mj_multiRay(
+            model.mj_model, data, marker, unit, None, 1, -1, hits, distances, None, len(cameras), 10.0
+        )
+        blocked[number] = (distances >= 0) & (distances < lengths)
+    return blocked
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--hands", type=int, default=50)
+    parser.add_argument("--poses", type=int, default=2000)
+    arguments = parser.parse_args()
+    print(describe("mujoco"))
+    rng = np.random.default_rng(0)
+    layout, cameras = load_layout("dense19"), named_rig("figure5").positions
+    deepest = kinematics = 0.0
+    outside = rays = disagreeing = 0
+    for _ in range(arguments.hands):
+        model = sample_hand(EVERYBODY, rng=rng)
+        angles = sample_valid_angles(model, arguments.poses, rng=rng)
+        outside += int(((angles < LOW) | (angles > HIGH)).any(axis=1).sum())
+        deepest = max(deepest, float(model.penetration(join_qpos(angles)).max()))
+        position = np.array([0.0, 0.0, 1.1]) + rng.uniform(-0.3, 0.3, size=(CHECKED, 3))
+        quaternion = random_quaternions(CHECKED, rng=rng)
+        qpos = join_qpos(angles[:CHECKED], position=position, quaternion=quaternion)
+        bones = model.forward_kinematics(qpos)
+        markers, _ = attach(layout, model).markers(model, bones)
+        free = free_rays(markers, cameras, model.capsules.posed(bones), model.capsules.radii)
+        data = mujoco.MjData(model.mj_model)
+        for frame, values in enumerate(qpos):
+            data.qpos[:] = values
+            mujoco.mj_kinematics(model.mj_model, data)
+            kinematics = max(kinematics, float(np.abs(data.xpos[1:] - bones[frame, :, :3, 3]).max()))
+            blocked = blocked_rays(model, data, markers[frame], cameras)
+            rays, disagreeing = rays + blocked.size, disagreeing + int((blocked == free[frame]).sum())
+    poses = arguments.hands * arguments.poses
+    print(f"{poses:,} poses of {arguments.hands} hands: {outside} outside a range")
+    print(f"deepest self-penetration {1e3 * deepest:.3f} mm (limit 1 mm)")
+    print(f"kinematics against mj_kinematics: largest difference {kinematics:.1e} m")
+    print(f"sight against mj_multiRay: {rays - disagreeing:,} of {rays:,} rays agree")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+"""How well sampled poses cover those of real people: the distance to the nearest one.
+
+    python benchmarks/coverage.py CAPTURES [--poses 100000 --frames 2000 --seed 0]
+
+CAPTURES is a folder of labelled dense19 captures, one sub-folder a person (such as the public
+Mocap_SIG18_Data; only right hands, named *_right.trc, are used). Sampled poses of the mean hand are scaled to
+each person's mean BackHand1-IndexMCP distance, aligned rigidly (Kabsch) and compared by the 3D RMS over the 19
+markers. Candidates come from the nearest pair-distance vectors, 200 a frame; more change nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from machine import describe
+
+from gloves.attach import attach
+from gloves.captures import read_capture
+from gloves.captures.markers import select_markers
+from gloves.layout import load_layout
+from handsim.model import HandModel, join_qpos
+from handsim.transforms import rigid_fit
+from poses.validity import sample_valid_angles
+
+CANDIDATES = 200
+PAIRS = np.triu_indices(19, 1)
+
+
+def pair_distances(markers: np.ndarray) -> torch.Tensor:
+    difference = markers[:, PAIRS[0]] - markers[:, PAIRS[1]]
+    return torch.from_numpy(np.linalg.norm(difference, axis=-1).astype(np.float32))
+
+
+def nearest_rms(queries: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """3D RMS [m] of each query (T, 19, 3) to its nearest pose (N, 19, 3)."""
+    pose_distances, result = pair_distances(poses), np.empty(len(queries))
+    for first in range(0, len(queries), 100):
+        block = queries[first : first + 100]
+        near = torch.cdist(pair_distances(block), pose_distances).topk(CANDIDATES, largest=False).indices
+        for number, query in enumerate(block):
+            candidates = poses[near[number].numpy()]
+            rotation, shift = rigid_fit(candidates, np.broadcast_to(query, candidates.shape))
+            error = np.einsum("kij,kmj->kmi", rotation, candidates) + shift[:, None] - query
+            result[first + number] = np.sqrt((error**2).sum(-1).mean(-1)).min()
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("captures", type=Path)
+    parser.add_argument("--poses", type=int, default=100_000)
+    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    print(describe("torch"))
+    rng = np.random.default_rng(arguments.seed)
+    layout, model = load_layout("dense19"), HandModel.named("M")
+    qpos = join_qpos(sample_valid_angles(model, arguments.poses, rng=rng))
+    poses, _ = attach(layout, model).markers(model, model.forward_kinematics(qpos))
+    first, second = layout.names.index("BackHand1"), layout.names.index("IndexMCP")
+
+    def size(markers: np.ndarray) -> float:
+        return float(np.linalg.norm(markers[:, first] - markers[:, second], axis=1).mean())
+
+    people = {
+        person.name: np.concatenate(
+            [select_markers(read_capture(file), layout.names) for file in sorted(person.rglob("*_right.trc"))]
+        )
+        for person in sorted(arguments.captures.iterdir())
+        if person.is_dir()
+    }
+    total = sum(map(len, people.values()))
+    errors = []
+    for name, markers in people.items():
+        count = round(arguments.frames * len(markers) / total)
+        chosen = markers[rng.choice(len(markers), count, replace=False)]
+        errors.append(1e3 * nearest_rms(chosen, poses * (size(markers) / size(poses))))
+        print(f"{name}: {count} frames, median {np.median(errors[-1]):.2f} mm, "
+              f"p95 {np.percentile(errors[-1], 95):.2f} mm")  # fmt: skip
+    everyone = np.concatenate(errors)
+    print(
+        f"all: {len(everyone)} frames against {len(poses)} poses: median {np.median(everyone):.2f} mm, "
+        f"p90 {np.percentile(everyone, 90):.2f} mm, p95 {np.percentile(everyone, 95):.2f} mm"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""Generate, train small, label a capture file, evaluate: one chain through the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from gloves.captures import Capture, read_capture, write_capture
+from handsim.cli import main
+from train.shards import Dataset
+
+SMALL = [
+    "--samples",
+    "60000",
+    "--batch",
+    "128",
+    "--network.width",
+    "32",
+    "--network.gates",
+    "8",
+    "--network.depth",
+    "3",
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Two test processes with two threads each would wait for one another most of the time."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("loop")
+    sizes = ["--num-frames", "6000", "--frames-per-hand", "60", "--population.children", "0"]
+    assert main(["generate", "--out", str(folder / "set"), *sizes, "--workers", "1"]) == 0
+    assert main(["train", str(folder / "set"), "--out", str(folder / "run"), *SMALL]) == 0
+    return folder
+
+
+def take(folder, name, frames=200):
+    dataset = Dataset(folder / "set")
+    path = folder / name
+    rows = dataset.rows()[:frames]
+    write_capture(path, Capture(dataset.marker_names, rows["markers"].astype(float), 120.0))
+    return path
+
+
+def test_a_small_labeler_labels_most_of_a_capture(run):
+    path = take(run, "take.trc")
+    figures = run / "figures.json"
+    assert main(["evaluate", str(path), "--labeler", str(run / "run"), "--json", str(figures)]) == 0
+    assert json.loads(figures.read_text())["figures"]["slot_accuracy"] > 0.85
+
+
+def test_labels_do_not_depend_on_the_columns(run, rng):
+    path = take(run, "straight.c3d")
+    capture = read_capture(path)
+    order = rng.permutation(19)
+    shuffled = Capture(tuple(f"*{n}" for n in range(19)), capture.positions[:, order], 120.0)
+    write_capture(run / "shuffled.c3d", shuffled)
+    for name in ("straight", "shuffled"):
+        arguments = ["label", str(run / f"{name}.c3d"), "--labeler", str(run / "run")]
+        assert main([*arguments, "--out", str(run / f"{name}.trc")]) == 0
+    first, second = read_capture(run / "straight.trc"), read_capture(run / "shuffled.trc")
+    assert first.names[:19] == capture.names
+    np.testing.assert_allclose(first.positions[:, :19], second.positions[:, :19], atol=1e-7)
+    right = np.isclose(first.positions[:, :19], capture.positions, atol=1e-6).all(-1)
+    assert right.mean() > 0.85
+
+
+def test_empty_frames_are_labelled_as_empty(run):
+    capture = read_capture(take(run, "gaps.trc", frames=20))
+    positions = capture.positions.copy()
+    positions[3:7] = np.nan
+    write_capture(run / "gaps.trc", Capture(capture.names, positions, 120.0))
+    arguments = ["label", str(run / "gaps.trc"), "--labeler", str(run / "run"), "--out", str(run / "out.trc")]
+    assert main(arguments) == 0
+    labelled = read_capture(run / "out.trc")
+    assert np.isnan(labelled.positions[3:7]).all()
+    assert np.isfinite(labelled.positions[:3]).any(axis=(1, 2)).all()
+
+
+def test_training_goes_on_to_the_same_weights(run, tmp_path):
+    from safetensors.numpy import load_file
+
+    from train.config import SetLabelerConfig, TrainConfig
+    from train.loop import train_labeler
+
+    config = TrainConfig(samples=2560, network=SetLabelerConfig(width=16, gates=4, depth=1))
+    dataset = Dataset(run / "set")
+
+    class Killed(Exception):
+        pass
+
+    def kill(done, total, loss):
+        if done == 1280:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train_labeler(dataset, config, tmp_path / "killed", progress=kill, save_every=0.0)
+    train_labeler(dataset, config, tmp_path / "killed", save_every=0.0)
+    train_labeler(dataset, config, tmp_path / "whole")
+    resumed, whole = (load_file(tmp_path / name / "labeler.safetensors") for name in ("killed", "whole"))
+    for name, values in whole.items():
+        np.testing.assert_allclose(resumed[name], values, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["label", "TAKE", "--glove", "dense91", "--out", "OUT"], "unknown glove 'dense91'"),
+        (["label", "TAKE", "--labeler", "nowhere", "--out", "OUT"], "unknown labeler 'nowhere'"),
+        (["label", "missing.trc", "--labeler", "RUN", "--out", "OUT"], "missing.trc: cannot be read"),
+        (["label", "TAKE", "--glove", "sparse13", "--labeler", "RUN", "--out", "OUT"], "the labeler knows"),
+        (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "wanted 0 or more"),
+        (["train", "nowhere", "--out", "OUT"], "wanted a training set with a manifest.json, but nowhere"),
+        (["train", "SET", "--out", "RUN", "--seed", "5"], "holds a run of other settings"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(run, tmp_path, capsys, arguments, sentence):
+    places = {
+        "TAKE": take(run, "take.trc", 5),
+        "OUT": tmp_path / "o.trc",
+        "RUN": run / "run",
+        "SET": run / "set",
+    }
+    assert main([str(places.get(word, word)) for word in arguments]) == 1
+    said = capsys.readouterr().err
+    assert sentence in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "o.trc").exists()

@@ -1,0 +1,60 @@
+"""The labeler that comes with the package, on simulated and on real marker data."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from gloves.captures import read_capture
+from gloves.captures.markers import select_markers
+from gloves.layout import load_layout
+from handsim.errors import ShapeError, WeightsError
+from train.augmentation import Corruption
+from train.evaluation import evaluate_labeler
+from train.labeler import load_labeler, shipped_labelers
+
+
+def test_cards_say_where_the_weights_come_from():
+    for name in shipped_labelers():
+        folder = resources.files("train").joinpath("weights")
+        card = json.loads(folder.joinpath(f"{name}.json").read_text())
+        assert card["trained_on"] == "simulated frames only"
+        assert tuple(card["marker_names"]) == load_layout(name).names
+        assert card["dataset"]["glove"] == name
+        assert len(folder.joinpath(f"{name}.safetensors").read_bytes()) < 5_000_000
+
+
+@pytest.mark.parametrize(("corruption", "least"), [(Corruption(0, 0), 0.985), (Corruption(), 0.92)])
+def test_real_people_are_labelled(sig18, corruption, least, rng):
+    labeler = load_labeler("dense19")
+    files = sorted(sig18.rglob("*.trc"))
+    chosen = rng.choice(len(files), size=40, replace=False)
+    markers = np.concatenate(
+        [select_markers(read_capture(files[number]), labeler.marker_names) for number in chosen]
+    )
+    frames = markers[rng.choice(len(markers), size=min(2000, len(markers)), replace=False)]
+    assert evaluate_labeler(labeler, frames, corruption, rng=rng).figures["slot_accuracy"] >= least
+
+
+def test_odd_clouds_are_labelled_or_told(rng):
+    labeler = load_labeler("dense19")
+    for count in (0, 1, 2, 60):
+        labelling = labeler.label_frames([rng.normal(scale=0.05, size=(count, 3))])[0]
+        assert len(labelling.labels) == len(labelling.confidence) == count
+        named = labelling.labels[labelling.labels >= 0]
+        assert len(set(named.tolist())) == len(named)
+    with pytest.raises(ShapeError, match="frame 1 holds NaN"):
+        labeler.label_frames([np.zeros((3, 3)), np.full((3, 3), np.nan)])
+    with pytest.raises(ShapeError, match="frame 0 holds 600 points, wanted at most 512"):
+        labeler.label_frames([np.zeros((600, 3))])
+
+
+def test_damaged_weights_are_told(tmp_path):
+    folder = resources.files("train").joinpath("weights")
+    (tmp_path / "labeler.json").write_bytes(folder.joinpath("dense19.json").read_bytes())
+    (tmp_path / "labeler.safetensors").write_bytes(folder.joinpath("dense19.safetensors").read_bytes()[:-100])
+    with pytest.raises(WeightsError, match=r"labeler\.safetensors is damaged or no labeler's"):
+        load_labeler(tmp_path)
