@@ -2,8 +2,8 @@
 
     python benchmarks/agreement.py [--hands 50 --poses 2000]
 
-Random people of both sides and all ages: kinematics against mj_kinematics, sight against mj_multiRay (300 rays'
-worth of frames a hand), ranges, and the deepest self-penetration of any sampled pose.
+Random people of both sides and all ages: kinematics against mj_kinematics, sight against mj_multiRay, ranges,
+and the deepest self-penetration of any sampled pose.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python benchmarks/generation.py [--frames 40960]
 
 The floor of a frame is its rays: 19 markers x 16 cameras, each against 21 capsules. The first line after the
-machine is the ray kernel alone on one core; the others are `handsim generate` whole: hands, skin, glove, poses,
-contact, kinematics, rays, ghosts, files.
+machine is the ray kernel alone on one core; the others are `handsim generate` whole: hands, skin, glove,
+poses, contact, kinematics, rays, ghosts, files.
 """
 
 from __future__ import annotations
@@ -58,7 +58,8 @@ def main() -> None:
             speed = frames / (time.perf_counter() - start)
         paper = 170_330 / speed
         print(
-            f"{workers} worker(s): {speed:,.0f} frames/s with 16 x 19 rays; the paper's 170,330 take {paper:.0f} s"
+            f"{workers} worker(s): {speed:,.0f} frames/s with 16 x 19 rays; "
+            f"the paper's 170,330 take {paper:.0f} s"
         )
 
 

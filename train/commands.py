@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from gloves.captures import read_capture, write_capture
+from gloves.captures import READABLE, WRITABLE, read_capture, write_capture
+from gloves.captures.capture import check_suffix
 from gloves.captures.markers import labelled_capture, select_markers, unlabelled_frames
 from gloves.layout import load_layout
 from handsim.errors import CaptureError, HandSimError, WeightsError
@@ -86,6 +87,7 @@ def label(
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler; the glove's shipped one when not given.
     """
+    check_suffix(out, WRITABLE)  # before the work, not after it
     network = labeler_of(glove, labeler)
     source = read_capture(capture)
     frames = unlabelled_frames(source)
@@ -199,8 +201,6 @@ def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
 
 
 def _capture_files(paths: tuple[Path, ...]) -> list[Path]:
-    from gloves.captures import READABLE
-
     files = []
     for path in paths:
         inside = (

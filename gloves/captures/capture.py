@@ -72,7 +72,7 @@ def read_capture(path: str | Path) -> Capture:
     from gloves.captures.trc import read_trc
 
     path = Path(path)
-    _check_suffix(path, READABLE)
+    check_suffix(path, READABLE)
     readers = dict(zip(READABLE, (read_trc, read_c3d, read_motive_csv), strict=True))
     try:
         data = path.read_bytes()
@@ -98,7 +98,7 @@ def write_capture(path: str | Path, capture: Capture) -> None:
     from gloves.captures.trc import write_trc
 
     path = Path(path)
-    _check_suffix(path, WRITABLE)
+    check_suffix(path, WRITABLE)
     for name in capture.names:
         if not name or name != name.strip() or not name.isprintable():
             raise CaptureError(
@@ -117,6 +117,7 @@ def write_capture(path: str | Path, capture: Capture) -> None:
         raise CaptureError(f"{path}: {error}") from error
 
 
-def _check_suffix(path: Path, valid: tuple[str, ...]) -> None:
+def check_suffix(path: Path, valid: tuple[str, ...]) -> None:
+    """Raise a `CaptureError` with the valid suffixes unless the path has one of them."""
     if path.suffix.lower() not in valid:
         raise CaptureError(f"{path}: {choices(path.suffix, valid, noun='file type')}")

@@ -27,7 +27,9 @@ def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, 
     bare = [column.rsplit(":", 1)[-1].strip() for column in capture.names]
     for name in names:
         if name not in bare:
-            raise CaptureError(f"marker {choices(name, bare, noun='column of the capture')}")
+            raise CaptureError(
+                f"the glove's marker is not among the columns: {choices(name, bare, noun='column')}"
+            )
         if bare.count(name) > 1:
             raise CaptureError(f"marker '{name}' has {bare.count(name)} columns in the capture, wanted one")
     return capture.positions[:, [bare.index(name) for name in names]]

@@ -1,0 +1,89 @@
+"""What users get wrong, through the command line: one sentence, exit code 1, nothing left behind.
+
+The sentences are a golden file; HANDSIM_RENEW_GOLDEN=1 pytest tests/test_bad_input.py writes it anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gloves.captures import Capture, write_capture
+from gloves.layout import load_layout, save_layout
+from handsim.cli import main
+
+GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"
+MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
+TOP = 'name = "mine"\nradius_mm = 3.2\n'
+FIVE = [("a", "index_distal"), ("b", "ring_distal"), ("c", "thumb_distal"), ("d", "little_distal")]
+
+
+def layout(*markers: tuple[str, str]) -> str:
+    return TOP + "\n".join(MARKER.format(*marker) for marker in markers)
+
+
+def good_capture(folder: Path) -> str:
+    path = folder / "good.trc"
+    markers = np.random.default_rng(0).uniform(0, 0.1, size=(5, 19, 3))
+    write_capture(path, Capture(load_layout("dense19").names, markers, 120.0))
+    return path.read_text()
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = good_capture(tmp_path)
+    files = {
+        "unknown_bone.toml": layout(*FIVE, ("e", "indx_middle")),
+        "twice.toml": layout(*FIVE, ("a", "index_middle")),
+        "two_markers.toml": layout(*FIVE[:2]),
+        "furlongs.trc": text.replace("\tmm\t", "\tfurlongs\t"),
+        "empty.trc": "\n".join(text.split("\n")[:5]) + "\n",
+        "nothing.trc": "",
+        "truncated.trc": text[: int(0.9 * len(text))],
+        "words.trc": text.replace("\t1\t", "\tone\t", 1) if "\t1\t" in text else text,
+        "renamed.trc": text.replace("ThumbIP", "Thumb_IP"),
+        "takes.docx": "x",
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_text(content)
+    save_layout(tmp_path / "copy.toml", load_layout("dense19"))
+    return tmp_path
+
+
+CASES = {
+    "unknown glove": ["generate", "--glove", "dense91", "--out", "out"],
+    "unknown bone": ["glove", "check", "unknown_bone.toml"],
+    "two markers of one name": ["glove", "check", "twice.toml"],
+    "a layout with two markers": ["generate", "--glove", "two_markers.toml", "--out", "out"],
+    "an unknown unit": ["label", "furlongs.trc", "--out", "out.trc"],
+    "a capture without rows": ["label", "empty.trc", "--out", "out.trc"],
+    "an empty file": ["evaluate", "nothing.trc", "--json", "out.json"],
+    "a truncated capture": ["label", "truncated.trc", "--out", "out.trc"],
+    "a marker that is not there": ["evaluate", "renamed.trc", "--json", "out.json"],
+    "another kind of file": ["label", "takes.docx", "--out", "out.trc"],
+    "another kind of output": ["label", "good.trc", "--out", "out.xlsx"],
+    "no such file": ["label", "missing.c3d", "--out", "out.trc"],
+    "no labeler for this glove": ["label", "good.trc", "--glove", "copy.toml", "--out", "out.trc"],
+    "no frames": ["generate", "--num-frames", "0", "--out", "out"],
+    "an existing layout": ["glove", "new", "copy.toml"],
+    "an unfinished training set": ["train", ".", "--out", "out"],
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_mistake_is_one_sentence(name, folder, capsys):
+    before = {path.name for path in folder.iterdir()}
+    assert main(CASES[name]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert {path.name for path in folder.iterdir()} == before, "something was left behind"
+    golden = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
+    if os.environ.get("HANDSIM_RENEW_GOLDEN"):
+        golden[name] = said.strip()
+        GOLDEN.write_text(json.dumps(golden, indent=1, sort_keys=True) + "\n")
+    assert said.strip() == golden[name]
