@@ -7,10 +7,13 @@ import platform
 from importlib import metadata
 from pathlib import Path
 
+from handsim import __version__
+
 
 def describe(*packages: str) -> str:
     """One line: versions, processor, cores."""
-    versions = [f"{name} {metadata.version(name)}" for name in ("handsim", "numpy", *packages)]
+    versions = [f"handsim {__version__}"]
+    versions += [f"{name} {metadata.version(name)}" for name in ("numpy", *packages)]
     cpuinfo = Path("/proc/cpuinfo")
     models = [line.split(":")[1].strip() for line in _lines(cpuinfo) if line.startswith("model name")]
     processor = models[0] if models else platform.processor() or platform.machine()

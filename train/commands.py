@@ -150,7 +150,9 @@ def evaluate(
             "seed": seed,
             "frames": len(markers),
         }
-        save_json(json, {**settings, "figures": report.figures, "slot_accuracy_by_marker": by_marker})
+        # JSON knows no NaN, which stands where there was nothing to count.
+        figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
+        save_json(json, {**settings, "figures": figures, "slot_accuracy_by_marker": by_marker})
 
 
 def labeler_of(glove: str, labeler: str | None) -> TrainedSetLabeler:
@@ -195,9 +197,13 @@ def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
         table.add_column(f"{name} [%]", justify="right")
     for figure in next(iter(columns.values())):
         table.add_row(
-            figure.replace("_", " "), *(f"{100 * column[figure]:.2f}" for column in columns.values())
+            figure.replace("_", " "), *map(_percent, (column[figure] for column in columns.values()))
         )
     Console().print(table)
+
+
+def _percent(share: float) -> str:
+    return "-" if np.isnan(share) else f"{100 * share:.2f}"
 
 
 def _capture_files(paths: tuple[Path, ...]) -> list[Path]:

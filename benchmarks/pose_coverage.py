@@ -1,6 +1,6 @@
 """How well sampled poses cover those of real people: the distance to the nearest one.
 
-    python benchmarks/coverage.py CAPTURES [--poses 100000 --frames 2000 --seed 0]
+    python benchmarks/pose_coverage.py CAPTURES [--poses 100000 --frames 2000 --seed 0]
 
 CAPTURES is a folder of labelled dense19 captures, one sub-folder a person (such as the public
 Mocap_SIG18_Data); only right hands, named *_right.trc, are used. Sampled poses of the mean hand are scaled to
