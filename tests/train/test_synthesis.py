@@ -158,7 +158,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(tmp_path, monkeypat
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device", str(tmp_path / "set" / rows_name(0)))
 
-    monkeypatch.setattr(np, "save", full)
+    monkeypatch.setattr(np.lib.format, "write_array_header_1_0", full)
     code = main(["generate", "--num-frames", "300", "--out", str(tmp_path / "set"), "--workers", "1"])
     assert code == 1
     assert capsys.readouterr().err.count("\n") == 1
