@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from machine import describe
+from people import right_hands
 
 from gloves.attach import attach
-from gloves.captures import read_capture
-from gloves.captures.markers import select_markers
 from gloves.layout import load_layout
 from handsim.model import HandModel, join_qpos
 from handsim.transforms import rigid_fit
@@ -65,13 +64,7 @@ def main() -> None:
     def size(markers: np.ndarray) -> float:
         return float(np.linalg.norm(markers[:, first] - markers[:, second], axis=1).mean())
 
-    people = {
-        person.name: np.concatenate(
-            [select_markers(read_capture(file), layout.names) for file in sorted(person.rglob("*_right.trc"))]
-        )
-        for person in sorted(arguments.captures.iterdir())
-        if person.is_dir()
-    }
+    people = right_hands(arguments.captures, layout.names)
     total = sum(map(len, people.values()))
     errors = []
     for name, markers in people.items():

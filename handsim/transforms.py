@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -36,6 +37,27 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
     )
     matrix: NDArray[np.float64] = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     return matrix
+
+
+def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Unit wxyz quaternions (T, 4) of rotation matrices."""
+    quaternions: NDArray[np.float64] = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
+    return quaternions
+
+
+def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]:
+    """Unit wxyz quaternions (T, 4) of rotation vectors [rad]."""
+    quaternions: NDArray[np.float64] = Rotation.from_rotvec(vectors).as_quat(scalar_first=True)
+    return quaternions
+
+
+def multiply_quaternions(
+    first: Float[np.ndarray, "T 4"], second: Float[np.ndarray, "T 4"]
+) -> NDArray[np.float64]:
+    """Rotations `second`, then `first`, as unit wxyz quaternions (T, 4)."""
+    product = Rotation.from_quat(first, scalar_first=True) * Rotation.from_quat(second, scalar_first=True)
+    quaternions: NDArray[np.float64] = product.as_quat(scalar_first=True)
+    return quaternions
 
 
 def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
