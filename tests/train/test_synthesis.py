@@ -30,6 +30,17 @@ if __name__ == "__main__":
     synthesis.generate_dataset(config, Path(sys.argv[1]), workers=1)
 """
 
+# A pause after each shard, so that the kill comes before the end however busy the machine is.
+SLOWLY = """
+import time
+make_shard = synthesis.make_shard
+def make_slowly(*arguments):
+    shard = make_shard(*arguments)
+    time.sleep(1.0)
+    return shard
+synthesis.make_shard = make_slowly
+"""
+
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch):
@@ -85,7 +96,7 @@ def environment() -> dict[str, str]:
 
 def test_a_killed_run_goes_on_to_the_same_bytes(finished, tmp_path):
     out, script = tmp_path / "killed", tmp_path / "make.py"
-    script.write_text(COMMAND)
+    script.write_text(COMMAND.replace("if __name__", SLOWLY + "if __name__"))
     process = subprocess.Popen([sys.executable, script, out], env=environment())
     deadline = time.monotonic() + 60
     while not (out / rows_name(1)).exists() and time.monotonic() < deadline:
