@@ -12,7 +12,7 @@ from gloves.layout import MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.mjcf import Site
 from handsim.model import HandModel
-from handsim.surface import HandSurface, linear_blend_skinning
+from handsim.surface import HandSurface, linear_blend_skinning, vertex_normals
 from handsim.topology import BONE_NAMES, PALM
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def attach(layout: MarkerLayout, model: HandModel) -> Attachment:
     """
     surface = model.surface
     triangles = surface.vertices[surface.faces]
-    vertex_normals = surface.vertex_normals()
+    skin_normals = vertex_normals(surface.vertices, surface.faces)
     centroids = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - centroids[:, None], axis=-1).max()
     corners, bary = np.empty((layout.num_markers, 3), dtype=np.int64), np.empty((layout.num_markers, 3))
@@ -86,7 +86,7 @@ def attach(layout: MarkerLayout, model: HandModel) -> Attachment:
             )
         face, bary[number], distance = found
         corners[number] = surface.faces[near[face]]
-        normal = bary[number] @ vertex_normals[corners[number]]
+        normal = bary[number] @ skin_normals[corners[number]]
         normals[number] = normal / np.linalg.norm(normal)
         points[number] = origin + distance * direction + layout.radius * normals[number]
     indices, shares = _blend_weights(surface, corners, bary)

@@ -181,7 +181,7 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
     rng = np.random.default_rng(seed)
     layout = load("gloves.layout:load_layout")(GLOVE)
     row = chain.rows[_telling_frame(chain)]
-    seen = _seen(row["cameras"], chain.dataset.manifest.min_cameras)
+    seen = load("gloves.visibility:seen_by_enough")(row["cameras"], chain.dataset.manifest.min_cameras)
     cloud = load("train.augmentation:corrupt")(
         row["markers"][None].astype(np.float64),
         load("train.augmentation:Corruption")(0, _PAPER_GHOSTS),
@@ -215,10 +215,10 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
 def _telling_frame(chain: _Chain) -> int:
     """An early frame with hidden markers, whose seen markers lie well apart when seen from the back."""
     best, widest = 0, -1.0
-    model = HandModel.named("M")
+    model, seen_by_enough = HandModel.named("M"), load("gloves.visibility:seen_by_enough")
     for number in range(min(400, len(chain.rows))):
         row = chain.rows[number]
-        seen = _seen(row["cameras"], chain.dataset.manifest.min_cameras)
+        seen = seen_by_enough(row["cameras"], chain.dataset.manifest.min_cameras)
         if not 0.7 * len(seen) <= seen.sum() < len(seen):
             continue
         wrist = model.forward_kinematics(row["qpos"][None].astype(np.float64))[0, 0, :3, :3]
@@ -227,11 +227,6 @@ def _telling_frame(chain: _Chain) -> int:
         if gaps.min() > widest:
             best, widest = number, float(gaps.min())
     return best
-
-
-def _seen(cameras: np.ndarray, min_cameras: int) -> np.ndarray:
-    enough: np.ndarray = np.bitwise_count(cameras) >= min_cameras
-    return enough
 
 
 def _attachment(model: HandModel) -> Any:

@@ -49,17 +49,6 @@ class HandSurface:
     bone_weights: Float[np.ndarray, "V 4"]
     """Their shares: not negative, in descending order, summing to one."""
 
-    def vertex_normals(self) -> Float[np.ndarray, "V 3"]:
-        """Outward unit normals at rest, each the area-weighted mean of the faces around the vertex."""
-        triangles = self.vertices[self.faces]
-        crosses = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        corners, count = self.faces.ravel(), len(self.vertices)
-        normals = np.stack(
-            [np.bincount(corners, np.repeat(crosses[:, axis], 3), count) for axis in range(3)], axis=1
-        )
-        unit: np.ndarray = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-        return unit
-
 
 class _Template(NamedTuple):
     """What all hands share."""
@@ -132,6 +121,18 @@ def _refit(
     scales.breadth *= shape.breadth / float(np.ptp(loop[:, 1]))
     row = vertices[palm[METACARPUS]]
     scales.thickness *= shape.palm_thickness / float(row[dorsal(3), 2] - row[palmar(3), 2])
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Outward unit normals, each the area-weighted mean of the faces around its vertex."""
+    corners = vertices[faces]
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = [np.bincount(faces.ravel(), np.repeat(crosses[:, axis], 3), len(vertices)) for axis in range(3)]
+    normals = np.stack(sums, axis=1)
+    unit: np.ndarray = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return unit
 
 
 def linear_blend_skinning(

@@ -22,13 +22,11 @@ if TYPE_CHECKING:
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(2.0)
 _SWAY: Final = np.deg2rad(3.0)  # all fingers to one side
-_SPLIT: Final = np.array(
-    [0.3, 0.2, 0.25]
-)  # how often the fingers part: index-middle, middle-ring, ring-little
+# How often the fingers part: index-middle, middle-ring, ring-little.
+_SPLIT: Final = np.array([0.3, 0.2, 0.25])
 _ALIKE: Final = 0.993
-_SLOPE: Final = 0.15 * np.array(
-    [-1.5, -0.5, 0.5, 1.5]
-)  # from index to little, standard deviation in the latent
+# How much curl may grow from index to little, standard deviation in the latent.
+_SLOPE: Final = 0.15 * np.array([-1.5, -0.5, 0.5, 1.5])
 _DIP_SHARE: Final = 0.68
 _DIP_LAG: Final = np.deg2rad(6.0)
 _DIP_NOISE: Final = np.deg2rad(9.0)

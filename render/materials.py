@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from handsim.model import HandModel
+from handsim.surface import vertex_normals
 from handsim.topology import BONES, DIGITS
 from render._gl import load_pyrender
 
@@ -64,7 +65,7 @@ def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
         share = ((surface.vertices - origin) @ along) / model.skeleton.lengths[last]
         mine = (surface.bone_weights * (surface.bone_indices == last)).sum(axis=1)
         reddening += mine * np.clip(share, 0.0, 1.0)
-    pale = np.clip(-surface.vertex_normals()[:, 2], 0.0, 1.0)[:, None]
+    pale = np.clip(-vertex_normals(surface.vertices, surface.faces)[:, 2], 0.0, 1.0)[:, None]
     paleness, redness = np.array([0.10, 0.06, 0.06]), np.array([0.0, -0.16, -0.13])
     tint: NDArray[np.float64] = 1.0 + pale * paleness + reddening[:, None] * redness
     return tint

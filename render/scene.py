@@ -13,6 +13,7 @@ from gloves.attach import Attachment
 from handsim._checks import check_array
 from handsim.errors import HandSimError
 from handsim.model import HandModel
+from handsim.surface import vertex_normals
 from handsim.topology import NUM_QPOS
 from render._gl import load_pyrender
 from render.materials import (
@@ -26,7 +27,7 @@ from render.materials import (
 )
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
     from numpy.typing import NDArray
 
 OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -246,18 +247,6 @@ def _mesh(
 @functools.cache
 def _unit_ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=3)
-
-
-def vertex_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V 3"]:
-    """Outward unit normals, each the area-weighted mean of the faces around its vertex."""
-    corners = vertices[faces]
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sums = [np.bincount(faces.ravel(), np.repeat(crosses[:, axis], 3), len(vertices)) for axis in range(3)]
-    normals = np.stack(sums, axis=1)
-    unit: NDArray[np.float64] = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    return unit
 
 
 def _frame_with_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:

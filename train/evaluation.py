@@ -50,13 +50,5 @@ def evaluate_labeler(
         frames = [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)]
         truths = [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)]
         for labelling, truth in zip(labeler.label_frames(frames), truths, strict=True):
-            counts.add(labelling.labels, truth, num_labels)
-            right_by_marker += _right_slots(labelling.labels, truth, num_labels)
+            right_by_marker += counts.add(labelling.labels, truth, num_labels)
     return Report(counts.figures(), right_by_marker / max(1, len(markers)), len(markers))
-
-
-def _right_slots(labels: np.ndarray, truth: np.ndarray, num_labels: int) -> np.ndarray:
-    """Which slots are right in one frame."""
-    named = np.arange(num_labels)[:, None]
-    right: np.ndarray = ((labels == named) == (truth == named)).all(axis=1)
-    return right

@@ -115,12 +115,12 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> Float[np.ndarr
     return cloud
 
 
-def save_labeler(folder: Path, network: SetLabeler, card: dict[str, Any], *, stem: str = "labeler") -> None:
+def save_labeler(folder: Path, network: SetLabeler, card: dict[str, Any]) -> None:
     """Write weights and model card; `card` holds at least `marker_names`."""
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
-    with atomic_write(folder / f"{stem}.safetensors") as temporary:
+    with atomic_write(folder / WEIGHTS) as temporary:
         save_file(tensors, temporary)
-    save_json(folder / f"{stem}.json", {"network": dataclasses.asdict(network.config), **card})
+    save_json(folder / CARD, {"network": dataclasses.asdict(network.config), **card})
 
 
 def shipped_labelers() -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import torch
 
+from gloves.visibility import seen_by_enough
 from handsim._version import __version__
 from handsim.errors import DatasetError, WeightsError
 from handsim.io import atomic_write
@@ -64,9 +65,8 @@ def train_labeler(
     state.restore(out / CHECKPOINT)
     saved = time.monotonic()
     while state.done < config.samples:
-        rng = np.random.default_rng(
-            (config.seed, state.done)
-        )  # so that a resumed run draws what it would have
+        # One generator a step, so that a resumed run draws what it would have.
+        rng = np.random.default_rng((config.seed, state.done))
         cloud = draw_batch(rows[:-held_out], dataset.manifest.min_cameras, config, rng=rng)
         loss = state.step(cloud)
         if progress is not None:
@@ -154,7 +154,7 @@ def draw_batch(
     markers = (markers - centre) @ stretch
     jitter = config.jitter * rng.uniform()
     if rng.random() < config.rig_share:
-        seen = np.bitwise_count(chosen["cameras"]) >= min_cameras
+        seen = seen_by_enough(chosen["cameras"], min_cameras)
         ghosts = (chosen["ghosts"].astype(np.float64) - centre) @ stretch
         few = Corruption(occlude=2, ghosts=0, jitter=jitter)
         return corrupt(markers, few, seen=seen, ghosts=ghosts, rng=rng)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from jaxtyping import Int
+    from jaxtyping import Bool, Int
 
 
 @dataclass(slots=True)
@@ -33,10 +33,17 @@ class LabelCounts:
     ghosts_said: int = 0
     ghosts_right: int = 0
 
-    def add(self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int) -> None:
-        """Count one frame: labels given to its points, and the true ones; -1 is a ghost."""
+    def add(
+        self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
+    ) -> Bool[np.ndarray, "M"]:
+        """Count one frame: labels given to its points, and the true ones; -1 is a ghost.
+
+        Returns:
+            Which label slots are right.
+        """
         said, held = _slots(labels, num_labels), _slots(truth, num_labels)
-        slots_right, points_right = int((said == held).sum()), int((labels == truth).sum())
+        right: np.ndarray = said == held
+        slots_right, points_right = int(right.sum()), int((labels == truth).sum())
         self.frames += 1
         self.frames_right += slots_right == num_labels and points_right == len(truth)
         self.slots += num_labels
@@ -49,6 +56,7 @@ class LabelCounts:
         self.ghosts += int((truth < 0).sum())
         self.ghosts_said += int((labels < 0).sum())
         self.ghosts_right += int(((labels < 0) & (truth < 0)).sum())
+        return right
 
     def figures(self) -> dict[str, float]:
         """All figures by name."""

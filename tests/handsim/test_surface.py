@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from handsim.shape import ADULTS, EVERYBODY, SIZES, HandShape, named_shape, sample_shape, shape_from_measures
 from handsim.skeleton import build_skeleton
-from handsim.surface import HandSurface, build_surface, linear_blend_skinning
+from handsim.surface import HandSurface, build_surface, linear_blend_skinning, vertex_normals
 from handsim.topology import BONES, DIGITS, JOINTS, NUM_BONES
 from handsim.transforms import axis_angle_matrix, euler_matrix
 
@@ -284,3 +284,13 @@ def test_skinning_against_the_plain_formula():
             share * (motion[bone] @ [*point, 1.0])[:3] for bone, share in zip(bones, shares, strict=True)
         )
         assert_allclose(got, wanted, atol=1e-12)
+
+
+def test_vertex_normals_are_the_area_weighted_means_of_their_faces():
+    surface = build_surface(named_shape("M"))
+    sums = np.zeros_like(surface.vertices)
+    for face in surface.faces:
+        a, b, c = surface.vertices[face]
+        sums[face] += np.cross(b - a, c - a)  # twice the area along the normal
+    expected = sums / np.linalg.norm(sums, axis=1, keepdims=True)
+    np.testing.assert_allclose(vertex_normals(surface.vertices, surface.faces), expected, atol=1e-9)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from handsim.cameras import look_at
 from handsim.errors import HandSimError
 from handsim.model import HandModel, join_qpos
-from render.scene import PosedHand, View, vertex_normals, view_along
+from render.scene import PosedHand, View, view_along
 
 SIZE = (320, 240)
 
@@ -42,13 +42,6 @@ def test_view_along_agrees_with_look_at() -> None:
     place, target = np.array([0.5, -1.0, 0.7]), np.array([0.1, 0.2, 0.0])
     view = view_along(target - place, np.array([0.0, 0.0, 1.0]), np.array([target, target + 0.1]), SIZE)
     np.testing.assert_allclose(view.T_world_camera[:3, :3], look_at(place, target)[:3, :3], atol=1e-12)
-
-
-def test_normals_of_the_rest_pose_are_the_surface_s(model: HandModel) -> None:
-    surface = model.surface
-    np.testing.assert_allclose(
-        vertex_normals(surface.vertices, surface.faces), surface.vertex_normals(), atol=1e-9
-    )
 
 
 @pytest.mark.parametrize("angle", [0.0, -1.0, 4.0, np.nan])
