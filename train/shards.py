@@ -17,9 +17,10 @@ import numpy as np
 
 from gloves.ghosts import MAX_GHOSTS
 from handsim.errors import DatasetError
+from handsim.hand_records import unpack_hand
 from handsim.io import atomic_write
 from handsim.shape import HandShape
-from handsim.topology import NUM_QPOS, SIDES
+from handsim.topology import NUM_QPOS
 
 if TYPE_CHECKING:
     from jaxtyping import Shaped
@@ -41,32 +42,6 @@ def row_dtype(num_markers: int) -> np.dtype[np.void]:
             ("ghosts", "<f4", (MAX_GHOSTS, 3)),
         ]
     )
-
-
-HAND_DTYPE: Final = np.dtype(
-    [
-        ("left", "?"),
-        ("length", "<f8"),
-        ("breadth", "<f8"),
-        ("bone_lengths", "<f8", (5, 3)),
-        ("knuckles", "<f8", (5, 3)),
-        ("base_angles", "<f8", (5, 3)),
-        ("radii", "<f8", (5, 4)),
-        ("palm_thickness", "<f8"),
-    ]
-)
-
-
-def pack_hand(shape: HandShape) -> tuple[Any, ...]:
-    """A hand as one element of a `HAND_DTYPE` array."""
-    return (shape.side == "left", *(getattr(shape, name) for name in (HAND_DTYPE.names or ())[1:]))
-
-
-def unpack_hand(record: np.void) -> HandShape:
-    """The hand of one element of a `HAND_DTYPE` array."""
-    fields = {name: record[name] for name in (HAND_DTYPE.names or ())[1:]}
-    fields = {name: float(value) if np.ndim(value) == 0 else value for name, value in fields.items()}
-    return HandShape(side=SIDES[0] if record["left"] else SIDES[1], **fields)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.visibility import pack_cameras, visible_cameras
 from handsim.cameras import CameraRig, named_rig
 from handsim.errors import DatasetError, LayoutError, ShapeError
+from handsim.hand_records import HAND_DTYPE, pack_hand
 from handsim.model import HandModel, join_qpos
 from handsim.shape import Population, sample_shape
 from handsim.topology import SIDES, Side
@@ -28,12 +29,10 @@ from poses.samplers import PoseMix
 from poses.validity import resting_angles, sample_valid_angles
 from train.shards import (
     CONFIG,
-    HAND_DTYPE,
     Manifest,
     checksum,
     hands_name,
     load_json,
-    pack_hand,
     row_dtype,
     rows_name,
     save_array,

@@ -1,0 +1,46 @@
+"""Gaps of a capture, counted as Han et al. 2018 count them in Table 3, and a marker at a time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Int
+
+
+class GapCounts(NamedTuple):
+    """One row of Table 3."""
+
+    frames: int
+    gaps: int
+    """Stretches of frames in each of which at least one marker is missing."""
+    average_length: float
+    """Frames a gap (AGL); NaN without gaps."""
+    average_missing: float
+    """Missing markers a frame that misses any (AMF); NaN without gaps."""
+
+
+def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
+    """Table 3's figures of a capture with M expected markers."""
+    missing = ~present
+    lacking = missing.any(axis=1, keepdims=True)
+    lengths = run_lengths(lacking)
+    gaps = len(lengths)
+    return GapCounts(
+        frames=len(present),
+        gaps=gaps,
+        average_length=float(lengths.mean()) if gaps else float("nan"),
+        average_missing=float(missing.sum() / lacking.sum()) if gaps else float("nan"),
+    )
+
+
+def run_lengths(flags: Bool[np.ndarray, "T M"]) -> Int[np.ndarray, "G"]:
+    """Lengths of all unbroken stretches of True, column by column [frames]."""
+    padded = np.zeros((len(flags) + 2, flags.shape[1]), dtype=np.int8)
+    padded[1:-1] = flags
+    steps = np.diff(padded, axis=0).T
+    begins, ends = np.nonzero(steps == 1)[1], np.nonzero(steps == -1)[1]
+    lengths: np.ndarray = ends - begins
+    return lengths

@@ -1,0 +1,147 @@
+"""A take: what an optical system put out, frame by frame, and the truth beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.layout import MarkerLayout, MarkerPlace
+from handsim.errors import CaptureError
+from handsim.hand_records import HAND_DTYPE, pack_hand, unpack_hand
+from handsim.io import atomic_write
+from handsim.shape import HandShape
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+SCHEMA: Final = 1
+SUFFIX: Final = ".truth.npz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlovedHand:
+    """One hand of a take."""
+
+    shape: HandShape
+    layout: MarkerLayout
+    """The glove as it was worn: places after slipping."""
+    qpos: Float[np.ndarray, "T 27"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldBody:
+    """A rigid body of a take."""
+
+    name: str
+    marker_names: tuple[str, ...]
+    T_world_body: Float[np.ndarray, "T 4 4"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Take:
+    """Points of every frame with IDs and truth.
+
+    A label counts through the markers of the hands, in their order, then those of the body; -1 is a ghost or
+    no point at all. An unbroken stretch of a column is one ID.
+    """
+
+    rate: float
+    """Frames a second [Hz]."""
+    points: Float[np.ndarray, "T N 3"]
+    """World frame [m], NaN where a column has no point."""
+    ids: Int[np.ndarray, "T N"]
+    labels: Int[np.ndarray, "T N"]
+    hands: tuple[GlovedHand, ...]
+    body: HeldBody | None
+    settings: dict[str, Any]
+    """What made it, as JSON."""
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.points)
+
+    @property
+    def hand_labels(self) -> tuple[range, ...]:
+        """The labels of each hand's markers."""
+        sizes = np.cumsum([0, *(hand.layout.num_markers for hand in self.hands)])
+        return tuple(range(int(low), int(high)) for low, high in itertools.pairwise(sizes))
+
+    def observed(self, label: range) -> Float[np.ndarray, "T M 3"]:
+        """Where the system put the markers with these labels [m], NaN where it lost them."""
+        observed = np.full((self.num_frames, len(label), 3), np.nan)
+        mine = (self.labels >= label.start) & (self.labels < label.stop)
+        frame, column = np.nonzero(mine)
+        observed[frame, self.labels[frame, column] - label.start] = self.points[frame, column]
+        return observed
+
+
+def save_take(path: Path, take: Take) -> None:
+    """Write a take's `.truth.npz`, whole or not at all."""
+    body = take.body
+    header = {
+        "schema": SCHEMA,
+        "units": "metres, radians, world frame",
+        "rate": take.rate,
+        "layouts": [dataclasses.asdict(hand.layout) for hand in take.hands],
+        "body": None if body is None else {"name": body.name, "marker_names": body.marker_names},
+        "settings": take.settings,
+    }
+    arrays = {
+        "header": np.array(json.dumps(header)),
+        "points": take.points,
+        "ids": take.ids.astype(np.int32),
+        "labels": take.labels.astype(np.int16),
+        "hands": np.array([pack_hand(hand.shape) for hand in take.hands], dtype=HAND_DTYPE),
+        "qpos": np.stack([hand.qpos for hand in take.hands]),
+        "T_world_body": np.zeros((0, 4, 4)) if body is None else body.T_world_body,
+    }
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def load_take(path: Path) -> Take:
+    """Read a `.truth.npz`.
+
+    Raises:
+        CaptureError: No such file, not a take, of another schema, or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        header = json.loads(str(arrays["header"]))
+        if header["schema"] != SCHEMA:
+            raise CaptureError(f"{path}: a take of schema {header['schema']}, wanted {SCHEMA}")
+        return _unpack(header, arrays)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise CaptureError(f"{path}: not a take, or a damaged one") from error
+
+
+def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
+    layouts = [
+        MarkerLayout(**{**stored, "markers": tuple(MarkerPlace(**place) for place in stored["markers"])})
+        for stored in header["layouts"]
+    ]
+    shapes = [unpack_hand(record) for record in arrays["hands"]]
+    hands = tuple(map(GlovedHand, shapes, layouts, arrays["qpos"]))
+    body = header["body"] and HeldBody(
+        header["body"]["name"], tuple(header["body"]["marker_names"]), arrays["T_world_body"]
+    )
+    return Take(
+        rate=float(header["rate"]),
+        points=arrays["points"],
+        ids=arrays["ids"],
+        labels=arrays["labels"],
+        hands=hands,
+        body=body,
+        settings=header["settings"],
+    )
