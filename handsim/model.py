@@ -14,7 +14,8 @@ from handsim.contact import penetration_depth
 from handsim.mjcf import build_spec
 from handsim.shape import HandShape, named_shape
 from handsim.skeleton import Skeleton, build_skeleton
-from handsim.surface import HandSurface, build_surface, linear_blend_skinning
+from handsim.skinning import skin_frames
+from handsim.surface import HandSurface, build_surface
 from handsim.topology import BONES, JOINTS, NUM_BONES, NUM_JOINTS, NUM_QPOS, Side
 from handsim.transforms import axis_angle_matrix, quaternion_matrix
 
@@ -90,7 +91,7 @@ class HandModel:
     def skin(self, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T V 3"]:
         """Skin vertices [m] in the world, by linear blend skinning."""
         surface = self.surface
-        return linear_blend_skinning(
+        return skin_frames(
             surface.vertices,
             surface.bone_indices,
             surface.bone_weights,

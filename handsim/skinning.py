@@ -1,0 +1,55 @@
+"""Linear blend skinning, compiled: the whole skin in every frame, fast enough to cast rays against it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+
+def skin_frames(
+    points: Float[np.ndarray, "V 3"],
+    bone_indices: Int[np.ndarray, "V 4"],
+    bone_weights: Float[np.ndarray, "V 4"],
+    rest_transforms: Float[np.ndarray, "L 4 4"],
+    transforms: Float[np.ndarray, "T L 4 4"],
+) -> Float[np.ndarray, "T V 3"]:
+    """What `surface.linear_blend_skinning` computes, for weights in descending order.
+
+    Args:
+        points: Rest positions, in the frame of `rest_transforms` [m].
+        bone_indices: The bones that move each point.
+        bone_weights: Their shares; the first zero ends a point's list.
+        rest_transforms: Bones at rest.
+        transforms: Bones in every frame, in any one frame of reference.
+
+    Returns:
+        Positions in the frame of `transforms` [m].
+    """
+    motion = np.ascontiguousarray((transforms @ np.linalg.inv(rest_transforms))[..., :3, :])
+    skinned: NDArray[np.float64] = _skin(points, bone_indices, bone_weights, motion)
+    return skinned
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _skin(points: Any, bones: Any, weights: Any, motion: Any) -> Any:
+    skinned = np.empty((len(motion), len(points), 3))
+    for t in range(len(motion)):
+        for v in range(len(points)):
+            px, py, pz = points[v, 0], points[v, 1], points[v, 2]
+            x, y, z = 0.0, 0.0, 0.0
+            for i in range(weights.shape[1]):
+                share = weights[v, i]
+                if share == 0.0:
+                    break
+                m = motion[t, bones[v, i]]
+                x += share * (m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3])
+                y += share * (m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3])
+                z += share * (m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3])
+            skinned[t, v, 0], skinned[t, v, 1], skinned[t, v, 2] = x, y, z
+    return skinned
