@@ -25,8 +25,8 @@ class GapCounts(NamedTuple):
 def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
     """Table 3's figures of a capture with M expected markers."""
     missing = ~present
-    lacking = missing.any(axis=1, keepdims=True)
-    lengths = run_lengths(lacking)
+    lacking: np.ndarray = missing.any(axis=1)
+    lengths = run_lengths(lacking[:, None])
     gaps = len(lengths)
     return GapCounts(
         frames=len(present),

@@ -27,7 +27,7 @@ class WristConfig:
     volume: float = 0.3
     """Half side of that cube [m]."""
     turning: float | None = None
-    """Standard deviation of the turns about each axis, from fingers ahead and palm down [rad]; None: any turn."""
+    """Standard deviation of the turns about each axis, from fingers ahead and palm down [rad]; None: any."""
     times: tuple[float, float] = (0.6, 2.0)
     """Shortest and longest time from place to place [s]."""
 
