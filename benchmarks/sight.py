@@ -1,0 +1,189 @@
+"""How right and how fast lines of sight past the skin are, what capsules miss, and what each rig sees.
+
+    python benchmarks/sight.py [--poses 500 --seed 0]
+
+One hand with the dense19 glove, random valid poses, turns and places, hands of random people. The reference for
+every line is embree (through trimesh, package embreex) on the same meshes. Speeds are processor time of one
+core; the floor of a frame is its skinning and refit, which no line is needed for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from machine import describe
+
+from gloves.attach import attach
+from gloves.layout import load_layout
+from gloves.mesh_sight import clear_of_body, clear_of_mesh, hand_tree
+from gloves.visibility import MAX_FACING, free_rays, visible_cameras
+from handsim.cameras import CameraRig, list_rigs, named_rig
+from handsim.model import HandModel, join_qpos
+from handsim.shape import sample_shape
+from handsim.topology import Side
+from handsim.transforms import random_quaternions
+from poses.validity import sample_valid_angles
+
+CENTRE = np.array([0.0, 0.0, 1.1])
+POSES_A_HAND = 50
+CHUNK = 128
+
+
+class Scene(NamedTuple):
+    model: HandModel
+    qpos: np.ndarray
+    skin: np.ndarray
+    markers: np.ndarray
+    normals: np.ndarray
+    segments: np.ndarray
+
+
+def make_scene(model: HandModel, poses: int, centre: np.ndarray, rng: np.random.Generator) -> Scene:
+    qpos = join_qpos(
+        sample_valid_angles(model, poses, rng=rng),
+        position=centre + rng.uniform(-0.3, 0.3, size=(poses, 3)),
+        quaternion=random_quaternions(poses, rng=rng),
+    )
+    bones = model.forward_kinematics(qpos)
+    markers, normals = attach(load_layout("dense19"), model).markers(model, bones)
+    return Scene(model, qpos, model.skin(qpos), markers, normals, model.capsules.posed(bones))
+
+
+def in_view_and_facing(markers: np.ndarray, normals: np.ndarray, rig: CameraRig) -> np.ndarray:
+    to_camera = rig.positions - markers[:, :, None]
+    ahead = np.einsum("tmci,tmi->tmc", to_camera, normals)
+    return rig.in_view(markers) & (ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1))
+
+
+def embree_clear(scene: Scene, cameras: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    clear = np.zeros_like(wanted)
+    for frame in range(len(wanted)):
+        mesh = trimesh.Trimesh(scene.skin[frame], scene.model.surface.faces, process=False)
+        marker, camera = np.nonzero(wanted[frame])
+        starts = scene.markers[frame, marker]
+        clear[frame, marker, camera] = ~mesh.ray.intersects_any(starts, cameras[camera] - starts)
+    return clear
+
+
+def agreement(poses: int, rng: np.random.Generator) -> None:
+    rig, sides = named_rig("figure5"), ("right", "left")
+    embree, skin, capsules, asked = [], [], [], []
+    for number in range(poses // POSES_A_HAND):
+        side: Side = sides[number % 2]  # type: ignore[assignment]
+        scene = make_scene(HandModel(sample_shape(side=side, rng=rng)), POSES_A_HAND, CENTRE, rng)
+        everything = np.ones((*scene.markers.shape[:2], len(rig.positions)), dtype=bool)
+        clear = clear_of_mesh(hand_tree(), scene.skin, scene.markers, rig.positions, everything)
+        reference = embree_clear(scene, rig.positions, everything)
+        wanted = in_view_and_facing(scene.markers, scene.normals, rig)
+        radii = scene.model.capsules.radii
+        embree.append(reference)
+        skin.append(clear)
+        asked.append(wanted)
+        capsules.append(visible_cameras(scene.markers, scene.normals, rig, scene.segments, radii))
+    oracle, ours, facing, flesh = (np.concatenate(each) for each in (embree, skin, asked, capsules))
+    both = (ours & facing).sum(-1) >= 2
+    print(f"\nskin against embree, {ours.size:,} lines (all cameras, facing or not), {both.size:,} markers")
+    print(f"  lines alike {(oracle == ours).mean():.4%}, of those in view and facing "
+          f"{(oracle == ours)[facing].mean():.4%}")  # fmt: skip
+    print(
+        f"  markers alike (seen by 2 cameras or not) {(both == ((oracle & facing).sum(-1) >= 2)).mean():.4%}"
+    )
+    seen, loose = ours & facing, flesh.sum(-1) >= 2
+    print("\ncapsules against skin, of the lines in view and facing")
+    print(f"  capsules see, skin hides {(flesh & ~seen)[facing].mean():.3%}; "
+          f"the reverse {(seen & ~flesh)[facing].mean():.3%}")  # fmt: skip
+    print(
+        f"  markers only capsules see {(loose & ~both).mean():.3%}, only skin sees {(both & ~loose).mean():.3%}"
+    )
+    names = load_layout("dense19").names
+    print(f"  markers missing, capsules -> skin: all {(~loose).mean():.2%} -> {(~both).mean():.2%}")
+    for number, name in enumerate(names):
+        print(f"    {name:10s} {(~loose[:, number]).mean():.2%} -> {(~both[:, number]).mean():.2%}")
+
+
+def rigs(poses: int, rng: np.random.Generator) -> None:
+    scene = make_scene(HandModel.named("M"), poses, CENTRE, rng)
+    cube = CENTRE + rng.uniform(-0.3, 0.3, size=(100_000, 3))
+    print("\nrigs: cube of half side 0.3 m in >= 2, >= 3 views; markers seen by >= 2, >= 3; cameras a marker")
+    for name in list_rigs():
+        rig = named_rig(name)
+        views = rig.in_view(cube).sum(axis=-1)
+        wanted = in_view_and_facing(scene.markers, scene.normals, rig)
+        seen = clear_of_mesh(hand_tree(), scene.skin, scene.markers, rig.positions, wanted).sum(axis=-1)
+        print(f"  {name:8s} {(views >= 2).mean():.2%} {(views >= 3).mean():.2%}; "
+              f"{(seen >= 2).mean():.1%} {(seen >= 3).mean():.1%}; {seen.mean():.2f}")  # fmt: skip
+
+
+def cost(job: Callable[[], object]) -> float:
+    """Processor time [us] a frame of a job over CHUNK frames, median of nine."""
+    job()
+    times = []
+    for _ in range(9):
+        start = time.process_time()
+        job()
+        times.append(time.process_time() - start)
+    return float(np.median(times)) / CHUNK * 1e6
+
+
+def speeds(rng: np.random.Generator) -> None:
+    rig = named_rig("figure5")
+    cameras, tree = rig.positions, hand_tree()
+    hands = []
+    for side, offset in (("right", -0.06), ("left", 0.06)):
+        model = HandModel.named("M", side=side)  # type: ignore[arg-type]
+        hands.append(make_scene(model, CHUNK, CENTRE, rng))
+        shift = CENTRE + [0.0, offset, 0.0] - hands[-1].qpos[:, None, :3]  # two hands close together
+        hands[-1] = hands[-1]._replace(
+            qpos=np.concatenate([hands[-1].qpos[:, :3] + shift[:, 0], hands[-1].qpos[:, 3:]], axis=1),
+            skin=hands[-1].skin + shift, markers=hands[-1].markers + shift,
+            segments=hands[-1].segments + shift[:, None],
+        )  # fmt: skip
+    markers = np.concatenate([hand.markers for hand in hands], axis=1)
+    normals = np.concatenate([hand.normals for hand in hands], axis=1)
+    wanted = in_view_and_facing(markers, normals, rig)
+    nothing = np.zeros_like(wanted)
+
+    def past_both(lines: np.ndarray) -> np.ndarray:
+        for hand in hands:
+            lines = clear_of_mesh(tree, hand.skin, markers, cameras, lines)
+        return lines
+
+    count = wanted.sum() / CHUNK
+    bones = cost(lambda: [hand.model.forward_kinematics(hand.qpos) for hand in hands])
+    skinning = cost(lambda: [hand.model.skin(hand.qpos) for hand in hands]) - bones
+    refit = sum(cost(lambda h=hand: clear_of_mesh(tree, h.skin, markers, cameras, nothing)) for hand in hands)  # type: ignore[misc]
+    rays = cost(lambda: past_both(wanted)) - refit
+    facing = cost(lambda: in_view_and_facing(markers, normals, rig))
+    flesh = cost(lambda: [free_rays(markers, cameras, h.segments, h.model.capsules.radii) for h in hands])
+    poses = np.tile(np.eye(4), (CHUNK, 1, 1))
+    poses[:, :3, 3] = CENTRE
+    body = cost(lambda: clear_of_body(tree, poses, markers, cameras, wanted))
+    whole = bones + skinning + refit + rays
+    print(f"\ntwo hands, {markers.shape[1]} markers, {len(cameras)} cameras, two skins of "
+          f"{len(tree.vertices):,} vertices, {len(tree.faces):,} triangles, one core, us a frame")  # fmt: skip
+    print(f"  bones {bones:.0f}, skinning {skinning:.0f}, refit {refit:.0f}, rays {rays:.0f} "
+          f"({count:.0f} lines, each past two skins: {rays / count * 1e3:.0f} ns): {whole:.0f}")  # fmt: skip
+    print(f"  {1e6 / whole:,.0f} frames/s; floor without a single line {1e6 / (whole - rays):,.0f} frames/s")
+    print(f"  beside it: in view and facing {facing:.0f}, the same lines past a rigid body of as many "
+          f"triangles {body:.0f}, capsules of both hands, all lines {flesh:.0f}")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--poses", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    print(describe("numba", "trimesh", "embreex"))
+    rng = np.random.default_rng(arguments.seed)
+    agreement(arguments.poses, rng)
+    rigs(4 * arguments.poses, rng)
+    speeds(rng)
+
+
+if __name__ == "__main__":
+    main()
