@@ -1,0 +1,148 @@
+"""Grasps settled by dynamics: fingers close around a thing until it stays where it is, however it is shaken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import mujoco
+import numpy as np
+
+from handsim.errors import ShapeError
+from handsim.model import HandModel
+from handsim.objects import RigidObject
+from handsim.topology import DIGITS, NUM_JOINTS
+from poses.couplings import HIGH, LOW
+from poses.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_scene, pose_to_qpos
+from poses.hold_library import HoldStyle, hold_names, hold_style, place_object
+from poses.validity import MAX_PENETRATION, is_valid
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_MOST_TRIES: Final = 12
+_RAMP: Final = 10  # pieces in which the motors' targets go from open to closed
+_CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 100  # steps of 2 ms
+_GRAVITY: Final = 9.81
+_MOST_DRIFT: Final = 0.006  # [m] while shaken
+_MOST_TURN: Final = np.deg2rad(12.0)
+_TOUCHING: Final = 0.0005  # [m]
+_SLOW: Final = 0.5  # [rad/s], of the hinges at the end
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hold:
+    """A hand that holds a thing."""
+
+    name: str
+    """Its style, one of `hold_names`."""
+    angles: Float[np.ndarray, "20"]
+    """Hinge angles [rad]."""
+    T_wrist_object: Float[np.ndarray, "4 4"]
+    contacts: tuple[str, ...]
+    """Names of the hand's capsules that touch the thing."""
+
+
+def settle_hold(
+    model: HandModel, obj: RigidObject, *, rng: np.random.Generator, hold: str | None = None
+) -> Hold:
+    """A valid grasp of a thing: it is placed, fingers close under limited torque, and it is shaken.
+
+    Args:
+        model: The hand.
+        obj: What it holds.
+        rng: Source of all randomness: placement, and the style when none is named.
+        hold: One of `hold_names`; any of them when not given.
+
+    Raises:
+        ShapeError: The thing is not held so, or this hand does not get hold of it in a dozen tries.
+    """
+    names = hold_names(obj) if hold is None else (hold,)
+    scene = grasp_scene(model, obj)
+    why = ""
+    for _ in range(_MOST_TRIES):
+        style = hold_style(obj, names[rng.integers(len(names))])
+        settled = try_hold(scene, style, rng=rng)
+        if isinstance(settled, Hold):
+            return settled
+        why = settled
+    raise ShapeError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
+
+
+def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> Hold | str:
+    """One try: a hold, or why there is none."""
+    start = place_object(scene, style, rng=rng)
+    data = scene.new_data(style.open, start)
+    _close(scene, data, style, start)
+    before = scene.object_pose(data)
+    if not _stays(scene, data, before):
+        return "it slips"
+    angles, pose = _backed_off(scene, style, data.qpos[:NUM_JOINTS].copy(), scene.object_pose(data))
+    if not is_valid(scene.hand, angles[None])[0]:
+        return "the fingers dig into each other"
+    if scene.depth(angles[None], pose[None])[0] > MAX_OBJECT_PENETRATION:
+        return "the fingers dig into it"
+    contacts = _contacts(scene, angles, pose)
+    for need in style.needs:
+        if not any(contact.startswith(need) for contact in contacts):
+            return f"the {need} does not touch it"
+    return Hold(style.name, angles, pose, contacts)
+
+
+def _close(
+    scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]
+) -> None:
+    """Close the fingers, the thing first guided by a soft spring and then free, without gravity."""
+    model = scene.mj_model
+    guide = pose_to_qpos(start)
+    data.mocap_pos[0], data.mocap_quat[0] = guide[:3], guide[3:]
+    data.eq_active[:] = 1
+    for share in np.arange(1, _RAMP + 1) / _RAMP:
+        _pull(scene, data, style, style.open + share * (style.closed - style.open))
+        mujoco.mj_step(model, data, nstep=_CLOSE // _RAMP)
+    data.eq_active[:] = 0
+    for _ in range(_SETTLE // 25):
+        _pull(scene, data, style, style.closed)
+        mujoco.mj_step(model, data, nstep=25)
+
+
+def _pull(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, wanted: NDArray[np.float64]) -> None:
+    """Set the motors' targets, so near to where the hinges are that no torque exceeds the style's share.
+
+    A motor at the end of its torque would yield to any push; these keep their stiffness both ways.
+    """
+    here = data.qpos[:NUM_JOINTS]
+    reach = style.strength * scene.mj_model.actuator_forcerange[:, 1] / scene.mj_model.actuator_gainprm[:, 0]
+    data.ctrl[:] = here + np.clip(wanted - here, -reach, reach)
+
+
+def _stays(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64]) -> bool:
+    """Shake the thing by its own weight in six directions; whether it stays in the hand."""
+    body = scene.mj_model.body("object").id
+    weight = scene.obj.mass * _GRAVITY
+    for direction in np.concatenate([np.eye(3), -np.eye(3)]):
+        data.xfrc_applied[body, :3] = weight * direction
+        mujoco.mj_step(scene.mj_model, data, nstep=_SHAKE)
+    data.xfrc_applied[body] = 0.0
+    mujoco.mj_step(scene.mj_model, data, nstep=_REST)
+    after = scene.object_pose(data)
+    drift = np.linalg.norm(after[:3, 3] - before[:3, 3])
+    turn = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
+    slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _SLOW
+    return bool(drift < _MOST_DRIFT and turn < _MOST_TURN and slow and np.isfinite(data.qpos).all())
+
+
+def _backed_off(
+    scene: GraspScene, style: HoldStyle, angles: NDArray[np.float64], pose: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Fingers opened a little where they dig in."""
+    return np.clip(angles, LOW, HIGH), pose
+
+
+def _contacts(
+    scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]
+) -> tuple[str, ...]:
+    distances = scene.distances(scene.new_data(angles, pose))
+    names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
+    return tuple(name for name, distance in zip(names, distances, strict=True) if distance < _TOUCHING)

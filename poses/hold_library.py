@@ -1,0 +1,172 @@
+"""Named ways to hold things, in `data/holds.json`, and where they put a thing in a certain hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Final
+
+import mujoco
+import numpy as np
+
+from handsim.errors import ShapeError, choices
+from handsim.model import HandModel, join_qpos
+from handsim.objects import RigidObject
+from handsim.topology import BONE_NAMES, DIGITS
+from handsim.transforms import MIRROR, vector_quaternions, quaternion_matrix
+from poses.grasp_scene import GraspScene
+from poses.library import gesture
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_GAP: Final = 0.0005  # [m] between palm and object before the fingers close
+_SLIDE: Final = 0.15  # [m] from where an object comes up to the palm
+_HALVINGS: Final = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HoldStyle:
+    """One way to hold one thing."""
+
+    name: str
+    open: Float[np.ndarray, "20"]
+    """Angles [rad] before the fingers close."""
+    closed: Float[np.ndarray, "20"]
+    """Where the motors pull [rad]."""
+    strength: Float[np.ndarray, "20"]
+    """Share of the motors' torques."""
+    needs: tuple[str, ...]
+    """Digits, or the palm, that must touch."""
+    free: tuple[str, ...]
+    """Digits that may leave the thing."""
+    press: tuple[str, ...]
+    """Digits that may tap on it."""
+    entry: dict[str, Any]
+    """The rest of its entry: place, axes and what varies."""
+
+
+def hold_names(obj: RigidObject) -> tuple[str, ...]:
+    """Names of the ways to hold a thing; one loaded from a file knows one way, `"grasp"`."""
+    return tuple(_holds(obj))
+
+
+def hold_style(obj: RigidObject, name: str) -> HoldStyle:
+    """A way to hold a thing.
+
+    Raises:
+        ShapeError: It is not held so.
+    """
+    holds = _holds(obj)
+    if name not in holds:
+        raise ShapeError(choices(name, holds, noun=f"hold of the {obj.name}"))
+    entry = holds[name]
+    opened = _angles(gesture(entry["open"]["gesture"]), entry["open"])
+    return HoldStyle(
+        name=name,
+        open=opened,
+        closed=_angles(opened, entry["closed"]),
+        strength=np.repeat(entry["strength"], (4, 16)),
+        needs=tuple(entry["needs"]),
+        free=tuple(entry["free"]),
+        press=tuple(entry["press"]),
+        entry=entry,
+    )
+
+
+@cache
+def _library() -> dict[str, Any]:
+    text = resources.files("poses").joinpath("data/holds.json").read_text(encoding="utf-8")
+    library: dict[str, Any] = json.loads(text)["objects"]
+    return library
+
+
+def _holds(obj: RigidObject) -> dict[str, Any]:
+    library = _library()
+    holds: dict[str, Any] = library.get(obj.name, library["box"])
+    return holds
+
+
+def _angles(start: NDArray[np.float64], digits: dict[str, Any]) -> NDArray[np.float64]:
+    angles = start.copy()
+    for place, digit in enumerate(DIGITS):
+        if digit in digits:
+            angles[4 * place : 4 * place + 4] = np.deg2rad(digits[digit])
+    return angles
+
+
+def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> NDArray[np.float64]:
+    """`T_wrist_object` (4, 4) before the fingers close, varied as the style says."""
+    model, entry = scene.hand, style.entry
+    mirror = MIRROR if model.shape.side == "left" else np.eye(3)
+    place, vary = entry["place"], entry["vary"]
+    point = 1e-3 * np.array(place["point"], dtype=np.float64)
+    point[2] += 1e-3 * rng.uniform(*vary["along"])
+    bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
+    pose = np.eye(4)
+    # All is placed for a right hand, then mirrored.
+    if "between" in place:
+        at = np.mean([_landmark(model, bones, mark) for mark in place["between"]], axis=0) @ mirror
+        back = _landmark(model, bones, place["through"]) @ mirror
+        z = back - at
+        x = _turned_about(z, rng.uniform(0.0, 2 * np.pi))
+    else:
+        length, breadth = model.shape.length, model.shape.breadth
+        at = np.array([place["under"][0] * length, place["under"][1] * breadth, 0.0])
+        x, z = (np.array(entry["axes"][name], dtype=np.float64) for name in "xz")
+    z /= np.linalg.norm(z)
+    y = np.cross(z, x)
+    y /= np.linalg.norm(y)
+    rotation = np.stack([np.cross(y, z), y, z], axis=1)
+    jitter = vector_quaternions(np.deg2rad(vary["angle"]) * np.clip(rng.standard_normal((1, 3)), -1.5, 1.5))
+    rotation = quaternion_matrix(jitter)[0] @ rotation
+    at = at + 1e-3 * vary["place"] * np.clip(rng.standard_normal(3), -1.5, 1.5)
+    pose[:3, :3] = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
+    pose[:3, 3] = mirror @ (at - rotation @ point)
+    return pose if "between" in place else _slid_to_palm(scene, style, pose)
+
+
+def _turned_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    axis = axis / np.linalg.norm(axis)
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    turned: NDArray[np.float64] = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
+    return turned
+
+
+def _landmark(
+    model: HandModel, bones: NDArray[np.float64], mark: tuple[str, float, float, float]
+) -> NDArray[np.float64]:
+    """Place on a bone in the wrist's frame, for either side."""
+    name, along, sideways, back = mark
+    number = BONE_NAMES.index(name)
+    radius = model.capsules.radii[model.capsules.bones == number][0]
+    sideways = -sideways if model.shape.side == "left" else sideways
+    local = np.array([along * model.skeleton.lengths[number], sideways * radius, back * radius])
+    world: NDArray[np.float64] = bones[number, :3, :3] @ local + bones[number, :3, 3]
+    return world
+
+
+def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The object brought up from below until it almost touches the palm."""
+    palm = [geom for geom in scene.hand_geoms if scene.mj_model.geom(geom).name.startswith("palm")]
+
+    def gap(height: float) -> float:
+        raised = pose.copy()
+        raised[2, 3] += height
+        data = scene.new_data(style.open, raised)
+        return min(
+            mujoco.mj_geomDistance(scene.mj_model, data, geom, part, 1.0, None)
+            for geom in palm
+            for part in scene.object_geoms
+        )
+
+    low, high = -_SLIDE, 0.0  # free, too high
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if gap(middle) > _GAP else (low, middle)
+    pose[2, 3] += low
+    return pose
