@@ -82,8 +82,8 @@ def test_the_documented_file_says_what_the_document_says(capsys):
     exec(script[1], {})
     assert capsys.readouterr().out.split("\n") == [
         "[ True  True]",
-        "[[35.2 18.4]",
-        " [60.2 -0. ]]",
+        "[[-52.3 -80.5]",
+        " [-60.2 -60.2]]",
         "1204",
         "",
     ]
