@@ -2,9 +2,9 @@
 
     python benchmarks/sight.py [--poses 500 --seed 0]
 
-One hand with the dense19 glove, random valid poses, turns and places, hands of random people. The reference for
-every line is embree (through trimesh, package embreex) on the same meshes. Speeds are processor time of one
-core; the floor of a frame is its skinning and refit, which no line is needed for.
+One hand with the dense19 glove, random valid poses, turns and places, hands of random people. The reference
+for every line is embree (through trimesh, package embreex) on the same meshes. Speeds are processor time of
+one core; the floor of a frame is its kinematics, skinning and refit, which come before the first line.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ CHUNK = 128
 
 
 class Scene(NamedTuple):
+    """One gloved hand in random poses."""
+
     model: HandModel
     qpos: np.ndarray
     skin: np.ndarray
@@ -97,9 +99,7 @@ def agreement(poses: int, rng: np.random.Generator) -> None:
     print("\ncapsules against skin, of the lines in view and facing")
     print(f"  capsules see, skin hides {(flesh & ~seen)[facing].mean():.3%}; "
           f"the reverse {(seen & ~flesh)[facing].mean():.3%}")  # fmt: skip
-    print(
-        f"  markers only capsules see {(loose & ~both).mean():.3%}, only skin sees {(both & ~loose).mean():.3%}"
-    )
+    print(f"  markers only capsules see {(loose & ~both).mean():.3%}, skin {(both & ~loose).mean():.3%}")
     names = load_layout("dense19").names
     print(f"  markers missing, capsules -> skin: all {(~loose).mean():.2%} -> {(~both).mean():.2%}")
     for number, name in enumerate(names):
@@ -137,7 +137,9 @@ def speeds(rng: np.random.Generator) -> None:
     for side, offset in (("right", -0.06), ("left", 0.06)):
         model = HandModel.named("M", side=side)  # type: ignore[arg-type]
         hands.append(make_scene(model, CHUNK, CENTRE, rng))
-        shift = CENTRE + [0.0, offset, 0.0] - hands[-1].qpos[:, None, :3]  # two hands close together
+        shift = (
+            CENTRE + np.array([0.0, offset, 0.0]) - hands[-1].qpos[:, None, :3]
+        )  # two hands close together
         hands[-1] = hands[-1]._replace(
             qpos=np.concatenate([hands[-1].qpos[:, :3] + shift[:, 0], hands[-1].qpos[:, 3:]], axis=1),
             skin=hands[-1].skin + shift, markers=hands[-1].markers + shift,
@@ -165,7 +167,7 @@ def speeds(rng: np.random.Generator) -> None:
     body = cost(lambda: clear_of_body(tree, poses, markers, cameras, wanted))
     whole = bones + skinning + refit + rays
     print(f"\ntwo hands, {markers.shape[1]} markers, {len(cameras)} cameras, two skins of "
-          f"{len(tree.vertices):,} vertices, {len(tree.faces):,} triangles, one core, us a frame")  # fmt: skip
+          f"{len(tree.vertices):,} vertices, {len(tree.faces):,} triangles, us a frame")  # fmt: skip
     print(f"  bones {bones:.0f}, skinning {skinning:.0f}, refit {refit:.0f}, rays {rays:.0f} "
           f"({count:.0f} lines, each past two skins: {rays / count * 1e3:.0f} ns): {whole:.0f}")  # fmt: skip
     print(f"  {1e6 / whole:,.0f} frames/s; floor without a single line {1e6 / (whole - rays):,.0f} frames/s")

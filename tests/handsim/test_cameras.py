@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,8 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.shape import Population, sample_shape
 
-GOLDEN = Path(__file__).parents[1] / "golden"
+ROOT = Path(__file__).parents[2]
+GOLDEN = ROOT / "tests" / "golden"
 CENTRE = np.array([0.0, 0.0, 1.1])
 
 TOP = 'name = "mine"\nfield_of_view = 50.0\n'
@@ -72,6 +74,19 @@ def test_a_file_of_ones_own(tmp_path):
     np.testing.assert_allclose(load_rig(str(path)).T_world_camera, rig.T_world_camera, atol=1e-15)
     assert load_rig(path).resolution == 1280
     np.testing.assert_array_equal(load_rig("six").T_world_camera, named_rig("six").T_world_camera)
+
+
+def test_the_documented_file_says_what_the_document_says(capsys):
+    script = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "rigs.md").read_text("utf-8"), re.S)
+    assert script is not None
+    exec(script[1], {})
+    assert capsys.readouterr().out.split("\n") == [
+        "[ True  True]",
+        "[[-52.3 -80.5]",
+        " [-60.2 -60.2]]",
+        "1204",
+        "",
+    ]
 
 
 distance = st.floats(-2.0, 2.0)
