@@ -24,13 +24,12 @@ def reconstruct_frames(
     for t in range(len(sources)):
         _draw_blobs(sources[t], seen[t], T_world_camera, camera, rng, centres, radii)
         _cast_rays(seen[t], T_world_camera, camera, centres, radii, directions, usable)
-        for s in range(count):
+        for s in np.argsort(-usable.sum(axis=1), kind="mergesort"):
             enough = min_rays[0] if t > 0 and rays[t - 1, s] > 0 else min_rays[1]
             rays[t, s] = _meet(directions[s], usable[s], T_world_camera, gates, enough, positions[t, s])
-        _join_near(positions[t], rays[t], gates[2])
-        for s in range(count):
             if rays[t, s] > 0:
-                _spend(positions[t, s], directions[s], usable[s], T_world_camera, gates[0])
+                _spend(positions[t, s], s, directions, usable, T_world_camera, gates[0])
+        _join_near(positions[t], rays[t], gates[2])
         false = false_points[t - 1 if t > 0 else 0], false_points[t]
         _meet_by_chance(sources[t], directions, usable, T_world_camera, gates, min_rays, positions[t], false)
 
@@ -180,11 +179,21 @@ def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _spend(point: Any, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
-    """Rays that made a point can make no other."""
-    for c in range(len(usable)):
-        if usable[c] and _off(point, directions[c], T_world_camera[c]) <= gate:
-            usable[c] = False
+def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
+    """Rays that made a point make no other; where a camera does not see its source, it takes another's ray."""
+    for c in range(len(T_world_camera)):
+        taken, near = -1, gate
+        if usable[source, c]:
+            if _off(point, directions[source, c], T_world_camera[c]) <= gate:
+                usable[source, c] = False
+            continue
+        for s in range(len(usable)):
+            if usable[s, c]:
+                off = _off(point, directions[s, c], T_world_camera[c])
+                if off <= near:
+                    taken, near = s, off
+        if taken >= 0:
+            usable[taken, c] = False
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
@@ -219,8 +228,8 @@ def _meet_by_chance(
                 continue
             if _new_and_near(point, sources, positions, gates[2]):
                 now[place] = point
-                for any_source in range(len(usable)):
-                    _spend(point, directions[any_source], usable[any_source], T_world_camera, gates[0])
+                _spend(point, s, directions, usable, T_world_camera, gates[0])
+                usable[s, c] = usable[o, k] = False
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]

@@ -39,8 +39,12 @@ class OpticsConfig:
     sum of their radii, and thrown away as not round beyond it."""
     blob_loss: float = 0.002
     """Chance that a camera misses a blob it should see."""
-    camera_loss: float = 0.001
-    """Chance that a camera's whole picture is lost in a frame."""
+    dropout: float = 0.0002
+    """Chance a frame that cameras begin to lose their pictures: a lost packet, a head or an arm in front."""
+    dropout_length: float = 3.0
+    """Mean number of pictures that they then lose."""
+    dropout_cameras: int = 1
+    """Cameras that lose them together, as those on one network switch do."""
     min_rays: int = 2
     """Rays that must meet before a point exists or goes on."""
     min_rays_to_start: int = 3
@@ -57,7 +61,7 @@ class OpticsConfig:
             value = getattr(self, name)
             if not 0.0 <= value < np.inf:
                 raise ShapeError(f"{name} is {value:g}, wanted a finite number that is not negative")
-        for name in ("blob_loss", "camera_loss"):
+        for name in ("blob_loss", "dropout"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ShapeError(f"{name} is {getattr(self, name):g}, wanted a chance from 0 to 1")
         if not 2 <= self.min_rays <= self.min_rays_to_start:
@@ -102,10 +106,10 @@ def reconstruct(
     positions = np.full((frames, count, 3), np.nan)
     rays = np.zeros((frames, count), dtype=np.int64)
     false_points = np.full((frames, MAX_FALSE_POINTS, 3), np.nan)
-    losses = rng.random((frames, len(rig.positions))) < config.camera_loss
+    lost = _dropouts(frames, len(rig.positions), config, rng)
     reconstruct_frames(
         np.ascontiguousarray(sources, dtype=np.float64),
-        np.ascontiguousarray(seen & ~losses[:, None]),
+        np.ascontiguousarray(seen & ~lost[:, None]),
         np.ascontiguousarray(rig.T_world_camera),
         (rig.focal_length, config.noise, config.blob_loss, config.marker_radius, config.roundness),
         (config.max_residual, np.sin(np.deg2rad(config.min_angle)), config.min_distance),
@@ -116,3 +120,17 @@ def reconstruct(
         false_points,
     )
     return Reconstruction(positions, rays, false_points)
+
+
+def _dropouts(
+    frames: int, cameras: int, config: OpticsConfig, rng: np.random.Generator
+) -> Bool[np.ndarray, "T C"]:
+    """Pictures that are lost: each dropout takes some cameras for a geometric number of frames."""
+    begins = np.flatnonzero(rng.random(frames) < config.dropout)
+    lasts = rng.geometric(1.0 / config.dropout_length, size=len(begins))
+    lost = np.zeros((frames, cameras), dtype=bool)
+    for begin, last in zip(begins, lasts, strict=True):
+        lost[
+            begin : begin + last, rng.choice(cameras, min(cameras, config.dropout_cameras), replace=False)
+        ] = True
+    return lost

@@ -90,9 +90,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     return Hold(style.name, angles, pose, contacts)
 
 
-def _close(
-    scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]
-) -> None:
+def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
     """Close the fingers, the thing first guided by a soft spring and then free, without gravity."""
     model = scene.mj_model
     guide = pose_to_qpos(start)
@@ -140,9 +138,7 @@ def _backed_off(
     return np.clip(angles, LOW, HIGH), pose
 
 
-def _contacts(
-    scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]
-) -> tuple[str, ...]:
+def _contacts(scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[str, ...]:
     distances = scene.distances(scene.new_data(angles, pose))
     names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
     return tuple(name for name, distance in zip(names, distances, strict=True) if distance < _TOUCHING)

@@ -10,7 +10,7 @@ from gloves.optics import OpticsConfig, reconstruct
 from handsim.cameras import CameraRig, look_at, named_rig
 from handsim.errors import ShapeError
 
-STILL = OpticsConfig(noise=0.0, blob_loss=0.0, camera_loss=0.0)
+STILL = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0)
 RIG = named_rig("figure5")
 MIDDLE = np.array([0.0, 0.0, 1.1])
 
@@ -36,7 +36,7 @@ def test_without_noise_points_are_where_the_markers_are(rng: np.random.Generator
 
 def test_noise_is_that_of_least_squares(rng: np.random.Generator) -> None:
     """The covariance of a point follows from its cameras: linearised, as a textbook has it."""
-    config = OpticsConfig(noise=0.3, blob_loss=0.0, camera_loss=0.0)
+    config = OpticsConfig(noise=0.3, blob_loss=0.0, dropout=0.0)
     sources = np.tile(MIDDLE + [0.03, 0.02, 0.05], (4000, 1, 1))
     found = reconstruct(sources, _all_seen(sources), RIG, config, continuous=False, rng=rng)
     off = found.positions[:, 0] - sources[:, 0]
@@ -72,7 +72,7 @@ def test_two_rays_along_one_line_make_no_point(rng: np.random.Generator) -> None
     sources = _grid(1, 1, 0.0)
     found = reconstruct(sources, _all_seen(sources, rig), rig, STILL, continuous=False, rng=rng)
     assert found.rays[0, 0] == 0
-    wide = OpticsConfig(noise=0.0, blob_loss=0.0, camera_loss=0.0, min_angle=1.0)
+    wide = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0, min_angle=1.0)
     assert reconstruct(sources, _all_seen(sources, rig), rig, wide, continuous=False, rng=rng).rays[0, 0] == 2
 
 
@@ -101,7 +101,7 @@ def test_rays_without_a_point_meet_by_chance(rng: np.random.Generator) -> None:
     assert np.isnan(found.positions).all()
     there = found.false_points[np.isfinite(found.false_points[..., 0])]
     np.testing.assert_allclose(there, crossing[None], atol=1e-9)
-    strict = OpticsConfig(noise=0.0, blob_loss=0.0, camera_loss=0.0, min_rays=3)
+    strict = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0, min_rays=3)
     assert np.isnan(reconstruct(sources, seen, RIG, strict, continuous=False, rng=rng).false_points).all()
 
 
