@@ -12,7 +12,7 @@ from gloves.layout import MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.mjcf import Site
 from handsim.model import HandModel
-from handsim.surface import HandSurface, linear_blend_skinning, vertex_normals
+from handsim.surface import HandSurface, vertex_normals
 from handsim.topology import BONE_NAMES, PALM
 
 if TYPE_CHECKING:
@@ -34,20 +34,31 @@ class Attachment:
     bone_weights: Float[np.ndarray, "M 4"]
     """Their shares, summing to one."""
 
+    def centres(
+        self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
+    ) -> Float[np.ndarray, "T M 3"]:
+        """Marker centres [m] in the world, for poses of the same hand."""
+        return self._carried(model, T_world_bone, self.points, 1.0)
+
     def markers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
     ) -> tuple[Float[np.ndarray, "T M 3"], Float[np.ndarray, "T M 3"]]:
         """Marker centres [m] and outward directions in the world, for poses of the same hand."""
-        both = linear_blend_skinning(
-            np.concatenate([self.points, self.points + self.normals]),
-            np.tile(self.bone_indices, (2, 1)),
-            np.tile(self.bone_weights, (2, 1)),
-            model.rest_transforms,
-            T_world_bone,
-        )
-        centres, ahead = np.split(both, 2, axis=1)
-        normals = ahead - centres
-        return centres, normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = self._carried(model, T_world_bone, self.normals, 0.0)
+        normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+        return self.centres(model, T_world_bone), normals
+
+    def _carried(
+        self, model: HandModel, T_world_bone: NDArray[np.float64], rest: NDArray[np.float64], last: float
+    ) -> NDArray[np.float64]:
+        """Points (`last` 1) or directions (0) at the markers, blended over the bones in one product a frame."""
+        inverse = np.linalg.inv(model.rest_transforms)
+        local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
+        weights = np.zeros(local.shape[:2])
+        np.add.at(weights, (np.arange(len(rest))[:, None], self.bone_indices), self.bone_weights)
+        bones = np.swapaxes(T_world_bone[..., :3, :], -1, -2).reshape(len(T_world_bone), -1, 3)
+        carried: NDArray[np.float64] = (weights[..., None] * local).reshape(len(rest), -1) @ bones
+        return carried
 
     def sites(self, model: HandModel) -> tuple[Site, ...]:
         """The markers as MuJoCo sites, each on the bone that carries most of it."""
@@ -67,28 +78,18 @@ def attach(layout: MarkerLayout, model: HandModel) -> Attachment:
         LayoutError: A marker's ray finds no skin; the sentence names the marker.
     """
     surface = model.surface
-    triangles = surface.vertices[surface.faces]
-    skin_normals = vertex_normals(surface.vertices, surface.faces)
-    centroids = triangles.mean(axis=1)
-    reach = np.linalg.norm(triangles - centroids[:, None], axis=-1).max()
-    corners, bary = np.empty((layout.num_markers, 3), dtype=np.int64), np.empty((layout.num_markers, 3))
-    points, normals = np.empty((layout.num_markers, 3)), np.empty((layout.num_markers, 3))
-    for number, marker in enumerate(layout.markers):
-        origin, direction = _ray(marker, model)
-        along = (centroids - origin) @ direction
-        off = np.linalg.norm(centroids - origin - along[:, None] * direction, axis=1)
-        near = np.flatnonzero((off <= reach) & (along >= -reach))
-        found = _first_way_out(origin, direction, triangles[near])
-        if found is None:
-            raise LayoutError(
-                f"marker '{marker.name}' finds no skin from {marker.bone} at along {marker.along:g}, "
-                f"across {marker.across:g}; move it onto the hand"
-            )
-        face, bary[number], distance = found
-        corners[number] = surface.faces[near[face]]
-        normal = bary[number] @ skin_normals[corners[number]]
-        normals[number] = normal / np.linalg.norm(normal)
-        points[number] = origin + distance * direction + layout.radius * normals[number]
+    origins, directions = np.moveaxis([_ray(marker, model) for marker in layout.markers], 1, 0)
+    markers, faces, bary, distances = _first_ways_out(origins, directions, surface)
+    if len(markers) < layout.num_markers:
+        marker = layout.markers[int(np.setdiff1d(np.arange(layout.num_markers), markers)[0])]
+        raise LayoutError(
+            f"marker '{marker.name}' finds no skin from {marker.bone} at along {marker.along:g}, "
+            f"across {marker.across:g}; move it onto the hand"
+        )
+    corners = surface.faces[faces]
+    normals = np.einsum("mk,mki->mi", bary, _normals_at(corners, surface))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = origins + distances[:, None] * directions + layout.radius * normals
     indices, shares = _blend_weights(surface, corners, bary)
     return Attachment(layout, points, normals, indices, shares)
 
@@ -130,25 +131,64 @@ def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], ND
     return T_wrist_bone[:3, :3] @ local + T_wrist_bone[:3, 3], T_wrist_bone[:3, :3] @ turn
 
 
-def _first_way_out(
-    origin: NDArray[np.float64], direction: NDArray[np.float64], triangles: NDArray[np.float64]
-) -> tuple[int, NDArray[np.float64], float] | None:
-    """First way out of a closed mesh along a ray: face, barycentric weights, distance (Moeller-Trumbore)."""
-    edge1, edge2 = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    across = np.cross(direction, edge2)
-    determinant = np.einsum("fi,fi->f", edge1, across)
+def _first_ways_out(
+    origins: NDArray[np.float64], directions: NDArray[np.float64], surface: HandSurface
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """First ways out of the skin along rays: rays that find one, faces, barycentric weights, distances."""
+    vertices, faces = surface.vertices, surface.faces
+    first, second, third = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
+    edges1, edges2 = second - first, third - first
+    # A line that meets a triangle comes nearer to its first corner than the longer edge from there.
+    reach = 1.01 * np.maximum(_dot(edges1, edges1), _dot(edges2, edges2))
+    along = vertices @ directions.T - _dot(origins, directions)
+    off = _dot(vertices, vertices)[:, None] - vertices @ (2.0 * origins.T) + _dot(origins, origins) - along**2
+    near = np.flatnonzero(off.take(faces[:, 0], axis=0) <= reach[:, None])
+    face, ray = np.divmod(near, len(origins))
+    weights, distance, outwards = _crossings(
+        origins[ray], directions[ray], first[face], edges1[face], edges2[face]
+    )
+    hits = np.flatnonzero(outwards)
+    hits = hits[np.lexsort((distance[hits], ray[hits]))]
+    rays, nearest = np.unique(ray[hits], return_index=True)
+    hits = hits[nearest]
+    return rays, face[hits], weights[hits], distance[hits]
+
+
+def _crossings(
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    edges1: NDArray[np.float64],
+    edges2: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Where rays meet triangles, a pair a row: barycentric weights, distance, and whether on the way out.
+
+    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997).
+    """
+    across = np.cross(directions, edges2)
+    determinant = _dot(edges1, across)
+    offset = origins - corners
     with np.errstate(divide="ignore", invalid="ignore"):
-        offset = origin - triangles[:, 0]
-        u = np.einsum("fi,fi->f", offset, across) / determinant
-        q = np.cross(offset, edge1)
-        v = q @ direction / determinant
-        distance = np.einsum("fi,fi->f", edge2, q) / determinant
+        u = _dot(offset, across) / determinant
+        q = np.cross(offset, edges1)
+        v = _dot(q, directions) / determinant
+        distance = _dot(edges2, q) / determinant
     slack = 1e-9
     outwards = (determinant < 0) & (u >= -slack) & (v >= -slack) & (u + v <= 1 + slack) & (distance > 0)
-    if not outwards.any():
-        return None
-    face = int(np.where(outwards, distance, np.inf).argmin())
-    return face, np.array([1 - u[face] - v[face], u[face], v[face]]), float(distance[face])
+    return np.stack([1 - u - v, u, v], axis=1), distance, outwards
+
+
+def _dot(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    products: NDArray[np.float64] = np.einsum("ni,ni->n", first, second)
+    return products
+
+
+def _normals_at(corners: NDArray[np.int64], surface: HandSurface) -> NDArray[np.float64]:
+    """Skin normals of a few vertices (M, 3, 3), from the faces around them alone."""
+    wanted = np.zeros(len(surface.vertices), dtype=np.bool_)
+    wanted[corners] = True
+    around = surface.faces[wanted[surface.faces].any(axis=1)]
+    return vertex_normals(surface.vertices, around)[corners]
 
 
 def _blend_weights(

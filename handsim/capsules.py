@@ -6,9 +6,11 @@ press into each other, and a marker on the skin must stay outside the capsule it
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import numba
 import numpy as np
 
 from handsim.shape import HandShape
@@ -42,20 +44,38 @@ class Capsules:
 
     def posed(self, T_world_bone: Float[np.ndarray, "T L 4 4"]) -> NDArray[np.float64]:
         """Both ends of every axis in the world (T, K, 2, 3) [m]."""
-        frames = T_world_bone[:, self.bones]
-        ends = np.stack([self.starts, self.ends], axis=1)
-        posed: NDArray[np.float64] = (
-            np.einsum("tkij,kej->tkei", frames[..., :3, :3], ends) + frames[..., None, :3, 3]
+        posed: NDArray[np.float64] = _posed(
+            np.ascontiguousarray(T_world_bone), self.bones, self.starts, self.ends
         )
         return posed
 
     def touching_pairs(self) -> NDArray[np.int64]:
         """Pairs (P, 2) that may collide: of different bones without a common joint, MuJoCo's own rule."""
-        parents = np.array([bone.parent for bone in BONES])
-        first, second = np.triu_indices(len(self.bones), 1)
-        a, b = self.bones[first], self.bones[second]
-        apart = (a != b) & (parents[a] != b) & (parents[b] != a)
-        return np.stack([first[apart], second[apart]], axis=1)
+        return _touching_pairs(tuple(self.bones.tolist()))
+
+
+@functools.cache
+def _touching_pairs(bones: tuple[int, ...]) -> NDArray[np.int64]:
+    parents = np.array([bone.parent for bone in BONES])
+    first, second = np.triu_indices(len(bones), 1)
+    a, b = np.array(bones)[first], np.array(bones)[second]
+    apart = (a != b) & (parents[a] != b) & (parents[b] != a)
+    pairs = np.stack([first[apart], second[apart]], axis=1)
+    pairs.setflags(write=False)
+    return pairs
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _posed(transforms: Any, bones: Any, starts: Any, ends: Any) -> Any:
+    posed = np.empty((len(transforms), len(bones), 2, 3))
+    for frame in range(len(transforms)):
+        for capsule in range(len(bones)):
+            pose, a, b = transforms[frame, bones[capsule]], starts[capsule], ends[capsule]
+            for i in range(3):
+                x, y, z, shift = pose[i, 0], pose[i, 1], pose[i, 2], pose[i, 3]
+                posed[frame, capsule, 0, i] = x * a[0] + y * a[1] + z * a[2] + shift
+                posed[frame, capsule, 1, i] = x * b[0] + y * b[1] + z * b[2] + shift
+    return posed
 
 
 def build_capsules(shape: HandShape) -> Capsules:

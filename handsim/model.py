@@ -11,17 +11,16 @@ import numpy as np
 from handsim._checks import check_array
 from handsim.capsules import Capsules, build_capsules
 from handsim.contact import penetration_depth
+from handsim.kinematics import bone_transforms
 from handsim.mjcf import build_spec
 from handsim.shape import HandShape, named_shape
 from handsim.skeleton import Skeleton, build_skeleton
 from handsim.skinning import skin_frames
 from handsim.surface import HandSurface, build_surface
-from handsim.topology import BONES, JOINTS, NUM_BONES, NUM_JOINTS, NUM_QPOS, Side
-from handsim.transforms import axis_angle_matrix, quaternion_matrix
+from handsim.topology import NUM_JOINTS, NUM_QPOS, Side
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-    from numpy.typing import NDArray
 
 
 class HandModel:
@@ -70,23 +69,7 @@ class HandModel:
             ShapeError: `qpos` is not (T, 27) or not finite.
         """
         values = check_array("qpos", qpos, (None, NUM_QPOS))
-        turns: list[NDArray[np.float64] | None] = [None] * NUM_BONES
-        for number, joint in enumerate(JOINTS):
-            turn = axis_angle_matrix(self.skeleton.axes[number], values[:, 7 + number])
-            before = turns[joint.bone]
-            turns[joint.bone] = turn if before is None else before @ turn
-        transforms = np.zeros((len(values), NUM_BONES, 4, 4))
-        transforms[..., 3, 3] = 1.0
-        transforms[:, 0, :3, :3] = quaternion_matrix(values[:, 3:7])
-        transforms[:, 0, :3, 3] = values[:, :3]
-        for number, bone in enumerate(BONES[1:], start=1):
-            parent = transforms[:, bone.parent]
-            local = self.skeleton.rotations[number] @ turns[number]
-            transforms[:, number, :3, :3] = parent[:, :3, :3] @ local
-            transforms[:, number, :3, 3] = (
-                parent[:, :3, :3] @ self.skeleton.offsets[number] + parent[:, :3, 3]
-            )
-        return transforms
+        return bone_transforms(self.skeleton, values)
 
     def skin(self, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T V 3"]:
         """Skin vertices [m] in the world, by linear blend skinning."""

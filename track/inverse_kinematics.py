@@ -46,7 +46,7 @@ def first_guess(
 ) -> Float[np.ndarray, "T 27"]:
     """Relaxed hands laid on the markers by a rigid fit, frame by frame."""
     qpos = join_qpos(np.tile(_RESTING, (len(targets), 1)))
-    markers, _ = attachment.markers(model, model.forward_kinematics(qpos[:1]))
+    markers = attachment.centres(model, model.forward_kinematics(qpos[:1]))
     for frame, target in enumerate(targets):
         there = np.isfinite(target).all(axis=1)
         rotation, translation = rigid_fit(markers[0, there], target[there])
@@ -106,7 +106,7 @@ def solve_poses(
         damping = np.clip(np.where(better, damping * 0.3, damping * 8.0), 1e-9, 1e6)
         if settled:
             break
-    markers, _ = attachment.markers(model, model.forward_kinematics(qpos))
+    markers = attachment.centres(model, model.forward_kinematics(qpos))
     residuals = markers - targets
     rms = np.sqrt(np.nanmean((residuals**2).sum(axis=-1), axis=1)) if len(targets) else np.zeros(0)
     return PoseFit(qpos, rms, residuals)
@@ -130,7 +130,7 @@ def _linearise(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Cost (T,), gradient (T, 26) and normal matrix (T, 26, 26) of every frame."""
     bones = model.forward_kinematics(qpos)
-    markers, _ = attachment.markers(model, bones)
+    markers = attachment.centres(model, bones)
     residual = np.where(there[..., None], markers - targets, 0.0).reshape(len(qpos), -1) / _MARKER_NOISE
     jacobian = skinned_jacobian(
         model, bones, attachment.points, attachment.bone_indices, attachment.bone_weights
