@@ -51,7 +51,7 @@ class Attachment:
     def _carried(
         self, model: HandModel, T_world_bone: NDArray[np.float64], rest: NDArray[np.float64], last: float
     ) -> NDArray[np.float64]:
-        """Points (`last` 1) or directions (0) at the markers, blended over the bones in one product a frame."""
+        """Points (`last` 1) or directions (0) at the markers, blended over the bones: one product a frame."""
         inverse = np.linalg.inv(model.rest_transforms)
         local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
         weights = np.zeros(local.shape[:2])

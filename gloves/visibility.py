@@ -61,10 +61,12 @@ def visible_cameras(
         segments: Both ends of every capsule's axis in the world [m].
         radii: Capsule radii [m].
     """
-    to_camera = rig.positions - markers[:, :, None]
-    ahead = np.einsum("tmci,tmi->tmc", to_camera, normals)
-    facing = ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
-    clear = free_rays(markers, rig.positions, segments, radii)
+    cameras = rig.positions
+    ahead = normals @ cameras.T - np.einsum("tmi,tmi->tm", normals, markers)[..., None]
+    squared = np.einsum("tmi,tmi->tm", markers, markers)[..., None] - markers @ (2.0 * cameras.T)
+    squared += np.einsum("ci,ci->c", cameras, cameras)
+    facing = ahead > np.cos(MAX_FACING) * np.sqrt(squared)
+    clear = free_rays(markers, cameras, segments, radii)
     seen: NDArray[np.bool_] = rig.in_view(markers) & facing & clear
     return seen
 
@@ -94,29 +96,28 @@ def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
     free = np.ones((frames, count, len(cameras)), dtype=np.bool_)
     capsules = len(radii)
     centres, reach = np.empty((capsules, 3)), np.empty(capsules)
-    near = np.empty(capsules, dtype=np.int64)
+    way, gap, margin = np.empty((3, capsules)), np.empty(capsules), np.empty(capsules)
     for t in range(frames):
         _bound(segments[t], radii, centres, reach)
         for m in range(count):
             marker = markers[t, m]
+            for k in range(capsules):
+                for i in range(3):
+                    way[i, k] = centres[k, i] - marker[i]
+                gap[k] = way[0, k] ** 2 + way[1, k] ** 2 + way[2, k] ** 2 - reach[k] ** 2
             for c in range(len(cameras)):
                 dx, dy, dz = (cameras[c, 0] - marker[0], cameras[c, 1] - marker[1], cameras[c, 2] - marker[2])
-                inverse = 1.0 / (dx * dx + dy * dy + dz * dz)
-                found = 0
+                squared = dx * dx + dy * dy + dz * dz
+                inverse = 1.0 / squared
                 for k in range(capsules):  # a capsule whose bounding sphere the ray misses cannot be met
-                    wx = centres[k, 0] - marker[0]
-                    wy = centres[k, 1] - marker[1]
-                    wz = centres[k, 2] - marker[2]
-                    share = min(1.0, max(0.0, (wx * dx + wy * dy + wz * dz) * inverse))
-                    ex, ey, ez = wx - share * dx, wy - share * dy, wz - share * dz
-                    near[found] = k
-                    found += ex * ex + ey * ey + ez * ez < reach[k] * reach[k]
-                for n in range(found):
-                    k = near[n]
-                    squared = segment_distance_squared(
-                        marker, cameras[c], segments[t, k, 0], segments[t, k, 1]
-                    )
-                    if squared < radii[k] * radii[k]:
+                    along = way[0, k] * dx + way[1, k] * dy + way[2, k] * dz
+                    share = min(1.0, max(0.0, along * inverse))
+                    margin[k] = gap[k] - share * (2.0 * along - share * squared)
+                for k in range(capsules):
+                    if margin[k] < 0.0 and (
+                        segment_distance_squared(marker, cameras[c], segments[t, k, 0], segments[t, k, 1])
+                        < radii[k] * radii[k]
+                    ):
                         free[t, m, c] = False
                         break
     return free

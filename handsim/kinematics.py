@@ -14,27 +14,22 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_PARENTS: Final = np.array([bone.parent for bone in BONES])
-_HINGES: Final = np.bincount([joint.bone for joint in JOINTS], minlength=len(BONES))
-"""Hinges of each bone; `JOINTS` lists them in the order of the bones."""
+_HINGES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones
+_CHAIN: Final = np.array([(bone.parent, _HINGES.count(number)) for number, bone in enumerate(BONES)])
+"""Parent of each bone, and how many hinges move it."""
 
 
 def bone_transforms(skeleton: Skeleton, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
     """`T_world_bone` of every bone in every frame, quaternions normalised first."""
     transforms: NDArray[np.float64] = _chain(
-        np.ascontiguousarray(qpos),
-        skeleton.offsets,
-        skeleton.rotations,
-        skeleton.axes,
-        _PARENTS,
-        _HINGES,
+        np.ascontiguousarray(qpos), skeleton.offsets, skeleton.rotations, skeleton.axes, _CHAIN
     )
     return transforms
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _chain(qpos: Any, offsets: Any, rotations: Any, axes: Any, parents: Any, hinges: Any) -> Any:
-    transforms = np.zeros((len(qpos), len(parents), 4, 4))
+def _chain(qpos: Any, offsets: Any, rotations: Any, axes: Any, chain: Any) -> Any:
+    transforms = np.zeros((len(qpos), len(chain), 4, 4))
     turn = np.empty((3, 3))
     for frame in range(len(qpos)):
         pose = transforms[frame]
@@ -45,15 +40,15 @@ def _chain(qpos: Any, offsets: Any, rotations: Any, axes: Any, parents: Any, hin
             pose[0, i, 3] = qpos[frame, i]
         pose[0, 3, 3] = 1.0
         joint = 0
-        for bone in range(1, len(parents)):
-            parent, own = pose[parents[bone]], pose[bone]
+        for bone in range(1, len(chain)):
+            parent, own = pose[chain[bone, 0]], pose[bone]
             for i in range(3):
                 own[i, 3] = parent[i, 3]
                 for j in range(3):
                     own[i, 3] += parent[i, j] * offsets[bone, j]
             own[3, 3] = 1.0
             _multiply(parent, rotations[bone], own)
-            for _ in range(hinges[bone]):
+            for _ in range(chain[bone, 1]):
                 sine, cosine = np.sin(0.5 * qpos[frame, 7 + joint]), np.cos(0.5 * qpos[frame, 7 + joint])
                 _write_turn(turn, cosine, sine * axes[joint, 0], sine * axes[joint, 1], sine * axes[joint, 2])
                 _multiply(own, turn, own)

@@ -51,16 +51,18 @@ class HandSurface:
 
 
 class _Template(NamedTuple):
-    """What all hands share."""
+    """What all hands share. The last four are rows of `measured`, the vertices that the fit looks at."""
 
     topology: CageTopology
     subdivide: sparse.csr_array
     faces: np.ndarray
     bone_indices: np.ndarray
     bone_weights: np.ndarray
-    ring_loops: list[np.ndarray]
+    measured: sparse.csr_array
+    ring_loops: np.ndarray
     knuckle_loop: np.ndarray
-    tips: list[np.ndarray]
+    tips: np.ndarray
+    back_and_palm: np.ndarray
 
 
 @functools.cache
@@ -75,14 +77,16 @@ def _template() -> _Template:
         subdivide = step @ subdivide
         quads, count = next_quads, step.shape[0]
     children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # a quad's four follow one another
-    tips = [np.unique(quads[children[pair]]) for pair in topology.tips]
+    tips = np.array([np.unique(quads[children[pair]]) for pair in topology.tips])
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     indices, weights = strongest_weights(subdivide @ cage_weights(topology))
-    sizes = np.cumsum([len(rings) for rings in topology.rings])[:-1]
-    ring_loops = np.split(np.array(loops[:-1]), sizes)
     for array in (faces, indices, weights):
         array.setflags(write=False)
-    return _Template(topology, subdivide, faces, indices, weights, ring_loops, loops[-1], tips)
+    back_and_palm = topology.palm[METACARPUS][[dorsal(3), palmar(3)]]
+    looked_at = (np.array(loops[:-1]), loops[-1], tips, back_and_palm)
+    rows = np.unique(np.concatenate([part.ravel() for part in looked_at]))
+    parts = [np.searchsorted(rows, part) for part in looked_at]
+    return _Template(topology, subdivide, faces, indices, weights, subdivide[rows], *parts)
 
 
 def build_surface(shape: HandShape) -> HandSurface:
@@ -92,35 +96,47 @@ def build_surface(shape: HandShape) -> HandSurface:
     palm thickness. A left hand is the exact mirror image of the right one.
     """
     template = _template()
-    scales = first_scales()
-    frames = digit_frames(shape)
-    vertices = template.subdivide @ cage_vertices(shape, frames, template.topology, scales)
-    for _ in range(_FIT_STEPS):
-        _refit(scales, vertices, shape, frames, template)
-        vertices = template.subdivide @ cage_vertices(shape, frames, template.topology, scales)
-    faces = template.faces
+    vertices, faces = template.subdivide @ _fitted_cage(shape, template), template.faces
     if shape.side == "left":
         vertices, faces = vertices @ MIRROR, faces[:, ::-1]
     return HandSurface(vertices, faces, template.bone_indices, template.bone_weights)
 
 
-def _refit(
-    scales: CageScales, vertices: np.ndarray, shape: HandShape, frames: np.ndarray, template: _Template
-) -> None:
-    """Corrects the scales by wanted over measured."""
-    for digit in range(len(DIGITS)):
-        loops = vertices[template.ring_loops[digit]]
-        girths = np.linalg.norm(loops - np.roll(loops, 1, axis=1), axis=-1).sum(axis=1)
-        scales.rings[digit][:-1] *= (ring_girths(shape, digit) / girths)[:-1]
-        scales.rings[digit][-1] = scales.rings[digit][-2]
-        base, along = frames[digit, :3, 3], frames[digit, :3, 0]
-        reach = float(((vertices[template.tips[digit]] - base) @ along).max())
-        scales.tips[digit] += shape.bone_lengths[digit].sum() - reach
-    palm = template.topology.palm
-    loop = vertices[template.knuckle_loop]
-    scales.breadth *= shape.breadth / float(np.ptp(loop[:, 1]))
-    row = vertices[palm[METACARPUS]]
-    scales.thickness *= shape.palm_thickness / float(row[dorsal(3), 2] - row[palmar(3), 2])
+def _fitted_cage(shape: HandShape, template: _Template) -> np.ndarray:
+    """Cage vertices after a few corrections of their scales by wanted over measured."""
+    topology, frames, first = template.topology, digit_frames(shape), first_scales()
+    still, wide, deep = _cage_parts(shape, frames, topology)
+    palm, on_ring = topology.palm.size, topology.rings[0].shape[1]
+    sideways = np.concatenate([np.full(palm, first.breadth), np.concatenate(first.rings).repeat(on_ring)])
+    upwards = np.concatenate([np.full(palm, first.thickness), np.zeros(len(still) - palm)])
+    rings = sideways[palm:].reshape(-1, on_ring)  # a view
+    tip_rings = np.cumsum([len(digit) for digit in topology.rings]) - 1
+    outermost = np.array([digit[-1] for digit in topology.rings])
+    girths = np.concatenate([ring_girths(shape, digit) for digit in range(len(DIGITS))])
+    for _ in range(_FIT_STEPS):
+        points = template.measured @ (still + sideways[:, None] * wide + upwards[:, None] * deep)
+        loops = points[template.ring_loops]
+        rings *= (girths / np.linalg.norm(loops - np.roll(loops, 1, axis=1), axis=-1).sum(axis=1))[:, None]
+        rings[tip_rings] = rings[tip_rings - 1]
+        ahead = np.einsum("dni,di->dn", points[template.tips] - frames[:, None, :3, 3], frames[:, :3, 0])
+        upwards[outermost] += (shape.bone_lengths.sum(axis=1) - ahead.max(axis=1))[:, None]
+        sideways[:palm] *= shape.breadth / np.ptp(points[template.knuckle_loop, 1])
+        upwards[:palm] *= -shape.palm_thickness / np.diff(points[template.back_and_palm, 2])
+    cage: np.ndarray = still + sideways[:, None] * wide + upwards[:, None] * deep
+    return cage
+
+
+def _cage_parts(shape: HandShape, frames: np.ndarray, topology: CageTopology) -> np.ndarray:
+    """The cage is affine in its scales: vertices (3, K, 3) at none, what one of width adds, and of depth."""
+
+    def scaled(wide: float, deep: float) -> np.ndarray:
+        rings = [np.full(len(digit), wide) for digit in topology.rings]
+        return cage_vertices(
+            shape, frames, topology, CageScales(rings, np.full(len(DIGITS), deep), wide, deep)
+        )
+
+    still = scaled(0.0, 0.0)
+    return np.stack([still, scaled(1.0, 0.0) - still, scaled(0.0, 1.0) - still])
 
 
 def vertex_normals(
