@@ -1,65 +1,116 @@
 """How fast training sets are made, every ray from every marker to every camera cast.
 
-    python benchmarks/generation.py [--frames 40960]
+    python benchmarks/generation.py [--frames 170330]
 
-The floor of a frame is its rays: 19 markers x 16 cameras, each against 21 capsules. The first line after the
-machine is the ray kernel alone on one core; the others are `handsim generate` whole: hands, skin, glove,
-poses, contact, kinematics, rays, ghosts, files.
+The floor of a frame is what cannot be left out: its rays, 19 markers x 16 cameras, each against 21 capsules,
+and its row on the disk. Then come the stages of `train.synthesis` one by one, a new person every 128 frames,
+in microseconds of processor time a frame, and `handsim generate` whole with one worker and with two.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from machine import describe
 
-from gloves.attach import attach
+from gloves.ghosts import sample_ghosts
 from gloves.layout import load_layout
-from gloves.visibility import free_rays
+from gloves.visibility import free_rays, pack_cameras, visible_cameras
 from handsim.cameras import named_rig
-from handsim.model import HandModel, join_qpos
+from handsim.model import join_qpos
 from handsim.transforms import random_quaternions
 from poses.validity import sample_valid_angles
-from train.synthesis import DatasetConfig, generate_dataset
+from train.shards import row_dtype
+from train.synthesis import DatasetConfig, generate_dataset, sample_hand, wear
+
+CONFIG = DatasetConfig()
+HANDS = 48
+FRAMES = CONFIG.frames_per_hand
 
 
-def kernel_frames_per_second() -> float:
-    rng = np.random.default_rng(0)
-    model, rig = HandModel.named("M"), named_rig("figure5")
-    angles = sample_valid_angles(model, 4000, rng=rng)
-    qpos = join_qpos(angles, position=[0, 0, 1.1], quaternion=random_quaternions(4000, rng=rng))
-    bones = model.forward_kinematics(qpos)
-    markers, _ = attach(load_layout("dense19"), model).markers(model, bones)
-    segments, radii = model.capsules.posed(bones), model.capsules.radii
-    free_rays(markers[:1], rig.positions, segments[:1], radii)  # compile
-    times = []
-    for _ in range(5):
-        start = time.perf_counter()
+class Stopwatch:
+    """Processor time [s] of every stage, a list of runs each."""
+
+    def __init__(self) -> None:
+        self.times: dict[str, list[float]] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Times what runs inside."""
+        start = time.process_time()
+        yield
+        self.times.setdefault(name, []).append(time.process_time() - start)
+
+    def per_frame(self) -> dict[str, float]:
+        """Median of every stage [us] a frame."""
+        return {name: 1e6 * float(np.median(times)) / FRAMES for name, times in self.times.items()}
+
+
+def one_hand(watch: Stopwatch, rng: np.random.Generator) -> None:
+    """What `train.synthesis` does for one person, stage by stage."""
+    layout, rig = load_layout(CONFIG.glove), named_rig(CONFIG.rig)
+    with watch.stage("person: shape, skeleton, room at rest"):
+        model = sample_hand(CONFIG.population, rng=rng)
+    with watch.stage("skin: cage fitted to the shape"):
+        _ = model.surface
+    with watch.stage("glove: 19 slipped markers on the skin"):
+        attachment = wear(layout, model, CONFIG, rng=rng)
+    with watch.stage("poses: drawn and made valid"):
+        angles = sample_valid_angles(model, FRAMES, CONFIG.poses, rng=rng)
+    turns = random_quaternions(FRAMES, rng=rng)
+    qpos = join_qpos(angles, position=[0.0, 0.0, 1.1], quaternion=turns)
+    with watch.stage("kinematics: bones, markers, capsules"):
+        bones = model.forward_kinematics(qpos)
+        markers, normals = attachment.markers(model, bones)
+        segments, radii = model.capsules.posed(bones), model.capsules.radii
+    with watch.stage("sight: rays, facing, field of view"):
+        pack_cameras(visible_cameras(markers, normals, rig, segments, radii))
+    with watch.stage("  of these the rays alone"):
         free_rays(markers, rig.positions, segments, radii)
-        times.append(time.perf_counter() - start)
-    return 4000 / float(np.median(times))
+    with watch.stage("ghosts: mirror images and strays"):
+        sample_ghosts(markers, rig, segments, radii, CONFIG.ghosts, min_cameras=2, rng=rng)
+
+
+def stages() -> dict[str, float]:
+    rng = np.random.default_rng(0)
+    one_hand(Stopwatch(), rng)  # compiles
+    watch = Stopwatch()
+    for _ in range(HANDS):
+        one_hand(watch, rng)
+    return watch.per_frame()
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=40_960)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--frames", type=int, default=CONFIG.num_frames)
     frames = parser.parse_args().frames
     print(describe("mujoco", "numba"))
-    floor = kernel_frames_per_second()
-    print(f"rays alone, one core: {floor:,.0f} frames/s, {floor * 304 / 1e6:.1f} million rays/s")
+    parts = stages()
+    rays = load_layout(CONFIG.glove).num_markers * len(named_rig(CONFIG.rig).positions)
+    size = row_dtype(load_layout(CONFIG.glove).num_markers).itemsize
+    kernel = parts["  of these the rays alone"]
+    print(
+        f"floor of a frame: {rays} rays x 21 capsules = {rays * 21:,} ray tests, {kernel:.1f} us "
+        f"({rays / kernel:.1f} million rays/s); a row of {size} bytes"
+    )
+    for name, microseconds in parts.items():
+        print(f"  {name:40s} {microseconds:6.1f} us/frame")
+    print(f"  {'sum':40s} {sum(parts.values()) - kernel:6.1f} us/frame")
     for workers in (1, 2):
         with tempfile.TemporaryDirectory() as folder:
-            start = time.perf_counter()
+            start, busy = time.perf_counter(), sum(os.times()[:4])
             generate_dataset(DatasetConfig(num_frames=frames), Path(folder) / "set", workers=workers)
-            speed = frames / (time.perf_counter() - start)
-        paper = 170_330 / speed
+            seconds, busy = time.perf_counter() - start, sum(os.times()[:4]) - busy  # workers' time too
         print(
-            f"{workers} worker(s): {speed:,.0f} frames/s with 16 x 19 rays; "
-            f"the paper's 170,330 take {paper:.0f} s"
+            f"{workers} worker(s): {frames:,} frames in {seconds:.1f} s, {frames / seconds:,.0f} frames/s; "
+            f"{frames / busy:,.0f} frames a second of processor time"
         )
 
 

@@ -78,7 +78,8 @@ def attach(layout: MarkerLayout, model: HandModel) -> Attachment:
         LayoutError: A marker's ray finds no skin; the sentence names the marker.
     """
     surface = model.surface
-    origins, directions = np.moveaxis([_ray(marker, model) for marker in layout.markers], 1, 0)
+    rays = np.array([_ray(marker, model) for marker in layout.markers])
+    origins, directions = rays[:, 0], rays[:, 1]
     markers, faces, bary, distances = _first_ways_out(origins, directions, surface)
     if len(markers) < layout.num_markers:
         marker = layout.markers[int(np.setdiff1d(np.arange(layout.num_markers), markers)[0])]

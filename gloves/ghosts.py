@@ -108,10 +108,12 @@ def _mirror_images(
     behind = np.einsum("tmi,ti->tm", plane[:, None] - images, normal)
     share = behind[..., None] / np.where(ahead > 1e-9, ahead, np.inf)
     hits = images[:, :, None] + share[..., None] * towards
-    on_patch = (share > 0) & (share < 1) & (behind[..., None] > 0)
-    on_patch &= np.linalg.norm(hits - plane[:, None, None], axis=-1) < config.mirror_radius
-    seen = on_patch & rig.in_view(images)
+    off = hits - plane[:, None, None]
+    seen = (share > 0) & (share < 1) & (behind[..., None] > 0)
+    seen &= np.einsum("tmci,tmci->tmc", off, off) < config.mirror_radius**2
     seen &= (rng.random((frames, count)) < config.reflectance)[..., None]
+    frame, marker = np.nonzero(seen.any(axis=2))
+    seen[frame, marker] &= rig.in_view(images[frame, marker])
     frame, marker, camera = np.nonzero(seen)
     spot = hits[frame, marker, camera]
     clear = free_segments(frame, markers[frame, marker], spot, segments, radii)

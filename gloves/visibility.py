@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from handsim.cameras import CameraRig
+from handsim.capsules import bounding_spheres
 from handsim.segments import segment_distance_squared
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
     centres, reach = np.empty((capsules, 3)), np.empty(capsules)
     way, gap, margin = np.empty((3, capsules)), np.empty(capsules), np.empty(capsules)
     for t in range(frames):
-        _bound(segments[t], radii, centres, reach)
+        bounding_spheres(segments[t], radii, centres, reach)
         for m in range(count):
             marker = markers[t, m]
             for k in range(capsules):
@@ -136,15 +137,3 @@ def _free_lines(frames: Any, starts: Any, ends: Any, segments: Any, radii: Any) 
                 free[line] = False
                 break
     return free
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _bound(segments: Any, radii: Any, centres: Any, reach: Any) -> None:
-    """Bounding spheres of the capsules, written into `centres` and `reach`."""
-    for k in range(len(radii)):
-        squared = 0.0
-        for i in range(3):
-            centres[k, i] = 0.5 * (segments[k, 0, i] + segments[k, 1, i])
-            half = 0.5 * (segments[k, 1, i] - segments[k, 0, i])
-            squared += half * half
-        reach[k] = np.sqrt(squared) + radii[k]

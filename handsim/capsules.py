@@ -78,6 +78,18 @@ def _posed(transforms: Any, bones: Any, starts: Any, ends: Any) -> Any:
     return posed
 
 
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def bounding_spheres(segments: Any, radii: Any, centres: Any, sizes: Any) -> None:
+    """Balls around the capsules of one frame, written into `centres` and `sizes`."""
+    for k in range(len(radii)):
+        squared = 0.0
+        for i in range(3):
+            centres[k, i] = 0.5 * (segments[k, 0, i] + segments[k, 1, i])
+            half = 0.5 * (segments[k, 1, i] - segments[k, 0, i])
+            squared += half * half
+        sizes[k] = np.sqrt(squared) + radii[k]
+
+
 def build_capsules(shape: HandShape) -> Capsules:
     """Capsules of a hand: one a phalanx, one a metacarpal, two for the wrist; mirrored for a left hand."""
     rows: list[tuple[int, NDArray[np.float64], NDArray[np.float64], float]] = []

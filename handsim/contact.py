@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
-from handsim.capsules import Capsules
+from handsim.capsules import Capsules, bounding_spheres
 from handsim.segments import segment_distance_squared
 
 if TYPE_CHECKING:
@@ -28,13 +28,19 @@ def penetration_depth(
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
     depth = np.zeros(len(segments))
+    centres, sizes = np.empty((len(radii), 3)), np.empty(len(radii))
     for frame in range(len(segments)):
+        bounding_spheres(segments[frame], radii, centres, sizes)
         for pair in range(len(pairs)):
             i, j = pairs[pair, 0], pairs[pair, 1]
             reach = radii[i] + radii[j] - depth[frame]
-            squared = segment_distance_squared(
-                segments[frame, i, 0], segments[frame, i, 1], segments[frame, j, 0], segments[frame, j, 1]
-            )
-            if reach > 0.0 and squared < reach * reach:
-                depth[frame] = radii[i] + radii[j] - np.sqrt(squared)
+            near = sizes[i] + sizes[j] - depth[frame]  # spheres apart by more hold capsules apart by more
+            x, y = centres[i, 0] - centres[j, 0], centres[i, 1] - centres[j, 1]
+            z = centres[i, 2] - centres[j, 2]
+            if reach > 0.0 and x * x + y * y + z * z < near * near:
+                squared = segment_distance_squared(
+                    segments[frame, i, 0], segments[frame, i, 1], segments[frame, j, 0], segments[frame, j, 1]
+                )
+                if squared < reach * reach:
+                    depth[frame] = radii[i] + radii[j] - np.sqrt(squared)
     return depth

@@ -21,7 +21,7 @@ from train.config import TrainConfig
 from train.evaluation import evaluate_labeler
 from train.labeler import TrainedSetLabeler, save_labeler
 from train.set_labeler import SetLabeler, labeling_loss
-from train.shards import Dataset, load_json, save_json
+from train.shards import Dataset, claim
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,7 +53,8 @@ def train_labeler(
     torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
     names = dataset.marker_names
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, num_labels=len(names)))
-    _claim(out, config, dataset)
+    settings = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
+    claim(out / _CONFIG, settings, noun="training run", error=WeightsError)
     rows = dataset.rows()
     held_out = max(1, int(_HELD_OUT * len(rows)))
     if len(rows) - held_out < config.batch:
@@ -167,18 +168,6 @@ def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArr
     factors = np.exp(anisotropy * rng.standard_normal((count, 1, 3)))
     stretches: NDArray[np.float64] = (axes * factors) @ axes.transpose(0, 2, 1)
     return stretches
-
-
-def _claim(out: Path, config: TrainConfig, dataset: Dataset) -> None:
-    """Mark the folder as this run's, or check that it is."""
-    settings = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
-    if (out / _CONFIG).is_file():
-        if load_json(out / _CONFIG) != settings:
-            raise WeightsError(f"{out} holds a run of other settings; use them or another folder")
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise WeightsError(f"{out} is not empty and holds no training run; name another folder")
-    else:
-        save_json(out / _CONFIG, settings)
 
 
 def _card(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gloves.ghosts import MAX_GHOSTS
-from handsim.errors import DatasetError
+from handsim.errors import DatasetError, HandSimError
 from handsim.hand_records import unpack_hand
 from handsim.io import atomic_write
 from handsim.shape import HandShape
@@ -97,6 +97,27 @@ def load_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DatasetError(f"{path} is damaged: it holds no JSON object")
     return content
+
+
+def claim(path: Path, settings: dict[str, Any], *, noun: str, error: type[HandSimError]) -> None:
+    """Mark the folder of a settings file as theirs, or check that it is; clear what a killed run left.
+
+    Raises:
+        HandSimError: Of class `error`: the `noun` there has other settings, or something else is there.
+    """
+    out = path.parent
+    if path.is_file():
+        found, wanted = load_json(path), json.loads(json.dumps(settings))
+        differing = sorted(key for key in found.keys() | wanted.keys() if found.get(key) != wanted.get(key))
+        if differing:
+            begun = f"{noun} begun with other settings ({', '.join(differing)})"
+            raise error(f"{out} holds a {begun}; use them or another folder")
+        for leftover in out.glob(".*.tmp-*"):
+            leftover.unlink(missing_ok=True)
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise error(f"{out} is not empty and holds no {noun}; name another folder")
+    else:
+        save_json(path, settings)
 
 
 def checksum(path: Path) -> str:

@@ -10,7 +10,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -31,12 +31,12 @@ from train.shards import (
     CONFIG,
     Manifest,
     checksum,
+    claim,
     hands_name,
     load_json,
     row_dtype,
     rows_name,
     save_array,
-    save_json,
     save_manifest,
 )
 
@@ -104,7 +104,7 @@ def generate_dataset(
         )
     attach(layout, HandModel.named("M"))  # a glove that does not fit is told before anything is written
     settings = {**dataclasses.asdict(config), "layout": dataclasses.asdict(layout)}
-    _claim(out, settings)
+    claim(out / CONFIG, settings, noun="training set", error=DatasetError)
     shards = range(-(-config.num_frames // ROWS_PER_SHARD))
     todo = [shard for shard in shards if not _finished(out, shard)]
     done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
@@ -122,31 +122,6 @@ def generate_dataset(
     )
     save_manifest(out, manifest)
     return manifest
-
-
-def _claim(out: Path, settings: dict[str, Any]) -> None:
-    """Mark the folder as this config's, or check that it is; clear what a killed run left half-written."""
-    if (out / CONFIG).is_file():
-        found = load_json(out / CONFIG)
-        known = {key: _plain(value) for key, value in settings.items()}
-        if found != known:
-            differing = sorted(key for key in found.keys() | known.keys() if found.get(key) != known.get(key))
-            raise DatasetError(
-                f"{out} was begun with other settings ({', '.join(differing)}); use them or another folder"
-            )
-        for leftover in out.glob(".*.tmp-*"):
-            leftover.unlink(missing_ok=True)
-    else:
-        if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise DatasetError(f"{out} is not empty and holds no training set; name another folder")
-        save_json(out / CONFIG, settings)
-
-
-def _plain(value: Any) -> Any:
-    """What JSON makes of a value: tuples become lists."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _finished(out: Path, shard: int) -> bool:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.attach import attach, vary_places
+from gloves.attach import _crossings, _ray, attach, vary_places
 from gloves.layout import load_layout
 from handsim.errors import LayoutError
 from handsim.mjcf import build_spec
 from handsim.model import HandModel, join_qpos
 from handsim.shape import EVERYBODY, sample_shape
+from handsim.surface import linear_blend_skinning
 from handsim.transforms import MIRROR
 
 
@@ -28,6 +29,37 @@ def test_markers_sit_one_radius_above_the_skin(glove, rng):
     np.testing.assert_allclose(distance, layout.radius, atol=0.0004)
     np.testing.assert_allclose(np.linalg.norm(attachment.normals, axis=1), 1.0)
     np.testing.assert_allclose(attachment.bone_weights.sum(axis=1), 1.0)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_markers_stand_where_a_ray_through_every_triangle_leaves_the_skin(side, rng):
+    layout = vary_places(load_layout("dense19"), along=0.1, around=0.3, rng=rng)
+    model = HandModel(sample_shape(EVERYBODY, side=side, rng=rng))
+    attachment, skin = attach(layout, model), model.surface
+    corners = skin.vertices[skin.faces]
+    edges1, edges2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    for number, marker in enumerate(layout.markers):
+        origin, direction = _ray(marker, model)
+        everywhere = np.broadcast_to(direction, edges1.shape)
+        _, distance, outwards = _crossings(
+            np.broadcast_to(origin, edges1.shape), everywhere, corners[:, 0], edges1, edges2
+        )
+        exit_point = origin + distance[outwards].min() * direction
+        below = attachment.points[number] - layout.radius * attachment.normals[number]
+        np.testing.assert_allclose(below, exit_point, atol=1e-12)
+
+
+def test_markers_are_carried_as_the_skin_is(rng):
+    model = HandModel(sample_shape(EVERYBODY, rng=rng))
+    glove = attach(load_layout("dense19"), model)
+    low, high = model.skeleton.ranges.T
+    bones = model.forward_kinematics(join_qpos(rng.uniform(low, high, size=(20, 20))))
+    markers, normals = glove.markers(model, bones)
+    weights = (glove.bone_indices, glove.bone_weights, model.rest_transforms, bones)
+    np.testing.assert_allclose(markers, linear_blend_skinning(glove.points, *weights), atol=1e-12)
+    ahead = linear_blend_skinning(glove.points + glove.normals, *weights) - markers
+    np.testing.assert_allclose(normals, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True), atol=1e-12)
+    np.testing.assert_array_equal(glove.centres(model, bones), markers)
 
 
 def test_left_glove_is_the_mirror_image(rng):

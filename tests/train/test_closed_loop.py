@@ -118,7 +118,10 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
         (["label", "TAKE", "--glove", "sparse13", "--labeler", "RUN", "--out", "OUT"], "the labeler knows"),
         (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "wanted 0 or more"),
         (["train", "nowhere", "--out", "OUT"], "wanted a training set with a manifest.json, but nowhere"),
-        (["train", "SET", "--out", "RUN", "--seed", "5"], "holds a run of other settings"),
+        (
+            ["train", "SET", "--out", "RUN", "--seed", "5"],
+            "holds a training run begun with other settings (train)",
+        ),
     ],
 )
 def test_mistakes_end_in_one_sentence(run, tmp_path, capsys, arguments, sentence):
