@@ -15,6 +15,7 @@ from scipy.ndimage import convolve1d, maximum_filter1d
 from handsim.model import HandModel, join_qpos
 from handsim.segments import segment_distance_squared
 from handsim.topology import BONES
+from poses.couplings import finger_view
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -25,7 +26,9 @@ FARTHEST: Final = 0.4
 NEAREST: Final = -0.15
 """Where it ends without one [m]."""
 _PRESS: Final = 0.0005  # depth [m] to which a hand is brought to the other
-_FINGER_PRESS: Final = 0.0008  # depth [m] to which a closing finger goes, into the other hand or its own
+# Fingers close in two stages: what stops a knuckle does not stop the joints beyond it. Each has a depth [m] to
+# which a finger presses into the other hand or its own, and the joints of a digit that it moves.
+_STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
 _LEVELS: Final = 13  # poses between open and closed; between them a finger's bones move on straight lines
 _STEPS_A_LEVEL: Final = 2
 _HALVINGS: Final = 9
@@ -74,27 +77,26 @@ def close_fingers(
         other_qpos: Where that is.
         window: Frames over which the ways are smoothed; 1 leaves each frame alone.
     """
-    busy = np.flatnonzero(strength.max(axis=1) > 0.0)
     angles = opened[:, 7:].copy()
+    busy = np.flatnonzero(strength.max(axis=1) > 0.0)
     if len(busy) == 0:
         return angles
-    capsules = model.capsules
-    digits = np.array([BONES[bone].digit for bone in capsules.bones])
-    levels = _levels(model, opened[busy], closed[busy])
-    current = levels[:, 0].copy()
     obstacle = other.capsules.posed(other.forward_kinematics(other_qpos[busy]))
-    pairs = capsules.touching_pairs()
-    for digit in _ORDER:
-        moving = np.flatnonzero(digits == digit)
-        own = pairs[(digits[pairs] == digit).sum(axis=1) == 1]
-        share = np.ones(len(opened))
-        share[busy] = _closing(
-            levels, current, moving, own, capsules.radii, obstacle, other.capsules.radii
-        )
-        share = smooth_below(share, window) * strength[:, digit]
-        current[:, moving] = _between(levels[:, :, moving], share[busy])
-        place = slice(4 * digit, 4 * digit + 4)
-        angles[:, place] += share[:, None] * (closed[:, place] - angles[:, place])
+    for press, joints in _STAGES:
+        goal = angles.copy()
+        finger_view(goal)[..., joints] = finger_view(closed)[..., joints]
+        levels = _levels(model, np.concatenate([opened[:, :7], angles], axis=1)[busy], goal[busy])
+        current = levels[:, 0].copy()
+        for digit in _ORDER:
+            bones, pairs = _parts(model, digit)
+            share = np.ones(len(angles))
+            share[busy] = _closing(
+                levels, current, bones, pairs, model.capsules.radii, obstacle, other.capsules.radii, press
+            )
+            share = smooth_below(share, window) * strength[:, digit]
+            current[:, bones] = _between(levels[:, :, bones], share[busy])
+            place = slice(4 * digit, 4 * digit + 4)
+            angles[:, place] += share[:, None] * (goal[:, place] - angles[:, place])
     return angles
 
 
@@ -111,6 +113,13 @@ def smooth_above(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarra
 def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
     """A smooth curve that is nowhere above `values`, smoothed over an odd number of frames."""
     return -smooth_above(-values, window)
+
+
+def _parts(model: HandModel, digit: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """A digit's capsules, and its pairs with the rest of the hand."""
+    digits = np.array([BONES[bone].digit for bone in model.capsules.bones])
+    pairs = model.capsules.touching_pairs()
+    return np.flatnonzero(digits == digit), pairs[(digits[pairs] == digit).sum(axis=1) == 1]
 
 
 def _levels(
@@ -163,7 +172,7 @@ def _first_contact(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _closing(
-    levels: Any, current: Any, moving: Any, own: Any, radii: Any, obstacle: Any, obstacle_radii: Any
+    levels: Any, current: Any, moving: Any, own: Any, radii: Any, obstacle: Any, others: Any, press: Any
 ) -> Any:
     share = np.empty(len(levels))
     segments = np.empty(current.shape[1:])
@@ -173,12 +182,12 @@ def _closing(
         low, high = 0.0, 1.0
         for step in range(1, steps + 1):
             high = step / steps
-            if _blocked(levels[frame], high, segments, moving, own, radii, obstacle[frame], obstacle_radii):
+            if _blocked(levels[frame], high, segments, moving, own, radii, obstacle[frame], others, press):
                 break
             low = high
         for _ in range(_HALVINGS if low < high else 0):
             middle = (low + high) / 2
-            if _blocked(levels[frame], middle, segments, moving, own, radii, obstacle[frame], obstacle_radii):
+            if _blocked(levels[frame], middle, segments, moving, own, radii, obstacle[frame], others, press):
                 high = middle
             else:
                 low = middle
@@ -188,7 +197,7 @@ def _closing(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _blocked(
-    levels: Any, share: Any, segments: Any, moving: Any, own: Any, radii: Any, obstacle: Any, others: Any
+    levels: Any, share: Any, segments: Any, moving: Any, own: Any, radii: Any, obstacle: Any, others: Any, press: Any
 ) -> bool:
     place = share * (_LEVELS - 1)
     low = min(int(place), _LEVELS - 2)
@@ -196,7 +205,7 @@ def _blocked(
     for i in moving:
         segments[i] = (1.0 - rest) * levels[low, i] + rest * levels[low + 1, i]
         for j in range(len(others)):
-            reach = radii[i] + others[j] - _FINGER_PRESS
+            reach = radii[i] + others[j] - press
             if (
                 segment_distance_squared(segments[i, 0], segments[i, 1], obstacle[j, 0], obstacle[j, 1])
                 < reach * reach
@@ -204,7 +213,7 @@ def _blocked(
                 return True
     for pair in range(len(own)):
         i, j = own[pair, 0], own[pair, 1]
-        reach = radii[i] + radii[j] - _FINGER_PRESS
+        reach = radii[i] + radii[j] - press
         if (
             segment_distance_squared(segments[i, 0], segments[i, 1], segments[j, 0], segments[j, 1])
             < reach * reach
