@@ -1,4 +1,4 @@
-"""How deep a hand digs into itself."""
+"""How deep a hand digs into itself, and into another one."""
 
 from __future__ import annotations
 
@@ -25,6 +25,19 @@ def penetration_depth(
     return depth
 
 
+def overlap_between(
+    first: Capsules,
+    T_world_first: Float[np.ndarray, "T L 4 4"],
+    second: Capsules,
+    T_world_second: Float[np.ndarray, "T L 4 4"],
+) -> Float[np.ndarray, "T"]:
+    """Deepest overlap of any capsule of one hand with any of another [m]; where none touches, minus the gap."""
+    overlap: NDArray[np.float64] = _overlap(
+        first.posed(T_world_first), first.radii, second.posed(T_world_second), second.radii
+    )
+    return overlap
+
+
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
     depth = np.zeros(len(segments))
@@ -44,3 +57,18 @@ def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
                 if squared < reach * reach:
                     depth[frame] = radii[i] + radii[j] - np.sqrt(squared)
     return depth
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _overlap(first: Any, first_radii: Any, second: Any, second_radii: Any) -> Any:
+    overlap = np.full(len(first), -np.inf)
+    for frame in range(len(first)):
+        for i in range(len(first_radii)):
+            for j in range(len(second_radii)):
+                squared = segment_distance_squared(
+                    first[frame, i, 0], first[frame, i, 1], second[frame, j, 0], second[frame, j, 1]
+                )
+                reach = first_radii[i] + second_radii[j] - overlap[frame]
+                if squared < reach * reach:
+                    overlap[frame] = first_radii[i] + second_radii[j] - np.sqrt(squared)
+    return overlap
