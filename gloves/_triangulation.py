@@ -180,7 +180,7 @@ def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
-    """Rays that made a point make no other; where a camera does not see its source, it takes another's ray."""
+    """Rays that made a point make no other; a camera that does not see its source lends another's ray."""
     for c in range(len(T_world_camera)):
         taken, near = -1, gate
         if usable[source, c]:

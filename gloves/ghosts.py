@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.visibility import free_segments
+from gloves.mirrors import cameras_by_mirror, reflect
 from handsim.cameras import CameraRig
 
 if TYPE_CHECKING:
@@ -71,17 +71,6 @@ def sample_ghosts(
     return _keep_some(np.concatenate([strays, images], axis=1), rng)
 
 
-def reflect(
-    points: Float[np.ndarray, "*batch 3"],
-    plane_point: Float[np.ndarray, "*batch 3"],
-    plane_normal: Float[np.ndarray, "*batch 3"],
-) -> Float[np.ndarray, "*batch 3"]:
-    """Mirror images of points in planes given by a point and a unit normal [m]."""
-    height = np.einsum("...i,...i->...", points - plane_point, plane_normal)
-    mirrored: NDArray[np.float64] = points - 2.0 * height[..., None] * plane_normal
-    return mirrored
-
-
 def _mirror_images(
     markers: NDArray[np.float64],
     rig: CameraRig,
@@ -100,25 +89,9 @@ def _mirror_images(
     half = np.linalg.norm(markers.max(axis=1) - markers.min(axis=1), axis=1) / (2 * np.sqrt(3.0))
     distance = half + rng.uniform(*config.mirror_distance, size=frames)
     plane = middle - distance[:, None] * normal
-    planes, normals = plane[:, None], normal[:, None]
-    images = reflect(markers, planes, normals)
-    # The way marker -> patch -> camera unfolds into the straight line from the mirror image to the camera.
-    towards = rig.positions - images[:, :, None]
-    ahead = np.einsum("tmci,ti->tmc", towards, normal)
-    behind = np.einsum("tmi,ti->tm", plane[:, None] - images, normal)
-    share = behind[..., None] / np.where(ahead > 1e-9, ahead, np.inf)
-    hits = images[:, :, None] + share[..., None] * towards
-    off = hits - plane[:, None, None]
-    seen = (share > 0) & (share < 1) & (behind[..., None] > 0)
-    seen &= np.einsum("tmci,tmci->tmc", off, off) < config.mirror_radius**2
-    seen &= (rng.random((frames, count)) < config.reflectance)[..., None]
-    frame, marker = np.nonzero(seen.any(axis=2))
-    seen[frame, marker] &= rig.in_view(images[frame, marker])
-    frame, marker, camera = np.nonzero(seen)
-    spot = hits[frame, marker, camera]
-    clear = free_segments(frame, markers[frame, marker], spot, segments, radii)
-    clear &= free_segments(frame, spot, rig.positions[camera], segments, radii)
-    seen[frame, marker, camera] = clear
+    images = reflect(markers, plane[:, None], normal[:, None])
+    images[rng.random((frames, count)) >= config.reflectance] = np.nan
+    seen = cameras_by_mirror(images, plane, normal, config.mirror_radius, rig, segments, radii)
     images[seen.sum(axis=2) < min_cameras] = np.nan
     return images
 

@@ -50,41 +50,45 @@ def cameras_by_mirror(
         segments: Capsule axes of what stands in the way [m].
         radii: Their radii [m].
     """
-    seen: NDArray[np.bool_] = rig.in_view(images)
-    _over_patch(images, plane_point, plane_normal, radius, rig.positions, segments, radii, seen)
+    seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
+    view = np.cos(rig.field_of_view / 2)
+    _over_patch(images, plane_point, plane_normal, radius, rig.T_world_camera, view, segments, radii, seen)
     return seen
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _over_patch(
-    images: Any, plane_point: Any, plane_normal: Any, radius: float, cameras: Any, segments: Any, radii: Any,
-    seen: Any,
+    images: Any, plane_point: Any, plane_normal: Any, radius: float, T_world_camera: Any, view: float,
+    segments: Any, radii: Any, seen: Any,
 ) -> None:  # fmt: skip
-    hit, marker = np.empty(3), np.empty(3)
+    hit, marker, camera = np.empty(3), np.empty(3), np.empty(3)
     for t in range(len(images)):
         point, normal = plane_point[t], plane_normal[t]
         for p in range(images.shape[1]):
             behind = 0.0  # how deep the image lies behind the plane
             for i in range(3):
                 behind += (point[i] - images[t, p, i]) * normal[i]
+            if not behind > 0.0:  # also where there is no image: NaN
+                continue
             for i in range(3):
                 marker[i] = images[t, p, i] + 2.0 * behind * normal[i]
-            for c in range(len(cameras)):
-                if not seen[t, p, c]:
-                    continue
-                ahead, off = 0.0, 0.0
+            for c in range(len(T_world_camera)):
+                ahead, off, deep, far = 0.0, 0.0, 0.0, 0.0
                 for i in range(3):
-                    ahead += (cameras[c, i] - images[t, p, i]) * normal[i]
-                if not 0.0 < behind < ahead:
-                    seen[t, p, c] = False
+                    camera[i] = T_world_camera[c, i, 3]
+                    way = images[t, p, i] - camera[i]
+                    ahead -= way * normal[i]
+                    deep += way * T_world_camera[c, i, 2]
+                    far += way * way
+                if ahead <= behind or deep < view * np.sqrt(far):
                     continue
                 for i in range(3):
-                    hit[i] = images[t, p, i] + behind / ahead * (cameras[c, i] - images[t, p, i])
+                    hit[i] = images[t, p, i] + behind / ahead * (camera[i] - images[t, p, i])
                     off += (hit[i] - point[i]) ** 2
                 seen[t, p, c] = (
                     off < radius * radius
                     and _clear(marker, hit, segments[t], radii)
-                    and _clear(hit, cameras[c], segments[t], radii)
+                    and _clear(hit, camera, segments[t], radii)
                 )
 
 

@@ -12,7 +12,7 @@ from handsim.capsules import bounding_spheres
 from handsim.segments import segment_distance_squared
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float
     from numpy.typing import NDArray
 
 MAX_FACING: Final = np.deg2rad(85.0)
@@ -31,18 +31,6 @@ def free_rays(
     its radius, so one distance between two segments decides it; MuJoCo's `mj_multiRay` is the test's oracle.
     """
     free: NDArray[np.bool_] = _free(markers, cameras, segments, radii)
-    return free
-
-
-def free_segments(
-    frames: Int[np.ndarray, "S"],
-    starts: Float[np.ndarray, "S 3"],
-    ends: Float[np.ndarray, "S 3"],
-    segments: Float[np.ndarray, "T K 2 3"],
-    radii: Float[np.ndarray, "K"],
-) -> Bool[np.ndarray, "S"]:
-    """Which lines from start to end [m] meet no capsule of their frame."""
-    free: NDArray[np.bool_] = _free_lines(frames, starts, ends, segments, radii)
     return free
 
 
@@ -121,19 +109,4 @@ def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
                     ):
                         free[t, m, c] = False
                         break
-    return free
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _free_lines(frames: Any, starts: Any, ends: Any, segments: Any, radii: Any) -> Any:
-    free = np.ones(len(frames), dtype=np.bool_)
-    for line in range(len(frames)):
-        axes = segments[frames[line]]
-        for k in range(len(radii)):
-            if (
-                segment_distance_squared(starts[line], ends[line], axes[k, 0], axes[k, 1])
-                < radii[k] * radii[k]
-            ):
-                free[line] = False
-                break
     return free

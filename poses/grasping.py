@@ -11,11 +11,11 @@ import numpy as np
 from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.objects import RigidObject
-from handsim.topology import DIGITS, NUM_JOINTS
+from handsim.topology import NUM_JOINTS
 from poses.couplings import HIGH, LOW
 from poses.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_scene, pose_to_qpos
 from poses.hold_library import HoldStyle, hold_names, hold_style, place_object
-from poses.validity import MAX_PENETRATION, is_valid
+from poses.validity import is_valid
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -15,7 +15,7 @@ from handsim.errors import ShapeError, choices
 from handsim.model import HandModel, join_qpos
 from handsim.objects import RigidObject
 from handsim.topology import BONE_NAMES, DIGITS
-from handsim.transforms import MIRROR, vector_quaternions, quaternion_matrix
+from handsim.transforms import MIRROR, quaternion_matrix, vector_quaternions
 from poses.grasp_scene import GraspScene
 from poses.library import gesture
 

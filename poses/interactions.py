@@ -105,7 +105,13 @@ def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
 
 
 def draw_meeting(
-    variant: dict[str, Any], still: HandModel, moving: HandModel, count: int, *, together: bool, rng: np.random.Generator
+    variant: dict[str, Any],
+    still: HandModel,
+    moving: HandModel,
+    count: int,
+    *,
+    together: bool,
+    rng: np.random.Generator,
 ) -> Meeting:
     """Random places, orientations and fingers for `count` beats.
 
@@ -119,8 +125,10 @@ def draw_meeting(
     """
     noise = _Noise(count, together, rng)
     mirror = np.eye(3) if still.shape.side == "right" else MIRROR
-    fingers = [_draw_fingers(model, variant[role], variant["relaxing"], noise, rng)
-               for model, role in ((still, "still"), (moving, "moving"))]
+    fingers = [
+        _draw_fingers(model, variant[role], variant["relaxing"], noise, rng)
+        for model, role in ((still, "still"), (moving, "moving"))
+    ]
     targets = np.tile(variant["target"], (count, 1))
     targets[:, :2] += noise.around(np.array(variant["jitter"]), 0.0) + _places(variant, count, rng)
     tilts = noise.around(np.deg2rad(variant["tilt"]), 0.3)
@@ -166,7 +174,8 @@ def _draw_fingers(
     model: HandModel, role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
 ) -> Fingers:
     opened, closed = (
-        np.clip(_angles(role[state]) + noise.around(_NOISE, _WANDER), LOW, HIGH) for state in ("open", "closed")
+        np.clip(_angles(role[state]) + noise.around(_NOISE, _WANDER), LOW, HIGH)
+        for state in ("open", "closed")
     )
     weaker = rng.random((noise.count, len(DIGITS))) < relaxing
     strength = np.where(weaker, rng.uniform(0.4, 1.0, size=weaker.shape), 1.0)
@@ -180,7 +189,9 @@ def _angles(name: str) -> NDArray[np.float64]:
     return np.deg2rad(np.array(library()["hands"][name], dtype=np.float64).ravel())
 
 
-def _anchors(anchor: str | list[float], moving: HandModel, opened: NDArray[np.float64]) -> NDArray[np.float64]:
+def _anchors(
+    anchor: str | list[float], moving: HandModel, opened: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Points (K, 3) of the moving hand in its wrist frame [m]."""
     if isinstance(anchor, str):
         bone = bones_of(anchor)[-1]

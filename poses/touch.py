@@ -204,7 +204,15 @@ def _pairs_in_line(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _closing(
-    rotations: Any, positions: Any, start: Any, goal: Any, parts: Any, others: Any, radii: Any, meets: Any, press: Any
+    rotations: Any,
+    positions: Any,
+    start: Any,
+    goal: Any,
+    parts: Any,
+    others: Any,
+    radii: Any,
+    meets: Any,
+    press: Any,
 ) -> Any:
     share = np.empty(len(start))
     near = np.empty(len(radii), dtype=np.int64)

@@ -186,7 +186,7 @@ def _travel(
 def _in_world(
     whole: Passage, middle: NDArray[np.float64], turns: Rotation
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """qpos of both hands, the middle of their wrists and the right one's orientation given."""
+    """Qpos of both hands, the middle of their wrists and the right one's orientation given."""
     across = turns.apply(whole.position) / 2
     rotations = turns.as_matrix()
     return (

@@ -8,7 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.ghosts import MAX_GHOSTS, GhostConfig, reflect, sample_ghosts
+from gloves.ghosts import MAX_GHOSTS, GhostConfig, sample_ghosts
+from gloves.mirrors import reflect
 from handsim.cameras import named_rig
 
 NOTHING = (np.zeros((200, 0, 2, 3)), np.zeros(0))
