@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from machine import describe
 
+from gloves.attach import wear
 from gloves.ghosts import sample_ghosts
 from gloves.layout import load_layout
 from gloves.visibility import free_rays, pack_cameras, visible_cameras
@@ -28,7 +29,7 @@ from handsim.model import join_qpos
 from handsim.transforms import random_quaternions
 from poses.validity import sample_valid_angles
 from train.shards import row_dtype
-from train.synthesis import DatasetConfig, generate_dataset, sample_hand, wear
+from train.synthesis import DatasetConfig, generate_dataset, sample_hand
 
 CONFIG = DatasetConfig()
 HANDS = 48
@@ -61,7 +62,8 @@ def one_hand(watch: Stopwatch, rng: np.random.Generator) -> None:
     with watch.stage("skin: cage fitted to the shape"):
         _ = model.surface
     with watch.stage("glove: 19 slipped markers on the skin"):
-        attachment = wear(layout, model, CONFIG, rng=rng)
+        slip = np.deg2rad(CONFIG.slip_around)
+        attachment = wear(layout, model, along=CONFIG.slip_along, around=slip, rng=rng)
     with watch.stage("poses: drawn and made valid"):
         angles = sample_valid_angles(model, FRAMES, CONFIG.poses, rng=rng)
     turns = random_quaternions(FRAMES, rng=rng)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from handsim.topology import BONE_NAMES, PALM
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
+
+_MOST_FITTINGS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +120,22 @@ def vary_places(
         )
 
     return dataclasses.replace(layout, markers=tuple(moved(marker) for marker in layout.markers))
+
+
+def wear(
+    layout: MarkerLayout, model: HandModel, *, along: float, around: float, rng: np.random.Generator
+) -> Attachment:
+    """The glove put on with its markers slipped a little (`vary_places`), again while one is off the hand.
+
+    Raises:
+        LayoutError: A marker finds no skin however it slips.
+    """
+    for _ in range(_MOST_FITTINGS):
+        try:
+            return attach(vary_places(layout, along=along, around=around, rng=rng), model)
+        except LayoutError:
+            continue
+    return attach(layout, model)
 
 
 def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -25,7 +25,7 @@ class GapCounts(NamedTuple):
 def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
     """Table 3's figures of a capture with M expected markers."""
     missing = ~present
-    lacking: np.ndarray = missing.any(axis=1)
+    lacking = np.any(missing, axis=1)
     lengths = run_lengths(lacking[:, None])
     gaps = len(lengths)
     return GapCounts(

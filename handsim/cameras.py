@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 FEWEST_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32
 """A marker's visibility is one bit a camera in 32 bits."""
+ROOM_CENTRE: Final = (0.0, 0.0, 1.1)
+"""Middle of the space that hands move in, in front of a seated user [m]."""
 HAND_REACH: Final = 0.25
 """No hand reaches further from its wrist [m], and no camera that watches it stands nearer."""
 _WIDEST: Final = 170.0  # [deg]

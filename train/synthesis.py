@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.attach import Attachment, attach, vary_places
+from gloves.attach import attach, wear
 from gloves.ghosts import GhostConfig, sample_ghosts
 from gloves.layout import MarkerLayout, load_layout
 from gloves.visibility import pack_cameras, visible_cameras
-from handsim.cameras import CameraRig, named_rig
-from handsim.errors import DatasetError, LayoutError, ShapeError
+from handsim.cameras import ROOM_CENTRE, CameraRig, check_outside_volume, list_rigs, load_rig
+from handsim.errors import DatasetError, ShapeError
 from handsim.hand_records import HAND_DTYPE, pack_hand
 from handsim.model import HandModel, join_qpos
 from handsim.shape import Population, sample_shape
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROWS_PER_SHARD: Final = 8192
-_MOST_FITTINGS: Final = 20
 Progress = Callable[[int, int], None]
 """Called with frames done and frames wanted."""
 
@@ -59,7 +58,7 @@ class DatasetConfig:
     """Frames; the default is the paper's number."""
     seed: int = 0
     rig: str = "figure5"
-    """Camera rig by name."""
+    """Camera rig: a shipped name or the path of a .toml file."""
     min_cameras: int = 2
     """Cameras that must see a marker before it exists."""
     frames_per_hand: int = 128
@@ -97,13 +96,19 @@ def generate_dataset(
         DatasetError: `out` holds a set of another config, or a worker died.
         LayoutError: The glove is unknown or does not fit.
     """
-    layout, rig = load_layout(config.glove), named_rig(config.rig)
+    layout, rig = load_layout(config.glove), load_rig(config.rig)
+    check_outside_volume(rig, np.array(ROOM_CENTRE), config.volume)
     if config.min_cameras > len(rig.positions):
         raise DatasetError(
             f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
     attach(layout, HandModel.named("M"))  # a glove that does not fit is told before anything is written
     settings = {**dataclasses.asdict(config), "layout": dataclasses.asdict(layout)}
+    if config.rig not in list_rigs():  # a file may change
+        settings["cameras"] = {
+            "T_world_camera": rig.T_world_camera.tolist(),
+            "field_of_view": rig.field_of_view,
+        }
     claim(out / CONFIG, settings, noun="training set", error=DatasetError)
     shards = range(-(-config.num_frames // ROWS_PER_SHARD))
     todo = [shard for shard in shards if not _finished(out, shard)]
@@ -157,7 +162,7 @@ def _make_all(config: DatasetConfig, out: Path, todo: list[int], workers: int) -
 def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:
     """Write one shard's hands and rows; its number is all that its randomness hangs on besides the seed."""
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(shard,)))
-    layout, rig = load_layout(config.glove), named_rig(config.rig)
+    layout, rig = load_layout(config.glove), load_rig(config.rig)
     size = _shard_size(config, shard)
     rows = np.zeros(size, dtype=row_dtype(layout.num_markers))
     hands = np.zeros(-(-size // config.frames_per_hand), dtype=HAND_DTYPE)
@@ -184,23 +189,6 @@ def sample_hand(population: Population, *, rng: np.random.Generator) -> HandMode
         return model
 
 
-def wear(
-    layout: MarkerLayout, model: HandModel, config: DatasetConfig, *, rng: np.random.Generator
-) -> Attachment:
-    """The glove put on with its markers slipped a little, drawn again while one has slipped off the hand.
-
-    Raises:
-        LayoutError: A marker finds no skin however it slips.
-    """
-    for _ in range(_MOST_FITTINGS):
-        slipped = vary_places(layout, along=config.slip_along, around=np.deg2rad(config.slip_around), rng=rng)
-        try:
-            return attach(slipped, model)
-        except LayoutError:
-            continue
-    return attach(layout, model)
-
-
 def simulate_frames(
     block: NDArray[np.void],
     model: HandModel,
@@ -212,8 +200,9 @@ def simulate_frames(
 ) -> None:
     """Fill rows with random poses of one gloved hand and what the rig sees of them."""
     count = len(block)
-    attachment = wear(layout, model, config, rng=rng)
-    position = np.array([0.0, 0.0, 1.1]) + rng.uniform(-config.volume, config.volume, size=(count, 3))
+    slip = np.deg2rad(config.slip_around)
+    attachment = wear(layout, model, along=config.slip_along, around=slip, rng=rng)
+    position = ROOM_CENTRE + rng.uniform(-config.volume, config.volume, size=(count, 3))
     qpos = join_qpos(
         sample_valid_angles(model, count, config.poses, rng=rng),
         position=position,
