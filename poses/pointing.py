@@ -6,8 +6,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
+from handsim.contact import overlap_between
+from handsim.errors import ShapeError
+from handsim.model import HandModel
+from handsim.motion import BodyMotion, HandMotion
+from handsim.objects import RigidObject
+from handsim.transforms import axis_angle_matrix
+from poses.grasp_scene import object_penetration, pose_to_qpos, wrist_poses
 from poses.motions import minimum_jerk
+from poses.validity import MAX_PENETRATION
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -15,6 +24,10 @@ if TYPE_CHECKING:
 _REFERENCE: Final = np.array(
     [0.35, 0.8, 0.5]
 )  # where the writing arm comes from, never along the pen for long
+
+_MOST_RETREATS: Final = 12
+_RETREAT_STEP: Final = 0.003  # [m] beyond what is asked for
+_SMOOTHING: Final = 0.25  # [s] over which the pen draws back
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,3 +111,63 @@ def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) ->
     pose[:, :3, 0], pose[:, :3, 1], pose[:, :3, 2] = x, np.cross(axis, x), axis
     pose[:, :3, 3] = origin
     return pose
+
+
+def point_pen(
+    holder: HandModel,
+    other: HandModel,
+    pen: RigidObject,
+    held: tuple[HandMotion, BodyMotion],
+    other_motion: HandMotion,
+    path: Float[np.ndarray, "T 4 4"],
+) -> tuple[HandMotion, BodyMotion]:
+    """The pen led along a path by the hand that holds it, drawn back wherever something would touch.
+
+    Args:
+        holder: The hand with the pen.
+        other: The hand that is pointed at.
+        pen: The pen; its tip is its first marker, its body goes from there along its z axis.
+        held: How fingers and pen move against the wrist; where the wrist goes is decided here.
+        other_motion: What the other hand does.
+        path: Where the tip shall be and how the pen shall stand, see `pointing_path`.
+
+    Raises:
+        ShapeError: Even drawn back, something touches.
+    """
+    motion, body = held
+    T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
+    T_path_pen = _turned_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
+    back = np.zeros(len(path))
+    for _ in range(_MOST_RETREATS):
+        pose = path.copy()
+        pose[:, :3, 3] += back[:, None] * path[:, :3, 2]
+        T_world_pen = pose @ T_path_pen
+        qpos = motion.qpos.copy()
+        qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+        deep = np.maximum(
+            overlap_between(
+                holder.capsules, holder.forward_kinematics(qpos),
+                other.capsules, other.forward_kinematics(other_motion.qpos),
+            ),
+            object_penetration(other, pen, other_motion.qpos, T_world_pen),
+        )  # fmt: skip
+        if deep.max() <= MAX_PENETRATION:
+            return HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
+        needed = np.where(deep > 0.5 * MAX_PENETRATION, back + deep + _RETREAT_STEP, back)
+        window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
+        back = uniform_filter1d(maximum_filter1d(needed, window), window)
+    raise ShapeError("the hands touch wherever the pen points, however far it draws back")
+
+
+def _turned_to_the_arm(
+    T_wrist_pen: Float[np.ndarray, "4 4"], tip: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """Pen in the path's frame: its tip at the origin, turned about itself until the wrist lies on the +x side."""
+    wrist = np.linalg.inv(T_wrist_pen)[:3, 3]
+    away = np.arctan2(wrist[1], wrist[0])
+    turn = np.eye(4)
+    turn[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), np.array([-away]))[0]
+    shift = np.eye(4)
+    shift[:3, 3] = -tip
+    posed: np.ndarray = turn @ shift
+    return posed
