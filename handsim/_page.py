@@ -24,6 +24,7 @@ figure { margin: 1rem 0 1.6rem; }
 .card { display: block; background: var(--card); border: 1px solid var(--line); border-radius: .6rem;
   padding: .6rem; }
 img { display: block; max-width: 100%; max-height: 44rem; margin: 0 auto; }
+div.card img { max-height: none; }
 figcaption, .note { font-size: .92rem; margin-top: .4rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .35rem .9rem .35rem 0; border-bottom: 1px solid var(--line); text-align: right; }

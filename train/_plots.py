@@ -74,6 +74,9 @@ def draw_angles(
     for number, joint in enumerate(JOINTS):
         digit, place = divmod(number, 4)
         panel: Axes = panels[place, digit]
+        if digit > 1:  # the thumb has axes of its own; linked before anything is drawn, so that all fits
+            panel.sharex(panels[place, 1])
+            panel.sharey(panels[place, 1])
         density = 100.0 * shares[number] / np.diff(edges[number])
         panel.axvspan(joint.low, joint.high, color=_BAND, linewidth=0)
         panel.stairs(density, edges[number], fill=True, color=_BLUE)
@@ -86,11 +89,8 @@ def draw_angles(
         panel.locator_params(axis="x", nbins=5)
         panel.locator_params(axis="y", nbins=3)
         panel.tick_params(labelsize=8.0, length=2.5)
-        if digit > 1:
-            panel.sharex(panels[place, 1])
-            panel.sharey(panels[place, 1])
-            panel.spines["left"].set_visible(False)
-            panel.tick_params(axis="y", left=False, labelleft=False)
+        panel.spines["left"].set_visible(digit < 2)
+        panel.tick_params(axis="y", left=digit < 2, labelleft=digit < 2)
     for digit, name in enumerate(DIGITS):
         panels[0, digit].annotate(
             name, (0.0, 1.0), (0.0, 20.0), "axes fraction", "offset points", weight="bold", fontsize=10.5
@@ -149,6 +149,8 @@ def draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Float
     right.set_xlabel("from a ghost to the nearest marker [mm]")
     if len(distances):
         _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", _INK)
+    else:
+        right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=_SOFT)
 
 
 def draw_neighbours(figure: Figure, distances: Float[np.ndarray, "T M"], diameter: float) -> None:
@@ -223,6 +225,8 @@ def _millimetres(panel: Axes, distances: Float[np.ndarray, "N"], color: str, thi
     panel.set_ylabel(f"share of {things} [% per mm]")
     panel.set_xlim(left=0.0)
     panel.margins(y=0.12)
+    if not distances.size:
+        panel.set_ylim(0.0, 1.0)
 
 
 def _mark(panel: Axes, place: float, text: str, color: str) -> None:

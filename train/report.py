@@ -172,12 +172,8 @@ def gap_lengths(present: Bool[np.ndarray, "T M"]) -> Int[np.ndarray, "G"]:
 
 def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section:
     manifest = dataset.manifest
-    hands = np.concatenate(
-        [
-            np.load(dataset.path / hands_name(shard), allow_pickle=False)[["left", "length"]]
-            for shard in range(len(dataset.shards))
-        ]
-    )
+    files = [dataset.path / hands_name(shard) for shard in range(len(dataset.shards))]
+    hands = np.concatenate([np.load(file, allow_pickle=False)[["left", "length"]] for file in files])
     length = 1e3 * np.percentile(hands["length"], [0, 50, 100])
     visible = seen_by_enough(rows["cameras"], manifest.min_cameras).sum(axis=1).mean()
     counts = ghost_counts(rows)
@@ -202,18 +198,15 @@ def _angles_section(rows: Shaped[np.ndarray, "T"]) -> Section:
     edges = np.linspace(_LOW, _HIGH, ANGLE_BINS + 1, axis=1)
     middle = np.rad2deg(np.percentile(rows["qpos"][:, 7:], [1.0, 99.0], axis=0)).T
     draw = partial(_plots.draw_angles, shares=angle_shares(rows), edges=edges, middle=middle)
-    return Section(
-        "Joint angles",
+    text = (
         "How often each of the twenty hinges takes which angle. Zero is the flat hand; flexion counts "
-        "towards the palm, abduction towards the thumb (the thumb's own: away from the palm).",
-        pictures=[
-            (
-                _plots.picture((10.8, 7.0), draw),
-                "Grey: the joint's range. Orange: between these angles lie 98 % of the frames. "
-                "The four fingers of a row share their axes.",
-            )
-        ],
+        "towards the palm, abduction towards the thumb (the thumb's: away from the palm)."
     )
+    caption = (
+        "Grey: the joint's range. Orange: between these angles lie 98 % of the frames. The four fingers of a "
+        "row share their axes."
+    )
+    return Section("Joint angles", text, pictures=[(_plots.picture((10.8, 7.0), draw), caption)])
 
 
 def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
@@ -227,22 +220,16 @@ def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
         seen_by=shares,
         min_cameras=manifest.min_cameras,
     )
-    return Section(
-        "Occlusion",
-        f"A marker exists when at least {manifest.min_cameras} cameras see it.",
-        pictures=[
-            (
-                _plots.picture((10.8, 1.6 + 0.21 * len(manifest.marker_names)), draw),
-                f"Left: how often each marker is lost. Right: how many of {shares.shape[1] - 1} cameras "
-                "see it.",
-            )
-        ],
-    )
+    text = f"A marker exists when at least {manifest.min_cameras} cameras see it."
+    caption = f"Left: how often each marker is lost. Right: how many of {shares.shape[1] - 1} cameras see it."
+    size = (10.8, 1.6 + 0.21 * len(lost))
+    return Section("Occlusion", text, pictures=[(_plots.picture(size, draw), caption)])
 
 
 def _ghosts_section(rows: Shaped[np.ndarray, "T"]) -> Section:
-    draw = partial(_plots.draw_ghosts, counts=ghost_counts(rows), distances=ghost_distances(rows))
-    caption = "Left: ghosts a frame. Right: where they lie."
+    counts = ghost_counts(rows)
+    draw = partial(_plots.draw_ghosts, counts=counts, distances=ghost_distances(rows))
+    caption = f"Left: ghosts a frame, of which {len(counts) - 1} at most are kept. Right: where they lie."
     text = "Points that no marker made: mirror images in shiny surfaces near the hand, and stray reflections."
     return Section("Ghosts", text, pictures=[(_plots.picture((10.8, 3.4), draw), caption)])
 

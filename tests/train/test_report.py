@@ -20,6 +20,7 @@ from train.shards import Dataset, row_dtype
 from train.synthesis import DatasetConfig, generate_dataset
 
 ROOT = Path(__file__).resolve().parents[2]
+pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
 
 
 @pytest.fixture(scope="module")
