@@ -90,7 +90,13 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
     )
     page = out / "index.html"
     sections.append(_figures_section(table, num_frames, seed, speed))
-    write_page(page, sections)
+    write_page(
+        page,
+        sections,
+        title="handsim demo",
+        lead="A hand wears a marker glove, strikes poses before simulated cameras, and a labeler trained on "
+        "nothing else names the points that they see.",
+    )
     console.print(speed)
     console.print(f"page: {page.resolve()}", soft_wrap=True, markup=False)
 

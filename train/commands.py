@@ -19,6 +19,7 @@ from gloves.captures.markers import labelled_capture, select_markers, unlabelled
 from gloves.layout import load_layout
 from handsim.errors import CaptureError, HandSimError, WeightsError
 from train.config import TrainConfig
+from train.report import write_report
 from train.shards import Dataset, save_json
 from train.synthesis import DatasetConfig, generate_dataset
 
@@ -29,10 +30,10 @@ if TYPE_CHECKING:
 def generate(
     out: Path, config: Annotated[DatasetConfig, tyro.conf.arg(name="")], workers: int | None = None
 ) -> None:
-    """Make a training set; run it again to go on where it was stopped.
+    """Make a training set and a page of plots of it; run it again to go on where it was stopped.
 
     Args:
-        out: Folder for the shards and their manifest.
+        out: Folder for the shards, their manifest and report.html.
         config: What to make.
         workers: Processes; all cores when not given.
     """
@@ -43,7 +44,11 @@ def generate(
             workers=workers,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
+    # Not in generate_dataset: the set is whole without its report, whose bytes hang on matplotlib's version.
+    with Console(stderr=True).status("drawing the report"):
+        report = write_report(Dataset(out))
     Console().print(f"{manifest.num_frames} frames of {config.glove} in {out}")
+    Console().print(f"report in {report}", soft_wrap=True, markup=False)
 
 
 def train(

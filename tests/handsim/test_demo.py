@@ -63,8 +63,10 @@ def test_page_escapes_what_it_shows(tmp_path: Path) -> None:
     section = Section(
         "a < b", "text", pictures=[("x.png", 'a "b" & c')], table=[["<i>"], ["1"]], notes=["<n>"]
     )
-    write_page(tmp_path / "index.html", [section])
+    write_page(tmp_path / "index.html", [section], title="<title>", lead="x & y")
     page = (tmp_path / "index.html").read_text("utf-8")
+    assert "<title>&lt;title&gt;</title>" in page
+    assert "x &amp; y</p>" in page
     assert "a &lt; b" in page
     assert 'alt="a &quot;b&quot; &amp; c"' in page
     assert "<th>&lt;i&gt;</th>" in page
