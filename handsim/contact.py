@@ -31,7 +31,7 @@ def overlap_between(
     second: Capsules,
     T_world_second: Float[np.ndarray, "T L 4 4"],
 ) -> Float[np.ndarray, "T"]:
-    """Deepest overlap of any capsule of one hand with any of another [m]; where none touches, minus the gap."""
+    """Deepest overlap of a capsule of one hand with one of another [m]; minus the gap where none touches."""
     overlap: NDArray[np.float64] = _overlap(
         first.posed(T_world_first), first.radii, second.posed(T_world_second), second.radii
     )
@@ -69,6 +69,6 @@ def _overlap(first: Any, first_radii: Any, second: Any, second_radii: Any) -> An
                     first[frame, i, 0], first[frame, i, 1], second[frame, j, 0], second[frame, j, 1]
                 )
                 reach = first_radii[i] + second_radii[j] - overlap[frame]
-                if squared < reach * reach:
+                if reach > 0.0 and squared < reach * reach:
                     overlap[frame] = first_radii[i] + second_radii[j] - np.sqrt(squared)
     return overlap

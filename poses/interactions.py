@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from handsim.errors import ShapeError, choices
 from handsim.model import HandModel, join_qpos
-from handsim.topology import DIGITS, NUM_JOINTS, bones_of
+from handsim.topology import DIGITS, bones_of
 from handsim.transforms import MIRROR, euler_matrix
 from poses.couplings import HIGH, LOW
 from poses.library import gesture, gesture_names
-from poses.validity import make_valid
+from poses.validity import is_valid, make_valid, resting_angles
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 _FLEXION_NOISE: Final = np.deg2rad(4.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(1.5)
-_NOISE: Final = np.where(np.arange(NUM_JOINTS) % 4 == 0, _ABDUCTION_NOISE, _FLEXION_NOISE)
+_NOISE: Final = np.tile([_ABDUCTION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE], len(DIGITS))
+_SNUG: Final = 0.0007  # self-penetration [m] up to which fingers may wander
 _WANDER: Final = 0.4  # noise from beat to beat, as a share of the noise that a whole interaction keeps
 
 
@@ -150,13 +151,15 @@ class _Noise:
     def __init__(self, count: int, together: bool, rng: np.random.Generator) -> None:
         self.count, self.together, self.rng = count, together, rng
 
-    def around(self, scale: NDArray[np.float64], wander: float) -> NDArray[np.float64]:
-        """Noise (K, n) of standard deviation `scale` (n,), a share `wander` of it new at each beat."""
+    def around(
+        self, scale: NDArray[np.float64], wander: float, *, common: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Noise (K, n): `common` standard deviations `scale` (n,) that last, `wander` new at each beat."""
         size = (self.count, len(scale))
-        common = self.rng.standard_normal((1, size[1]) if self.together else size)
-        own = self.rng.standard_normal(size)
-        clipped: NDArray[np.float64] = scale * (np.clip(common, -2, 2) + wander * np.clip(own, -2, 2))
-        return clipped
+        lasting = np.clip(self.rng.standard_normal((1, size[1]) if self.together else size), -2.0, 2.0)
+        new = np.clip(self.rng.standard_normal(size), -2.0, 2.0)
+        noise: NDArray[np.float64] = scale * (common * lasting + wander * new)
+        return noise
 
 
 def _places(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -173,13 +176,21 @@ def _places(variant: dict[str, Any], count: int, rng: np.random.Generator) -> ND
 def _draw_fingers(
     model: HandModel, role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
 ) -> Fingers:
-    opened, closed = (
-        np.clip(_angles(role[state]) + noise.around(_NOISE, _WANDER), LOW, HIGH)
-        for state in ("open", "closed")
-    )
     weaker = rng.random((noise.count, len(DIGITS))) < relaxing
     strength = np.where(weaker, rng.uniform(0.4, 1.0, size=weaker.shape), 1.0)
-    return Fingers(make_valid(model, opened), closed, strength)
+    opened = _angles(role["open"]) + noise.around(_NOISE, 0.0)
+    closed = _angles(role["closed"]) + noise.around(_NOISE, 0.0)
+    lasting = _loosened(model, make_valid(model, np.clip(opened, LOW, HIGH)))
+    wandering = np.clip(lasting + _WANDER * noise.around(_NOISE, 1.0, common=0.0), LOW, HIGH)
+    valid = is_valid(model, wandering, max_penetration=_SNUG)
+    return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
+
+
+def _loosened(model: HandModel, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Valid poses, those that press hard into themselves a little nearer to rest: fingers need room."""
+    hard = ~is_valid(model, angles, max_penetration=_SNUG)
+    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
+    return angles
 
 
 def _angles(name: str) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -27,7 +27,7 @@ PEAK_SPEED: Final = 1.875
 _PEAK_ACCELERATION: Final = 5.7735  # in distances per duration squared
 _TURNING: Final = 8.0  # fastest turn of one hand against the other [rad/s]
 _CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
-_FINGER_WINDOW: Final = 0.25  # over which closing fingers are smoothed [s]
+_FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
 _PARTED: Final = (0.08, 0.16)  # how far the hands are moved apart along the axis before and after [m]
 _DISTANCE: Final = (0.25, 0.45)  # between the wrists of hands that are apart [m]
 # Single poses: how many touch, how far the others are apart at most [m], how many fingers are half closed.
@@ -71,6 +71,16 @@ class Passage:
         return Passage(self.rotation[frames], self.position[frames], self.right[frames], self.left[frames])
 
 
+class _Course(NamedTuple):
+    """What a meeting's frames do, each (T,)."""
+
+    beats: NDArray[np.float64]
+    lift: NDArray[np.float64]
+    """How far the hands are from touching [m]."""
+    grip: NDArray[np.float64]
+    """Share of their strength with which fingers close."""
+
+
 def join_passages(passages: list[Passage]) -> Passage:
     """One after the other."""
     return Passage(
@@ -93,13 +103,14 @@ def play_meeting(
         for _ in range(variant.get("tries", 1))
     ]
     meeting = min(draws, key=lambda draw: float(_reach(still, moving, draw, np.zeros(1))[0]))
-    beats, lift, grip = _course(variant, count, config, rng)
-    reach = _reach(still, moving, meeting, beats)
+    course = _course(variant, count, config, rng)
+    reach = _reach(still, moving, meeting, course.beats)
     if (reach <= NEAREST).any():
         return None
-    passage = _brought_together(still, moving, meeting, beats, reach, lift, grip, config.rate)
-    slow = _too_fast(passage, config)
-    return None if slow or not valid_frames(right, left, passage).all() else passage
+    passage = _brought_together(still, moving, meeting, course, reach=reach, rate=config.rate)
+    if _too_fast(passage, config) or not valid_frames(right, left, passage).all():
+        return None
+    return passage
 
 
 def draw_poses(
@@ -114,7 +125,9 @@ def draw_poses(
     best = tries * np.arange(count) + reach.reshape(count, tries).argmin(axis=1)
     lift = np.where(rng.random(count) < _TOUCHING, 0.0, _GAP * rng.random(count))
     grip = np.where(rng.random(count) < _HALF_CLOSED, rng.random(count), 1.0)
-    passage = _brought_together(still, moving, meeting, best.astype(float), reach[best], lift, grip, None)
+    passage = _brought_together(
+        still, moving, meeting, _Course(best.astype(float), lift, grip), reach=reach[best], rate=None
+    )
     return passage.at((reach[best] > NEAREST) & valid_frames(right, left, passage))
 
 
@@ -127,7 +140,7 @@ def way_between(
     *,
     rng: np.random.Generator,
 ) -> Passage | None:
-    """Frames from one single pose to another over a place where the hands are apart, if this draw is valid."""
+    """Frames from one pose to another over a place where the hands are apart; nothing when not valid."""
     apart = Passage(
         *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)
     )
@@ -144,7 +157,10 @@ def valid_frames(right: HandModel, left: HandModel, passage: Passage) -> Bool[np
         left.capsules,
         left.forward_kinematics(_placed(passage.left, passage.rotation, passage.position)),
     )
-    return is_valid(right, passage.right) & is_valid(left, passage.left) & (overlap <= MAX_OVERLAP)
+    valid: NDArray[np.bool_] = (
+        is_valid(right, passage.right) & is_valid(left, passage.left) & (overlap <= MAX_OVERLAP)
+    )
+    return valid
 
 
 def _reach(
@@ -164,26 +180,37 @@ def _brought_together(
     still: HandModel,
     moving: HandModel,
     meeting: Meeting,
-    beats: NDArray[np.float64],
+    course: _Course,
+    *,
     reach: NDArray[np.float64],
-    lift: NDArray[np.float64],
-    grip: NDArray[np.float64],
     rate: float | None,
 ) -> Passage:
-    """The hands `lift` [m] short of touching, and their fingers closed; smoothed in time where there is a rate."""
+    """Hands brought to each other and their fingers closed; smoothed in time where there is a rate."""
     contact_window, finger_window = (
         1 if rate is None else 2 * int(window * rate / 2) + 1 for window in (_CONTACT_WINDOW, _FINGER_WINDOW)
     )
-    rotation, position = meeting.placement(beats)
-    position = position + (smooth_above(reach, contact_window) + lift)[:, None] * meeting.axis
-    fingers = meeting.still.at(beats), meeting.moving.at(beats)
+    rotation, position = meeting.placement(course.beats)
+    position = position + (smooth_above(reach, contact_window) + course.lift)[:, None] * meeting.axis
+    fingers = meeting.still.at(course.beats), meeting.moving.at(course.beats)
     still_qpos, moving_qpos = join_qpos(fingers[0].opened), _placed(fingers[1].opened, rotation, position)
-    strength = [each.strength * grip[:, None] for each in fingers]
+    strength = [each.strength * course.grip[:, None] for each in fingers]
     still_qpos[:, 7:] = close_fingers(
-        still, still_qpos, fingers[0].closed, strength[0], moving, moving_qpos, window=finger_window
+        still,
+        still_qpos,
+        fingers[0].closed,
+        strength[0],
+        other=moving,
+        other_qpos=moving_qpos,
+        window=finger_window,
     )
     moving_qpos[:, 7:] = close_fingers(
-        moving, moving_qpos, fingers[1].closed, strength[1], still, still_qpos, window=finger_window
+        moving,
+        moving_qpos,
+        fingers[1].closed,
+        strength[1],
+        other=still,
+        other_qpos=still_qpos,
+        window=finger_window,
     )
     if still.shape.side == "right":
         return Passage(rotation, position, still_qpos[:, 7:], moving_qpos[:, 7:])
@@ -191,10 +218,8 @@ def _brought_together(
     return Passage(back, -np.einsum("tij,tj->ti", back, position), moving_qpos[:, 7:], still_qpos[:, 7:])
 
 
-def _course(
-    variant: dict[str, Any], count: int, config: TwoHandConfig, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Beats, lift [m] and grip of every frame (T,): come together, stay and move `count` times, let go."""
+def _course(variant: dict[str, Any], count: int, config: TwoHandConfig, rng: np.random.Generator) -> _Course:
+    """Come together, stay and move `count` times, let go."""
     ends = [int(rng.uniform(*config.approach) * config.rate) + 1 for _ in range(2)]
     # Fingers close after the hands met, and open before they part.
     grips = [int(rng.uniform(*config.approach) * config.rate) + 1 for _ in range(2)]
@@ -218,7 +243,7 @@ def _course(
     grip = np.ones(sum(map(len, beats)))
     grip[: sum(map(len, lift[:2]))] = np.concatenate([np.zeros(ends[0]), minimum_jerk(grips[0])])
     grip[len(grip) - ends[1] - grips[1] :] = np.concatenate([1.0 - minimum_jerk(grips[1]), np.zeros(ends[1])])
-    return np.concatenate(beats), np.concatenate(lift), grip
+    return _Course(np.concatenate(beats), np.concatenate(lift), grip)
 
 
 def _straight(start: Passage, end: Passage, config: TwoHandConfig, rng: np.random.Generator) -> Passage:

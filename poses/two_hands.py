@@ -96,9 +96,9 @@ def sample_two_hand_motion(
     if not 0.0 < duration < np.inf:
         raise ShapeError(f"the duration is {duration:g} s, wanted a positive number")
     frames = round(duration * config.rate) + 1
-    passages = _next_passages(right, left, None, names, config, rng)
+    passages = _next_passages(right, left, None, names, config, rng=rng)
     while sum(map(len, passages)) < frames:
-        passages += _next_passages(right, left, passages[-1].at([-1]), names, config, rng)
+        passages += _next_passages(right, left, passages[-1].at([-1]), names, config, rng=rng)
     whole = join_passages(passages).at(slice(frames))
     right_qpos, left_qpos = _in_world(whole, *_travel(frames, config, rng))
     return HandMotion(right_qpos, config.rate), HandMotion(left_qpos, config.rate)
@@ -148,6 +148,7 @@ def _next_passages(
     last: Passage | None,
     names: tuple[str, ...],
     config: TwoHandConfig,
+    *,
     rng: np.random.Generator,
 ) -> list[Passage]:
     """The way from the last frame to a meeting, and the meeting."""
@@ -186,7 +187,7 @@ def _travel(
 def _in_world(
     whole: Passage, middle: NDArray[np.float64], turns: Rotation
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Qpos of both hands, the middle of their wrists and the right one's orientation given."""
+    """Both hands' qpos from the middle of their wrists and the right one's orientation."""
     across = turns.apply(whole.position) / 2
     rotations = turns.as_matrix()
     return (
