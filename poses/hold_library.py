@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,6 +18,7 @@ from handsim.topology import BONE_NAMES, DIGITS
 from handsim.transforms import MIRROR, vector_quaternions, quaternion_matrix
 from poses.grasp_scene import GraspScene
 from poses.library import gesture
+from poses.retargeting import retarget_angles
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -39,8 +40,12 @@ class HoldStyle:
     """Where the motors pull [rad]."""
     strength: Float[np.ndarray, "20"]
     """Share of the motors' torques."""
+    palm_up: float
+    """Share of its weight with which the thing lies in the palm while the fingers close."""
     needs: tuple[str, ...]
-    """Digits, or the palm, that must touch."""
+    """Bones or digits that must touch."""
+    fingers: int
+    """How many fingers must touch."""
     free: tuple[str, ...]
     """Digits that may leave the thing."""
     press: tuple[str, ...]
@@ -54,8 +59,9 @@ def hold_names(obj: RigidObject) -> tuple[str, ...]:
     return tuple(_holds(obj))
 
 
-def hold_style(obj: RigidObject, name: str) -> HoldStyle:
-    """A way to hold a thing.
+@lru_cache(maxsize=64)
+def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
+    """A way to hold a thing, with the angles that bring this hand's tips where the mean hand has them.
 
     Raises:
         ShapeError: It is not held so.
@@ -65,12 +71,15 @@ def hold_style(obj: RigidObject, name: str) -> HoldStyle:
         raise ShapeError(choices(name, holds, noun=f"hold of the {obj.name}"))
     entry = holds[name]
     opened = _angles(gesture(entry["open"]["gesture"]), entry["open"])
+    closed = _angles(opened, entry["closed"])
     return HoldStyle(
         name=name,
-        open=opened,
-        closed=_angles(opened, entry["closed"]),
-        strength=np.repeat(entry["strength"], (4, 16)),
+        open=retarget_angles(model, opened),
+        closed=retarget_angles(model, closed),
+        strength=np.repeat(entry["strength"], 4),
+        palm_up=entry["palm_up"],
         needs=tuple(entry["needs"]),
+        fingers=entry["fingers"],
         free=tuple(entry["free"]),
         press=tuple(entry["press"]),
         entry=entry,
