@@ -114,7 +114,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
     if mesh.volume < 0.0:
         mesh.invert()
     return RigidObject(
-        name=path.stem,
+        name=path.name,
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.faces),
         parts=(object_solids.hull_part(mesh.vertices),),

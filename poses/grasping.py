@@ -81,7 +81,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     _shake(scene, data)
     if not _stayed(scene, data, before):
         return "it slips"
-    angles, pose = _backed_off(scene, style, data.qpos[:NUM_JOINTS].copy(), scene.object_pose(data))
+    angles, pose = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH), scene.object_pose(data)
     if not is_valid(scene.hand, angles[None])[0]:
         return "the fingers dig into each other"
     if scene.depth(angles[None], pose[None])[0] > MAX_OBJECT_PENETRATION:
@@ -142,13 +142,6 @@ def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64])
     turn = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
     slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _SLOW
     return bool(drift < _MOST_DRIFT and turn < _MOST_TURN and slow and np.isfinite(data.qpos).all())
-
-
-def _backed_off(
-    scene: GraspScene, style: HoldStyle, angles: NDArray[np.float64], pose: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fingers opened a little where they dig in."""
-    return np.clip(angles, LOW, HIGH), pose
 
 
 def _contacts(

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
 _SLIDE: Final = 0.15  # [m] from where an object comes up to the palm
 _HALVINGS: Final = 12
+_ANY: Final = "any"  # the entry for things that have none of their own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +51,8 @@ class HoldStyle:
     """Digits that may leave the thing."""
     press: tuple[str, ...]
     """Digits that may tap on it."""
+    scribble: float
+    """How far a writing wrist goes [m]; 0 for what does not write."""
     entry: dict[str, Any]
     """The rest of its entry: place, axes and what varies."""
 
@@ -82,6 +85,7 @@ def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
         fingers=entry["fingers"],
         free=tuple(entry["free"]),
         press=tuple(entry["press"]),
+        scribble=1e-3 * entry.get("scribble", 0.0),
         entry=entry,
     )
 
@@ -95,7 +99,7 @@ def _library() -> dict[str, Any]:
 
 def _holds(obj: RigidObject) -> dict[str, Any]:
     library = _library()
-    holds: dict[str, Any] = library.get(obj.name, library["box"])
+    holds: dict[str, Any] = library.get(obj.name, library[_ANY])
     return holds
 
 
@@ -109,9 +113,10 @@ def _angles(start: NDArray[np.float64], digits: dict[str, Any]) -> NDArray[np.fl
 
 def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> NDArray[np.float64]:
     """`T_wrist_object` (4, 4) before the fingers close, varied as the style says."""
-    model, entry = scene.hand, style.entry
+    model, obj, entry = scene.hand, scene.obj, style.entry
     mirror = MIRROR if model.shape.side == "left" else np.eye(3)
     place, vary = entry["place"], entry["vary"]
+    frame = np.eye(4) if obj.name in _library() else _box_frame(obj)
     point = 1e-3 * np.array(place["point"], dtype=np.float64)
     point[2] += 1e-3 * rng.uniform(*vary["along"])
     bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
@@ -135,7 +140,18 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     at = at + 1e-3 * vary["place"] * np.clip(rng.standard_normal(3), -1.5, 1.5)
     pose[:3, :3] = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
     pose[:3, 3] = mirror @ (at - rotation @ point)
+    pose = pose @ np.linalg.inv(frame)
     return pose if "between" in place else _slid_to_palm(scene, style, pose)
+
+
+def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
+    """Middle of a thing's bounding box, x along its shortest side and z along its longest."""
+    low, high = obj.vertices.min(axis=0), obj.vertices.max(axis=0)
+    shortest, _, longest = np.argsort(high - low, kind="stable")
+    x, z = np.eye(3)[shortest], np.eye(3)[longest]
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), (low + high) / 2
+    return frame
 
 
 def _turned_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
