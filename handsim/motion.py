@@ -63,7 +63,9 @@ class BodyMotion:
         square = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max()
         last_row = np.abs(self.T_world_body[:, 3] - np.eye(4)[3]).max()
         if max(square, last_row) > 1e-6 or not (np.linalg.det(rotations) > 0.0).all():
-            raise ShapeError("T_world_body holds matrices that are no rigid transforms: a rotation and a place")
+            raise ShapeError(
+                "T_world_body holds matrices that are no rigid transforms: a rotation and a place"
+            )
         if not 0.0 < self.rate < np.inf:
             raise ShapeError(f"the rate is {self.rate:g} Hz, wanted a positive number")
 

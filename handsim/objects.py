@@ -29,7 +29,6 @@ MARKER_RADIUS: Final = 0.0032
 MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
 _LARGEST: Final = 1.0  # [m]
 _SMALLEST: Final = 0.002
-_HULL_VERTICES: Final = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -79,7 +79,10 @@ class GraspScene:
         """Distance [m] of every hand capsule to the thing, negative where they overlap."""
         return np.array(
             [
-                min(mujoco.mj_geomDistance(self.mj_model, data, geom, part, _FAR, None) for part in self.object_geoms)
+                min(
+                    mujoco.mj_geomDistance(self.mj_model, data, geom, part, _FAR, None)
+                    for part in self.object_geoms
+                )
                 for geom in self.hand_geoms
             ]
         )

@@ -1,4 +1,4 @@
-"""Grasps settled by dynamics: fingers close around a thing until it stays where it is, however it is shaken."""
+"""Grasps settled by dynamics: fingers close around a thing until it stays, however it is shaken."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from handsim.topology import DIGITS, NUM_JOINTS
 from poses.couplings import HIGH, LOW
 from poses.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_scene, pose_to_qpos
 from poses.hold_library import HoldStyle, hold_names, hold_style, place_object
-from poses.validity import MAX_PENETRATION, is_valid
+from poses.validity import is_valid
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -29,6 +29,7 @@ _TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)
 _MOST_DRIFT: Final = 0.004  # [m] while shaken
 _MOST_TURN: Final = np.deg2rad(8.0)
 _TOUCHING: Final = 0.0005  # [m]
+_DEEPEST: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
 _SLOW: Final = 0.5  # [rad/s], of the hinges at the end
 
 
@@ -84,20 +85,25 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     angles, pose = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH), scene.object_pose(data)
     if not is_valid(scene.hand, angles[None])[0]:
         return "the fingers dig into each other"
-    if scene.depth(angles[None], pose[None])[0] > MAX_OBJECT_PENETRATION:
+    if scene.depth(angles[None], pose[None])[0] > _DEEPEST:
         return "the fingers dig into it"
     contacts = _contacts(scene, angles, pose)
-    for need in style.needs:
-        if not any(contact.startswith(need) for contact in contacts):
-            return f"the {need} does not touch it"
-    if sum(any(contact.startswith(digit) for contact in contacts) for digit in DIGITS[1:]) < style.fingers:
-        return "too few fingers touch it"
+    why = why_not_held(style, set(contacts))
+    if why:
+        return why
     return Hold(style.name, angles, pose, contacts)
 
 
-def _close(
-    scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]
-) -> None:
+def why_not_held(style: HoldStyle, touching: set[str]) -> str:
+    """What is missing to a hold by these capsules of the hand; nothing (an empty string) if it holds."""
+    for need in style.needs:
+        if not any(name.startswith(need) for name in touching):
+            return f"the {need} does not touch it"
+    fingers = sum(any(name.startswith(digit) for name in touching) for digit in DIGITS[1:])
+    return "" if fingers >= style.fingers else "too few fingers touch it"
+
+
+def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
     """Close the fingers, the thing first guided by a soft spring and then free, without gravity."""
     model = scene.mj_model
     guide = pose_to_qpos(start)
@@ -144,9 +150,7 @@ def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64])
     return bool(drift < _MOST_DRIFT and turn < _MOST_TURN and slow and np.isfinite(data.qpos).all())
 
 
-def _contacts(
-    scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]
-) -> tuple[str, ...]:
+def _contacts(scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[str, ...]:
     distances = scene.distances(scene.new_data(angles, pose))
     names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
     return tuple(name for name, distance in zip(names, distances, strict=True) if distance < _TOUCHING)

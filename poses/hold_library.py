@@ -8,14 +8,13 @@ from functools import cache, lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
-import mujoco
 import numpy as np
 
 from handsim.errors import ShapeError, choices
 from handsim.model import HandModel, join_qpos
 from handsim.objects import RigidObject
 from handsim.topology import BONE_NAMES, DIGITS
-from handsim.transforms import MIRROR, vector_quaternions, quaternion_matrix
+from handsim.transforms import MIRROR, quaternion_matrix, vector_quaternions
 from poses.grasp_scene import GraspScene
 from poses.library import gesture
 from poses.retargeting import retarget_angles
@@ -177,17 +176,13 @@ def _landmark(
 
 def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """The object brought up from below until it almost touches the palm."""
-    palm = [geom for geom in scene.hand_geoms if scene.mj_model.geom(geom).name.startswith("palm")]
+    palm = [scene.mj_model.geom(geom).name.startswith("palm") for geom in scene.hand_geoms]
 
     def gap(height: float) -> float:
         raised = pose.copy()
         raised[2, 3] += height
         data = scene.new_data(style.open, raised)
-        return min(
-            mujoco.mj_geomDistance(scene.mj_model, data, geom, part, 1.0, None)
-            for geom in palm
-            for part in scene.object_geoms
-        )
+        return float(scene.distances(data)[palm].min())
 
     low, high = -_SLIDE, 0.0  # free, too high
     for _ in range(_HALVINGS):

@@ -40,10 +40,8 @@ def retarget_angles(model: HandModel, angles: Float[np.ndarray, "20"]) -> Float[
     return found
 
 
-def _marks(
-    model: HandModel, angles: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Last joint and tip of every digit (10, 3) in the wrist's frame [m], and their derivative (10, 3, 20)."""
+def _marks(model: HandModel, angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Last joints and tips (10, 3) in the wrist's frame [m], and their derivative (10, 3, 20)."""
     last = np.array([bones_of(digit)[2] for digit in DIGITS])
     rest = model.rest_transforms[last]
     tips = rest[:, :3, 3] + model.skeleton.lengths[last, None] * rest[:, :3, 0]
