@@ -1,4 +1,4 @@
-"""A hand in motion: poses at a steady rate."""
+"""Hands and things in motion: poses at a steady rate."""
 
 from __future__ import annotations
 
@@ -42,3 +42,34 @@ class HandMotion:
         """Hinge speeds between frames [rad/s]."""
         speeds: np.ndarray = np.diff(self.qpos[:, 7:], axis=0) * self.rate
         return speeds
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyMotion:
+    """Poses of one rigid thing, frame by frame."""
+
+    T_world_body: Float[np.ndarray, "T 4 4"]
+    """The thing's frame seen from the world [m]."""
+    rate: float
+    """Frames a second [Hz]."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_world_body", check_array("T_world_body", self.T_world_body, (None, 4, 4)))
+        if self.T_world_body.ndim != 3 or len(self.T_world_body) == 0:
+            raise ShapeError(
+                f"a motion needs frames: T_world_body has shape {self.T_world_body.shape}, wanted (T, 4, 4)"
+            )
+        rotations = self.T_world_body[:, :3, :3]
+        square = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max()
+        last_row = np.abs(self.T_world_body[:, 3] - np.eye(4)[3]).max()
+        if max(square, last_row) > 1e-6 or not (np.linalg.det(rotations) > 0.0).all():
+            raise ShapeError(
+                "T_world_body holds matrices that are no rigid transforms: a rotation and a place"
+            )
+        if not 0.0 < self.rate < np.inf:
+            raise ShapeError(f"the rate is {self.rate:g} Hz, wanted a positive number")
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return (len(self.T_world_body) - 1) / self.rate

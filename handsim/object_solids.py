@@ -1,7 +1,8 @@
-"""The simple solids that things are made of: each a convex part or some for fingers, and a mesh for cameras."""
+"""The simple solids that things are made of: convex parts for fingers, and a mesh for cameras."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -48,7 +49,7 @@ def hull_part(vertices: Float[np.ndarray, "N 3"]) -> Part:
     return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
 
 
-def _part(kind: PartKind, size: Sequence[float], pose: NDArray[np.float64]) -> Part:
+def _part(kind: PartKind, size: Sequence[float] | NDArray[np.float64], pose: NDArray[np.float64]) -> Part:
     return Part(kind, np.asarray(size, dtype=np.float64), pose, np.empty((0, 3)))
 
 
@@ -115,7 +116,7 @@ def _arc(numbers: NDArray[np.float64]) -> Solid:
     outward = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * second
     points = centre + radius * outward
     parts = []
-    for start, end in zip(points[:-1], points[1:], strict=True):
+    for start, end in itertools.pairwise(points):
         pose, length = _along(start, end)
         parts.append(_part("capsule", (tube, length / 2, 0.0), pose))
     return parts, _tube_mesh(points, outward, np.cross(first, second), tube, bool(np.ptp(angles) > 6.28))

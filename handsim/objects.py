@@ -29,7 +29,6 @@ MARKER_RADIUS: Final = 0.0032
 MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
 _LARGEST: Final = 1.0  # [m]
 _SMALLEST: Final = 0.002
-_HULL_VERTICES: Final = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +113,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
     if mesh.volume < 0.0:
         mesh.invert()
     return RigidObject(
-        name=path.stem,
+        name=path.name,
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.faces),
         parts=(object_solids.hull_part(mesh.vertices),),

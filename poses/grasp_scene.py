@@ -31,7 +31,7 @@ _FINGER_TORQUES: Final = (0.20, 0.30, 0.16, 0.06)
 _THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
 _FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting (by the pad's size), rolling
 _CONTACT_TIME: Final = (0.005, 1.0)
-_GUIDE_TIME: Final = (0.08, 1.0)  # a soft hand that holds the thing while fingers close
+_GUIDE_TIME: Final = (0.03, 1.0)  # a soft hand that holds the thing while fingers close
 _FAR: Final = 0.5  # [m], beyond which distances are not wanted
 _GEOMS: Final = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,

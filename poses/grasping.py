@@ -1,4 +1,4 @@
-"""Grasps settled by dynamics: fingers close around a thing until it stays where it is, however it is shaken."""
+"""Grasps settled by dynamics: fingers close around a thing until it stays, however it is shaken."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.objects import RigidObject
-from handsim.topology import NUM_JOINTS
+from handsim.topology import DIGITS, NUM_JOINTS
 from poses.couplings import HIGH, LOW
 from poses.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_scene, pose_to_qpos
 from poses.hold_library import HoldStyle, hold_names, hold_style, place_object
@@ -23,11 +23,13 @@ if TYPE_CHECKING:
 
 _MOST_TRIES: Final = 12
 _RAMP: Final = 10  # pieces in which the motors' targets go from open to closed
-_CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 100  # steps of 2 ms
+_CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
 _GRAVITY: Final = 9.81
-_MOST_DRIFT: Final = 0.006  # [m] while shaken
-_MOST_TURN: Final = np.deg2rad(12.0)
+_TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
+_MOST_DRIFT: Final = 0.004  # [m] while shaken
+_MOST_TURN: Final = np.deg2rad(8.0)
 _TOUCHING: Final = 0.0005  # [m]
+_DEEPEST: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
 _SLOW: Final = 0.5  # [rad/s], of the hinges at the end
 
 
@@ -62,7 +64,7 @@ def settle_hold(
     scene = grasp_scene(model, obj)
     why = ""
     for _ in range(_MOST_TRIES):
-        style = hold_style(obj, names[rng.integers(len(names))])
+        style = hold_style(model, obj, names[rng.integers(len(names))])
         settled = try_hold(scene, style, rng=rng)
         if isinstance(settled, Hold):
             return settled
@@ -75,19 +77,30 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
     start = place_object(scene, style, rng=rng)
     data = scene.new_data(style.open, start)
     _close(scene, data, style, start)
+    _shake(scene, data)  # it finds its seat
     before = scene.object_pose(data)
-    if not _stays(scene, data, before):
+    _shake(scene, data)
+    if not _stayed(scene, data, before):
         return "it slips"
-    angles, pose = _backed_off(scene, style, data.qpos[:NUM_JOINTS].copy(), scene.object_pose(data))
+    angles, pose = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH), scene.object_pose(data)
     if not is_valid(scene.hand, angles[None])[0]:
         return "the fingers dig into each other"
-    if scene.depth(angles[None], pose[None])[0] > MAX_OBJECT_PENETRATION:
+    if scene.depth(angles[None], pose[None])[0] > _DEEPEST:
         return "the fingers dig into it"
     contacts = _contacts(scene, angles, pose)
-    for need in style.needs:
-        if not any(contact.startswith(need) for contact in contacts):
-            return f"the {need} does not touch it"
+    why = why_not_held(style, set(contacts))
+    if why:
+        return why
     return Hold(style.name, angles, pose, contacts)
+
+
+def why_not_held(style: HoldStyle, touching: set[str]) -> str:
+    """What is missing to a hold by these capsules of the hand; nothing (an empty string) if it holds."""
+    for need in style.needs:
+        if not any(name.startswith(need) for name in touching):
+            return f"the {need} does not touch it"
+    fingers = sum(any(name.startswith(digit) for name in touching) for digit in DIGITS[1:])
+    return "" if fingers >= style.fingers else "too few fingers touch it"
 
 
 def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
@@ -96,6 +109,8 @@ def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDAr
     guide = pose_to_qpos(start)
     data.mocap_pos[0], data.mocap_quat[0] = guide[:3], guide[3:]
     data.eq_active[:] = 1
+    body = model.body("object").id
+    data.xfrc_applied[body, 2] = style.palm_up * scene.obj.mass * _GRAVITY
     for share in np.arange(1, _RAMP + 1) / _RAMP:
         _pull(scene, data, style, style.open + share * (style.closed - style.open))
         mujoco.mj_step(model, data, nstep=_CLOSE // _RAMP)
@@ -103,6 +118,7 @@ def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDAr
     for _ in range(_SETTLE // 25):
         _pull(scene, data, style, style.closed)
         mujoco.mj_step(model, data, nstep=25)
+    data.xfrc_applied[body] = 0.0
 
 
 def _pull(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, wanted: NDArray[np.float64]) -> None:
@@ -115,27 +131,23 @@ def _pull(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, wanted: NDAr
     data.ctrl[:] = here + np.clip(wanted - here, -reach, reach)
 
 
-def _stays(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64]) -> bool:
-    """Shake the thing by its own weight in six directions; whether it stays in the hand."""
+def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
+    """Pull the thing by its own weight to the four corners of a tetrahedron, then let it rest."""
     body = scene.mj_model.body("object").id
-    weight = scene.obj.mass * _GRAVITY
-    for direction in np.concatenate([np.eye(3), -np.eye(3)]):
-        data.xfrc_applied[body, :3] = weight * direction
+    for corner in _TETRAHEDRON:
+        data.xfrc_applied[body, :3] = scene.obj.mass * _GRAVITY * corner
         mujoco.mj_step(scene.mj_model, data, nstep=_SHAKE)
     data.xfrc_applied[body] = 0.0
     mujoco.mj_step(scene.mj_model, data, nstep=_REST)
+
+
+def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64]) -> bool:
+    """Whether the thing is where it was, and the fingers are still."""
     after = scene.object_pose(data)
     drift = np.linalg.norm(after[:3, 3] - before[:3, 3])
     turn = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
     slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _SLOW
     return bool(drift < _MOST_DRIFT and turn < _MOST_TURN and slow and np.isfinite(data.qpos).all())
-
-
-def _backed_off(
-    scene: GraspScene, style: HoldStyle, angles: NDArray[np.float64], pose: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fingers opened a little where they dig in."""
-    return np.clip(angles, LOW, HIGH), pose
 
 
 def _contacts(scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[str, ...]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
-import mujoco
 import numpy as np
 
 from handsim.errors import ShapeError, choices
@@ -18,6 +17,7 @@ from handsim.topology import BONE_NAMES, DIGITS
 from handsim.transforms import MIRROR, quaternion_matrix, vector_quaternions
 from poses.grasp_scene import GraspScene
 from poses.library import gesture
+from poses.retargeting import retarget_angles
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
 _SLIDE: Final = 0.15  # [m] from where an object comes up to the palm
 _HALVINGS: Final = 12
+_ANY: Final = "any"  # the entry for things that have none of their own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,12 +40,18 @@ class HoldStyle:
     """Where the motors pull [rad]."""
     strength: Float[np.ndarray, "20"]
     """Share of the motors' torques."""
+    palm_up: float
+    """Share of its weight with which the thing lies in the palm while the fingers close."""
     needs: tuple[str, ...]
-    """Digits, or the palm, that must touch."""
+    """Bones or digits that must touch."""
+    fingers: int
+    """How many fingers must touch."""
     free: tuple[str, ...]
     """Digits that may leave the thing."""
     press: tuple[str, ...]
     """Digits that may tap on it."""
+    scribble: float
+    """How far a writing wrist goes [m]; 0 for what does not write."""
     entry: dict[str, Any]
     """The rest of its entry: place, axes and what varies."""
 
@@ -54,8 +61,9 @@ def hold_names(obj: RigidObject) -> tuple[str, ...]:
     return tuple(_holds(obj))
 
 
-def hold_style(obj: RigidObject, name: str) -> HoldStyle:
-    """A way to hold a thing.
+@lru_cache(maxsize=64)
+def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
+    """A way to hold a thing, with the angles that bring this hand's tips where the mean hand has them.
 
     Raises:
         ShapeError: It is not held so.
@@ -65,14 +73,18 @@ def hold_style(obj: RigidObject, name: str) -> HoldStyle:
         raise ShapeError(choices(name, holds, noun=f"hold of the {obj.name}"))
     entry = holds[name]
     opened = _angles(gesture(entry["open"]["gesture"]), entry["open"])
+    closed = _angles(opened, entry["closed"])
     return HoldStyle(
         name=name,
-        open=opened,
-        closed=_angles(opened, entry["closed"]),
-        strength=np.repeat(entry["strength"], (4, 16)),
+        open=retarget_angles(model, opened),
+        closed=retarget_angles(model, closed),
+        strength=np.repeat(entry["strength"], 4),
+        palm_up=entry["palm_up"],
         needs=tuple(entry["needs"]),
+        fingers=entry["fingers"],
         free=tuple(entry["free"]),
         press=tuple(entry["press"]),
+        scribble=1e-3 * entry.get("scribble", 0.0),
         entry=entry,
     )
 
@@ -86,7 +98,7 @@ def _library() -> dict[str, Any]:
 
 def _holds(obj: RigidObject) -> dict[str, Any]:
     library = _library()
-    holds: dict[str, Any] = library.get(obj.name, library["box"])
+    holds: dict[str, Any] = library.get(obj.name, library[_ANY])
     return holds
 
 
@@ -100,9 +112,10 @@ def _angles(start: NDArray[np.float64], digits: dict[str, Any]) -> NDArray[np.fl
 
 def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> NDArray[np.float64]:
     """`T_wrist_object` (4, 4) before the fingers close, varied as the style says."""
-    model, entry = scene.hand, style.entry
+    model, obj, entry = scene.hand, scene.obj, style.entry
     mirror = MIRROR if model.shape.side == "left" else np.eye(3)
     place, vary = entry["place"], entry["vary"]
+    frame = np.eye(4) if obj.name in _library() else _box_frame(obj)
     point = 1e-3 * np.array(place["point"], dtype=np.float64)
     point[2] += 1e-3 * rng.uniform(*vary["along"])
     bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
@@ -126,7 +139,18 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     at = at + 1e-3 * vary["place"] * np.clip(rng.standard_normal(3), -1.5, 1.5)
     pose[:3, :3] = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
     pose[:3, 3] = mirror @ (at - rotation @ point)
+    pose = pose @ np.linalg.inv(frame)
     return pose if "between" in place else _slid_to_palm(scene, style, pose)
+
+
+def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
+    """Middle of a thing's bounding box, x along its shortest side and z along its longest."""
+    low, high = obj.vertices.min(axis=0), obj.vertices.max(axis=0)
+    shortest, _, longest = np.argsort(high - low, kind="stable")
+    x, z = np.eye(3)[shortest], np.eye(3)[longest]
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), (low + high) / 2
+    return frame
 
 
 def _turned_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
@@ -152,17 +176,13 @@ def _landmark(
 
 def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """The object brought up from below until it almost touches the palm."""
-    palm = [geom for geom in scene.hand_geoms if scene.mj_model.geom(geom).name.startswith("palm")]
+    palm = [scene.mj_model.geom(geom).name.startswith("palm") for geom in scene.hand_geoms]
 
     def gap(height: float) -> float:
         raised = pose.copy()
         raised[2, 3] += height
         data = scene.new_data(style.open, raised)
-        return min(
-            mujoco.mj_geomDistance(scene.mj_model, data, geom, part, 1.0, None)
-            for geom in palm
-            for part in scene.object_geoms
-        )
+        return float(scene.distances(data)[palm].min())
 
     low, high = -_SLIDE, 0.0  # free, too high
     for _ in range(_HALVINGS):
