@@ -1,7 +1,7 @@
 """Thumb and finger that touch: solved for one person's hand, with the place of the contact.
 
-A touch is two capsules that meet: those of the thumb's and the finger's last bones, pads facing each other. It
-is ground truth of a kind a real hand gives without any instrument.
+A touch is two capsules that meet: those of the thumb's and the finger's last bones, pads facing each other.
+It is ground truth of a kind that a real hand gives without any instrument.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from handsim.segments import segment_distance_squared
 from handsim.topology import DIGITS, NUM_JOINTS, bones_of
 from poses.couplings import HIGH, LOW
 from poses.library import gesture
-from poses.validity import MAX_PENETRATION, make_valid
+from poses.validity import MAX_PENETRATION, is_valid, make_valid
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -41,6 +41,7 @@ _PAD_SCALE: Final = 3e-2
 _FACING_WEIGHT: Final = 5.0
 _ANGLE_WEIGHTS: Final = 2.0 * np.array([1.0, 1.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0])
 _WANTED_FACING: Final = 0.55
+_MOST_ROUNDS: Final = 4
 _STEP: Final = 1e-6  # of the finite differences [rad]
 
 
@@ -94,7 +95,7 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
 
 
 def touching_angles(
-    model: HandModel, finger: str, start: Float[np.ndarray, "20"] | None = None
+    model: HandModel, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
 ) -> Float[np.ndarray, "20"]:
     """Hinge angles [rad] at which the pads of thumb and finger touch, the rest of the hand as in `start`.
 
@@ -104,7 +105,8 @@ def touching_angles(
     Args:
         model: The hand.
         finger: "index", "middle", "ring" or "little".
-        start: Where to begin; the library's pinch of this finger, made valid, when not given.
+        start: Where to begin [rad], one pose or several that are tried in turn; the library's pinches of this
+            finger, made valid, when not given.
 
     Raises:
         ShapeError: There is no such finger, or this hand's thumb was not brought to it.
@@ -112,26 +114,29 @@ def touching_angles(
     if finger not in FINGERS:
         raise ShapeError(choices(finger, FINGERS, noun="finger"))
     if start is None:
-        starts = make_valid(model, np.stack([gesture(f"{kind}_{finger}") for kind in ("pinch_pad", "pinch_tip")]))
+        pinches = [gesture(f"{kind}_{finger}") for kind in ("pinch_pad", "pinch_tip")]
+        starts = make_valid(model, np.stack(pinches))
     else:
-        starts = check_array("start", start, (NUM_JOINTS,))[None]
-    for angles in starts:
-        solved = _solve(model, finger, np.clip(angles, LOW, HIGH))
-        if is_touching(model, solved[None], finger)[0]:
-            return solved
-    gap = -1e3 * thumb_contact(model, solved[None], finger).overlap[0]
+        starts = check_array("start", start, (NUM_JOINTS,)).reshape(-1, NUM_JOINTS)
+    for begin in np.clip(starts, LOW, HIGH):
+        angles = begin
+        for _ in range(_MOST_ROUNDS):  # each stays near where it began, so that a far touch takes some rounds
+            angles = _solve(model, finger, angles)
+            if is_touching(model, angles[None], finger)[0]:
+                return angles
     raise ShapeError(
-        f"this hand's thumb and {finger} finger could not be brought to touch: the pads stay {gap:.1f} mm apart "
-        "or something else is in the way"
+        f"this hand's thumb and {finger} finger could not be brought to touch pad to pad: "
+        "another start or finger may do"
     )
 
 
 def is_touching(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> NDArray[np.bool_]:
     """Which poses (T,) touch as `touching_angles` promises, valid ones that overlap by 0 to `MAX_OVERLAP`."""
     contact = thumb_contact(model, angles, finger)
-    touching = (contact.overlap >= 0.0) & (contact.overlap <= MAX_OVERLAP) & (contact.facing >= MIN_FACING).all(axis=1)
-    free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= MAX_PENETRATION
-    return touching & free
+    touching = (contact.overlap >= 0.0) & (contact.overlap <= MAX_OVERLAP)
+    facing = (contact.facing >= MIN_FACING).all(axis=1)
+    valid: NDArray[np.bool_] = touching & facing & is_valid(model, angles)
+    return valid
 
 
 def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -141,7 +146,8 @@ def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray
     residuals = _residuals(model, finger, start, moving)
 
     def value(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        return residuals(x[None])[0]
+        values: NDArray[np.float64] = residuals(x[None])[0]
+        return values
 
     def slope(x: NDArray[np.float64]) -> NDArray[np.float64]:
         steps = np.where(x + _STEP > high, -_STEP, _STEP)
@@ -151,7 +157,7 @@ def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray
 
     inside = np.clip(start[moving], low + 1e-4, high - 1e-4)
     found = least_squares(value, inside, jac=slope, bounds=(low, high), max_nfev=60, xtol=1e-6, ftol=1e-6)
-    angles = start.copy()
+    angles: NDArray[np.float64] = start.copy()
     angles[moving] = found.x
     return angles
 
