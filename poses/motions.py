@@ -1,51 +1,35 @@
 """Smooth motion through valid poses, at speeds a human hand reaches, valid at every frame.
 
 Between two poses every joint follows the minimum-jerk profile of human reaching (Flash and Hogan 1985). A way
-that digs into the hand is taken over rest instead, and where that does not help another pose is drawn.
+that digs into the hand is taken over rest instead, some digits ahead of the others where need be.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from handsim._checks import check_array
 from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.motion import HandMotion
+from handsim.topology import NUM_JOINTS
 from handsim.transforms import random_quaternions
-from poses.validity import is_valid, resting_angles, sample_valid_angles
+from poses.detours import way_to_rest
+from poses.pace import MotionConfig, held, minimum_jerk, straight_way
+from poses.validity import MAX_PENETRATION, is_valid, resting_angles, sample_valid_angles
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
-_PEAK_ACCELERATION: Final = 5.7735  # in distances per duration squared
+__all__ = ["MotionConfig", "minimum_jerk", "motion_through", "sample_motion"]
+
 _MOST_DRAWS: Final = 25
 _POSES_A_DRAW: Final = 8
-
-
-@dataclass(frozen=True, slots=True)
-class MotionConfig:
-    """How fast a hand moves and where its wrist goes."""
-
-    rate: float = 120.0
-    """Frames a second [Hz]."""
-    max_speed: float = 10.0
-    """Fastest hinge [rad/s]; rapid finger tapping reaches about this."""
-    max_acceleration: float = 200.0
-    """Largest hinge acceleration [rad/s^2]."""
-    durations: tuple[float, float] = (0.15, 0.8)
-    """Shortest and longest time for a way that the limits would allow to be quicker [s]."""
-    hold: float = 0.3
-    """Longest rest at a pose [s]."""
-    volume: float = 0.3
-    """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
-    wrist_time: tuple[float, float] = (0.6, 2.0)
-    """Shortest and longest time between two places of the wrist [s]."""
 
 
 def sample_motion(
@@ -60,28 +44,82 @@ def sample_motion(
         rng: Source of all randomness.
 
     Raises:
-        ShapeError: The duration is not positive, or this hand has no room for its fingers.
+        ShapeError: The duration is not positive or less than a step, this hand has no room for its fingers,
+            or no way leads out of a pose.
     """
     config = config or MotionConfig()
-    if not 0.0 < duration < np.inf:
-        raise ShapeError(f"the duration is {duration:g} s, wanted a positive number")
-    frames = round(duration * config.rate) + 1
+    frames = count_frames(duration, config)
     angles = sample_valid_angles(model, 1, rng=rng)
     parts, count = [angles], 1
     while count < frames:
         part = _next_way(model, parts[-1][-1], config, rng)
         parts.append(part)
         count += len(part)
-    position, quaternion = _wrist_path(frames, config, rng)
-    angles = np.concatenate(parts)[:frames]
-    return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)
+    return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
 
 
-def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
-    """Share of the way after each of `frames` frames, the last one being 1."""
-    time = np.arange(1, frames + 1) / frames
-    share: NDArray[np.float64] = time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
-    return share
+def motion_through(
+    model: HandModel,
+    poses: Float[np.ndarray, "K 20"],
+    config: MotionConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> HandMotion:
+    """Smooth motion of one hand from each of the given poses to the next, valid at every frame.
+
+    It begins in the first pose and rests for a moment at each later one; how long a way takes and where the
+    wrist goes is drawn.
+
+    Args:
+        model: The hand.
+        poses: Hinge angles [rad], at least two poses.
+        config: Speeds and places; human ones when not given.
+        rng: Source of all randomness.
+
+    Raises:
+        ShapeError: There are less than two poses, one is not valid on this hand, or no way leads out of one.
+    """
+    config = config or MotionConfig()
+    poses = check_array("poses", poses, (None, NUM_JOINTS))
+    if poses.ndim != 2 or len(poses) < 2:
+        raise ShapeError(f"poses has shape {poses.shape}, wanted at least two poses, (K, {NUM_JOINTS})")
+    valid = is_valid(model, poses)
+    if not valid.all():
+        raise ShapeError(
+            f"pose {valid.argmin()} of {len(poses)} is not valid on this hand: out of range or deeper than "
+            f"{1e3 * MAX_PENETRATION:g} mm in itself, wanted what poses.validity.make_valid returns"
+        )
+    angles = np.concatenate([poses[:1], angles_through(model, poses, config, rng=rng)])
+    return with_wrist(angles, config, rng=rng)
+
+
+def count_frames(duration: float, config: MotionConfig) -> int:
+    """Frames of a motion of this duration [s], the first one included.
+
+    Raises:
+        ShapeError: The duration is not positive, or less than half a step.
+    """
+    steps = duration * config.rate
+    if not np.isfinite(steps) or round(steps) < 1:
+        raise ShapeError(
+            f"the motion is {duration:g} s long, wanted a number of at least one step at {config.rate:g} Hz"
+        )
+    return round(steps) + 1
+
+
+def angles_through(
+    model: HandModel, poses: Float[np.ndarray, "K 20"], config: MotionConfig, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 20"]:
+    """Valid frames from the first of these valid poses (left out) to the last, a hold at each."""
+    ways = [straight_way(start, target, config, rng) for start, target in pairwise(poses)]
+    ends = np.cumsum([len(way) for way in ways])
+    valid = np.split(is_valid(model, np.concatenate(ways)), ends[:-1])
+    for number, direct in enumerate(valid):
+        if not direct.all():
+            out = way_to_rest(model, poses[number], config, rng)
+            back = way_to_rest(model, poses[number + 1], config, rng)[-2::-1]
+            ways[number] = np.concatenate([out, back, poses[number + 1 : number + 2]])
+    return np.concatenate([held(way, config, rng) for way in ways])
 
 
 def _next_way(
@@ -91,30 +129,23 @@ def _next_way(
     resting = resting_angles(model)
     for _ in range(_MOST_DRAWS):
         for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
-            direct = _way(start, target, config, rng)
+            direct = straight_way(start, target, config, rng)
             if is_valid(model, direct).all():
-                return _held(direct, config, rng)
-            around = np.concatenate([_way(start, resting, config, rng), _way(resting, target, config, rng)])
+                return held(direct, config, rng)
+            around = np.concatenate(
+                [straight_way(start, resting, config, rng), straight_way(resting, target, config, rng)]
+            )
             if is_valid(model, around).all():
-                return _held(around, config, rng)
-    raise ShapeError(f"no valid way out of a pose was found in {_MOST_DRAWS * _POSES_A_DRAW} tries")
+                return held(around, config, rng)
+    return held(way_to_rest(model, start, config, rng), config, rng)
 
 
-def _way(
-    start: NDArray[np.float64], target: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
-) -> NDArray[np.float64]:
-    distance = np.abs(target - start).max()
-    quickest = max(
-        _PEAK_SPEED * distance / config.max_speed,
-        np.sqrt(_PEAK_ACCELERATION * distance / config.max_acceleration),
-    )
-    frames = int(np.ceil(max(quickest, rng.uniform(*config.durations)) * config.rate)) + 1
-    return start + minimum_jerk(frames)[:, None] * (target - start)
-
-
-def _held(way: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    pause = int(rng.uniform(0.0, config.hold) * config.rate)
-    return np.concatenate([way, np.repeat(way[-1:], pause, axis=0)])
+def with_wrist(
+    angles: Float[np.ndarray, "T 20"], config: MotionConfig, *, rng: np.random.Generator
+) -> HandMotion:
+    """The motion of these hinge angles [rad] by a hand whose wrist goes from place to place."""
+    position, quaternion = _wrist_path(len(angles), config, rng)
+    return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)
 
 
 def _wrist_path(

@@ -1,0 +1,61 @@
+"""How a hand goes straight from one pose to another: the minimum-jerk profile, within limits of speed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
+_PEAK_ACCELERATION: Final = 5.7735  # in distances per duration squared
+
+
+@dataclass(frozen=True, slots=True)
+class MotionConfig:
+    """How fast a hand moves and where its wrist goes."""
+
+    rate: float = 120.0
+    """Frames a second [Hz]."""
+    max_speed: float = 10.0
+    """Fastest hinge [rad/s]; rapid finger tapping reaches about this."""
+    max_acceleration: float = 200.0
+    """Largest hinge acceleration [rad/s^2]."""
+    durations: tuple[float, float] = (0.15, 0.8)
+    """Shortest and longest time for a way that the limits would allow to be quicker [s]."""
+    hold: float = 0.3
+    """Longest rest at a pose [s]."""
+    volume: float = 0.3
+    """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
+    wrist_time: tuple[float, float] = (0.6, 2.0)
+    """Shortest and longest time between two places of the wrist [s]."""
+
+
+def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
+    """Share of the way after each of `frames` frames, the last one being 1."""
+    time = np.arange(1, frames + 1) / frames
+    share: NDArray[np.float64] = time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
+    return share
+
+
+def straight_way(
+    start: NDArray[np.float64], target: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Frames from one pose (left out) to another, as quick as drawn and no quicker than the limits allow."""
+    distance = np.abs(target - start).max()
+    quickest = max(
+        _PEAK_SPEED * distance / config.max_speed,
+        np.sqrt(_PEAK_ACCELERATION * distance / config.max_acceleration),
+    )
+    frames = int(np.ceil(max(quickest, rng.uniform(*config.durations)) * config.rate)) + 1
+    return start + minimum_jerk(frames)[:, None] * (target - start)
+
+
+def held(way: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+    """The frames, and some more in the last pose."""
+    pause = int(rng.uniform(0.0, config.hold) * config.rate)
+    return np.concatenate([way, np.repeat(way[-1:], pause, axis=0)])
