@@ -189,10 +189,10 @@ def test_hands_are_brought_together_from_the_free_side(rng):
 
 def test_fingers_close_until_they_meet_something():
     right, left = hands()
-    opened = join_qpos(np.tile(resting_angles(right), (1, 1)))
-    closed = np.tile(resting_angles(right), (1, 1))
+    flat = np.deg2rad(np.array(library()["hands"]["clap"], dtype=float).reshape(1, 20))
+    opened, closed = join_qpos(flat), flat.copy()
     closed[:, 5::4] += 0.6
-    far = join_qpos(resting_angles(left)[None], position=np.array([[0.0, 0.0, 1.0]]))
+    far = join_qpos(flat, position=np.array([[0.0, 0.0, 1.0]]))
     free = close_fingers(right, opened, closed, np.ones((1, 5)), other=left, other_qpos=far)
     np.testing.assert_allclose(free, closed)
     near = far.copy()
