@@ -128,7 +128,7 @@ def sample_two_hand_poses(
     passages: list[Passage] = []
     missing = count
     for _ in range(_MOST_DRAWS):
-        # Each name twice, since the roles are drawn once a batch; some more than wanted, since some will fail.
+        # Each name twice, since roles are drawn once a batch; more than wanted, since some will fail.
         batches = rng.multinomial(
             missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
         )
