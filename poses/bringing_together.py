@@ -13,7 +13,7 @@ from scipy.ndimage import convolve1d, maximum_filter1d
 
 from handsim.model import HandModel
 from handsim.transforms import quaternion_matrix
-from poses._touch_search import NEAREST, Digit, Obstacles, Ways, pose_digit, search_closing, search_contact
+from poses._contact_search import NEAREST, Digit, Obstacles, Ways, pose_digit, search_closing, search_contact
 
 __all__ = ["NEAREST", "close_fingers", "first_contact", "smooth_above", "smooth_below"]
 
@@ -64,7 +64,7 @@ def close_fingers(
         model: The hand whose fingers close.
         opened: Where it is, with its fingers open.
         closed: Angles [rad] its fingers would have with nothing in the way.
-        strength: Share of the way, a digit each, that is gone where nothing is in the way.
+        strength: Share of the way that is gone where nothing is in the way, a digit each.
         other: The hand that is in the way, besides the own one.
         other_qpos: Where that is.
         window: Frames over which the ways are smoothed; 1 leaves each frame alone.

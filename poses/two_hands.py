@@ -128,14 +128,17 @@ def sample_two_hand_poses(
     passages: list[Passage] = []
     missing = count
     for _ in range(_MOST_DRAWS):
-        # Each name twice: the roles are drawn once a batch.
-        batches = rng.multinomial(missing, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS)))
+        # Each name twice, since roles are drawn once a batch; more than wanted, since some will fail.
+        batches = rng.multinomial(
+            missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
+        )
         for name, size in zip(2 * INTERACTIONS, batches, strict=True):
             if size:
                 passages.append(draw_poses(right, left, name, int(size), rng=rng))
         missing = count - sum(map(len, passages))
-        if missing == 0:
-            whole = join_passages(passages).at(rng.permutation(count))
+        if missing <= 0:
+            whole = join_passages(passages)
+            whole = whole.at(rng.permutation(len(whole))[:count])
             volume = TwoHandConfig().volume
             places = _CENTRE + rng.uniform(-volume, volume, size=(count, 3))
             return _in_world(whole, places, Rotation.from_quat(random_quaternions(count, rng=rng)))

@@ -77,12 +77,12 @@ def mujoco_distances(right: HandModel, left: HandModel, qpos: np.ndarray) -> np.
 def test_overlap_of_two_hands_is_mujocos(rng):
     right = HandModel(sample_shape(EVERYBODY, side="right", rng=rng))
     left = HandModel(sample_shape(EVERYBODY, side="left", rng=rng))
-    posed = list(sample_two_hand_poses(right, left, 40, rng=rng))
+    posed = list(sample_two_hand_poses(right, left, 60, rng=rng))
     for qpos in posed:  # some of them deep in each other
         qpos[20:] = join_qpos(
-            rng.uniform(*right.skeleton.ranges.T, size=(20, 20)),
-            position=rng.normal(scale=0.05, size=(20, 3)),
-            quaternion=random_quaternions(20, rng=rng),
+            rng.uniform(*right.skeleton.ranges.T, size=(40, 20)),
+            position=rng.normal(scale=0.03, size=(40, 3)),
+            quaternion=random_quaternions(40, rng=rng),
         )
     ours = overlap(right, left, *posed)
     theirs = -mujoco_distances(right, left, np.concatenate(posed, axis=1))
@@ -189,10 +189,10 @@ def test_hands_are_brought_together_from_the_free_side(rng):
 
 def test_fingers_close_until_they_meet_something():
     right, left = hands()
-    opened = join_qpos(np.tile(resting_angles(right), (1, 1)))
-    closed = np.tile(resting_angles(right), (1, 1))
+    flat = np.deg2rad(np.array(library()["hands"]["clap"], dtype=float).reshape(1, 20))
+    opened, closed = join_qpos(flat), flat.copy()
     closed[:, 5::4] += 0.6
-    far = join_qpos(resting_angles(left)[None], position=np.array([[0.0, 0.0, 1.0]]))
+    far = join_qpos(flat, position=np.array([[0.0, 0.0, 1.0]]))
     free = close_fingers(right, opened, closed, np.ones((1, 5)), other=left, other_qpos=far)
     np.testing.assert_allclose(free, closed)
     near = far.copy()

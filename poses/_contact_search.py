@@ -17,8 +17,9 @@ FARTHEST: Final = 0.4
 NEAREST: Final = -0.15
 """Where it ends without one [m]."""
 _PRESS: Final = 0.0005  # depth [m] to which a hand is brought to the other
-_STEPS: Final = 16  # from open to closed, until the first that is blocked; then halvings
-_HALVINGS: Final = 7
+_STEP: Final = 0.15  # of all hinges together [rad], from open to closed until the first that is blocked
+_HALVINGS: Final = 6  # of that last step, or fewer where that is exact to
+_PRECISION: Final = 0.003  # of all hinges together [rad]
 
 
 class Digit(NamedTuple):
@@ -116,9 +117,11 @@ def search_closing(ways: Any, parts: Any, obstacles: Any) -> Any:
         count = _within_reach(wrist, parts, obstacles, frame, near)
         if count == 0:
             continue
+        bend = np.abs(ways.goal[frame] - ways.start[frame]).sum()
+        steps = max(1, int(np.ceil(bend / _STEP)))
         low, high = 0.0, 1.0
-        for step in range(1, _STEPS + _HALVINGS + 1):
-            tried = step / _STEPS if step <= _STEPS and high == 1.0 else (low + high) / 2
+        for step in range(1, steps + _HALVINGS + 1):
+            tried = step / steps if step <= steps and high == 1.0 else (low + high) / 2
             for hinge in range(4):
                 angles[hinge] = ways.start[frame, hinge] + tried * (
                     ways.goal[frame, hinge] - ways.start[frame, hinge]
@@ -128,7 +131,7 @@ def search_closing(ways: Any, parts: Any, obstacles: Any) -> Any:
                 high = min(tried, 1.0 - 1e-9)
             else:
                 low = tried
-            if low >= 1.0:
+            if low >= 1.0 or (high - low) * bend < _PRECISION:
                 break
         share[frame] = low
     return share
