@@ -103,6 +103,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
         raise ShapeError(f"{path}: the mesh is empty, wanted a closed surface of triangles")
     if not np.isfinite(mesh.vertices).all():
         raise ShapeError(f"{path}: the mesh has vertices that are NaN or infinite, wanted finite metres")
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if size > _LARGEST:
         raise ShapeError(f"{path}: the mesh is {size:.3g} m large, wanted at most 1 m; is it in millimetres?")
@@ -131,10 +132,9 @@ def _read_mesh(path: Path) -> Any:
     if not path.is_file():
         raise ShapeError(f"{path}: no such file")
     try:
-        mesh = trimesh.load(path, force="mesh")
+        mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # readers of damaged files fail in many ways
         raise ShapeError(f"{path}: not a readable {path.suffix} mesh ({error})") from error
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
     return mesh
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_MOST_TRIES: Final = 12
+_MOST_TRIES: Final = 40
+_LOOSENESS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # spread of the angles from try to try
 _RAMP: Final = 10  # pieces in which the motors' targets go from open to closed
 _CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
 _GRAVITY: Final = 9.81
@@ -58,18 +60,26 @@ def settle_hold(
         hold: One of `hold_names`; any of them when not given.
 
     Raises:
-        ShapeError: The thing is not held so, or this hand does not get hold of it in a dozen tries.
+        ShapeError: The thing is not held so, or this hand does not get hold of it in forty tries.
     """
     names = hold_names(obj) if hold is None else (hold,)
     scene = grasp_scene(model, obj)
     why = ""
-    for _ in range(_MOST_TRIES):
+    for attempt in range(_MOST_TRIES):
         style = hold_style(model, obj, names[rng.integers(len(names))])
-        settled = try_hold(scene, style, rng=rng)
+        settled = try_hold(scene, _varied(style, attempt, rng), rng=rng)
         if isinstance(settled, Hold):
             return settled
         why = settled
     raise ShapeError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
+
+
+def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldStyle:
+    """The style with angles that differ a little, and more the more often it has failed."""
+    spread = _LOOSENESS[min(attempt, len(_LOOSENESS) - 1)]
+    change = spread * rng.standard_normal(NUM_JOINTS).clip(-2.0, 2.0)
+    opened, closed = (np.clip(angles + change, LOW, HIGH) for angles in (style.open, style.closed))
+    return dataclasses.replace(style, open=opened, closed=closed)
 
 
 def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> Hold | str:
