@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from handsim.contact import overlap_between
 from handsim.model import HandModel, join_qpos
 from handsim.transforms import rotation_quaternions
+from poses.bringing_together import NEAREST, close_fingers, first_contact, smooth_above
 from poses.interactions import Meeting, draw_meeting, draw_variant
 from poses.motions import minimum_jerk
-from poses.bringing_together import NEAREST, close_fingers, first_contact, smooth_above
 from poses.validity import is_valid, sample_valid_angles
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from handsim.mjcf import build_spec
 from handsim.model import HandModel, join_qpos
 from handsim.shape import EVERYBODY, sample_shape
 from handsim.transforms import random_quaternions
+from poses.bringing_together import close_fingers, first_contact, smooth_above, smooth_below
 from poses.interactions import library
 from poses.library import gesture_names
-from poses.bringing_together import close_fingers, first_contact, smooth_above, smooth_below
 from poses.two_hands import (
     INTERACTIONS,
     TwoHandConfig,
