@@ -62,7 +62,7 @@ class BodyMotion:
         rotations = self.T_world_body[:, :3, :3]
         square = np.abs(rotations @ np.swapaxes(rotations, 1, 2) - np.eye(3)).max()
         last_row = np.abs(self.T_world_body[:, 3] - np.eye(4)[3]).max()
-        if max(square, last_row) > 1e-6 or not (np.linalg.det(rotations) > 0.0).all():
+        if max(square, last_row) > 1e-5 or not (np.linalg.det(rotations) > 0.0).all():
             raise ShapeError(
                 "T_world_body holds matrices that are no rigid transforms: a rotation and a place"
             )

@@ -114,7 +114,7 @@ def why_not_held(style: HoldStyle, touching: set[str]) -> str:
 
 
 def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
-    """Close the fingers, the thing first guided by a soft spring and then free, without gravity."""
+    """Close the fingers, the thing first guided by a soft spring and then free, or lying in the palm."""
     model = scene.mj_model
     guide = pose_to_qpos(start)
     data.mocap_pos[0], data.mocap_quat[0] = guide[:3], guide[3:]
