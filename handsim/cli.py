@@ -25,6 +25,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "train": ("train.commands:train", "Train a labeler on a training set; goes on where it was stopped."),
     "label": ("train.commands:label", "Label every frame of a marker capture."),
     "evaluate": ("train.commands:evaluate", "Measure a labeler on a labelled capture."),
+    "simulate": ("train.take_commands:simulate", "Simulate a capture of two hands, with its truth."),
+    "reproduce": ("train.take_commands:reproduce", "Print a table of the paper with our figures beside."),
     "doctor": ("handsim.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }
 

@@ -162,7 +162,7 @@ def point_pen(
 def _turned_to_the_arm(
     T_wrist_pen: Float[np.ndarray, "4 4"], tip: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Pen in the path's frame: its tip at the origin, turned about itself to have the wrist on the +x side."""
+    """Pen in the path's frame: its tip at the origin, turned about itself until the wrist is at +x."""
     wrist = np.linalg.inv(T_wrist_pen)[:3, 3]
     away = np.arctan2(wrist[1], wrist[0])
     turn = np.eye(4)

@@ -17,6 +17,7 @@ from gloves.captures import READABLE, WRITABLE, read_capture, write_capture
 from gloves.captures.capture import check_suffix
 from gloves.captures.markers import labelled_capture, select_markers, unlabelled_frames
 from gloves.layout import load_layout
+from gloves.take import load_take
 from handsim.errors import CaptureError, HandSimError, WeightsError
 from train.config import TrainConfig
 from train.report import write_report
@@ -125,7 +126,7 @@ def evaluate(
     """Measure a labeler on labelled captures, corrupted as in the paper.
 
     Args:
-        captures: Labelled .trc, .c3d or .csv files, or folders searched for them.
+        captures: Labelled .trc, .c3d or .csv files, folders searched for them, or the .truth.npz of takes.
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler; the glove's shipped one when not given.
         occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).
@@ -134,15 +135,24 @@ def evaluate(
         json: File for the figures.
     """
     from train.augmentation import Corruption
-    from train.evaluation import evaluate_labeler
+    from train.evaluation import evaluate_labeler, evaluate_takes
 
     if occlude < 0 or ghosts < 0:
         raise HandSimError(f"occlude is {occlude} and ghosts {ghosts}, wanted 0 or more of each")
     network = labeler_of(glove, labeler)
-    files = _capture_files(captures)
-    markers = np.concatenate([_known_markers(file, network.marker_names) for file in files])
-    report = evaluate_labeler(network, markers, Corruption(occlude, ghosts), rng=np.random.default_rng(seed))
-    title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
+    if all(path.suffix == ".npz" for path in captures):
+        if occlude or ghosts:
+            raise HandSimError(
+                "a simulated take has its own gaps and ghosts: leave out --occlude and --ghosts"
+            )
+        report = evaluate_takes(network, [load_take(path) for path in captures])
+        title = f"{len(captures)} takes, {report.num_frames} frames of one hand"
+    else:
+        files = _capture_files(captures)
+        markers = np.concatenate([_known_markers(file, network.marker_names) for file in files])
+        corruption = Corruption(occlude, ghosts)
+        report = evaluate_labeler(network, markers, corruption, rng=np.random.default_rng(seed))
+        title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
     print_figures({"share": report.figures}, title=title)
     by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
     worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
@@ -153,7 +163,7 @@ def evaluate(
             "occlude": occlude,
             "ghosts": ghosts,
             "seed": seed,
-            "frames": len(markers),
+            "frames": report.num_frames,
         }
         # JSON knows no NaN, which stands where there was nothing to count.
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}

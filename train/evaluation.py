@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from gloves.take import Take
+from handsim.errors import CaptureError
 from train.augmentation import Corruption, corrupt
 from train.labeler import Labeler
 from train.metrics import LabelCounts
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 _CHUNK: Final = 4096
+GHOST_REACH: Final = 0.1
+"""A ghost farther from every marker of a hand [m] is not in its cloud; the paper clusters at 200 mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,13 +48,78 @@ def evaluate_labeler(
         corruption: What is drawn on top.
         rng: Source of all randomness.
     """
-    num_labels = len(labeler.marker_names)
-    counts = LabelCounts()
-    right_by_marker = np.zeros(num_labels)
+    count = _Count(labeler)
     for first in range(0, len(markers), _CHUNK):
         cloud = corrupt(markers[first : first + _CHUNK], corruption, rng=rng)
-        frames = [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)]
-        truths = [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)]
-        for labelling, truth in zip(labeler.label_frames(frames), truths, strict=True):
-            right_by_marker += counts.add(labelling.labels, truth, num_labels)
-    return Report(counts.figures(), right_by_marker / max(1, len(markers)), len(markers))
+        count.add(
+            [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
+            [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
+        )
+    return count.report()
+
+
+def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
+    """Label every hand of every frame of simulated takes, told apart by the truth, and count.
+
+    Raises:
+        CaptureError: A take's glove has other markers than the labeler knows.
+    """
+    count = _Count(labeler)
+    for take in takes:
+        for hand in range(len(take.hands)):
+            names = take.hands[hand].layout.names
+            if names != labeler.marker_names:
+                raise CaptureError(
+                    f"the take's glove has markers {', '.join(names)}, the labeler knows "
+                    f"{', '.join(labeler.marker_names)}"
+                )
+            clouds, truths = hand_clouds(take, hand)
+            for first in range(0, len(clouds), _CHUNK):
+                count.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
+    return count.report()
+
+
+def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:
+    """One hand's points of every frame [m], with the marker of each; -1 for a ghost.
+
+    A ghost belongs to the hand with the nearest marker, if that is no further than `GHOST_REACH`. Markers of
+    a body with three or more are the system's own business and left out, as are those of the other hand.
+    """
+    nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
+    mine = take.hand_labels[hand]
+    own = (take.labels >= mine.start) & (take.labels < mine.stop)
+    ghost = (take.labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
+    truth = np.where(own, take.labels - mine.start, -1)
+    here = own | ghost
+    clouds = [points[chosen] for points, chosen in zip(take.points, here, strict=True)]
+    return clouds, [label[chosen] for label, chosen in zip(truth, here, strict=True)]
+
+
+def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "T N"]:
+    """Distance of every point from the nearest marker seen of one hand [m]; inf without any."""
+    markers = take.observed(label)
+    distance = np.full(take.labels.shape, np.inf)
+    for frame, points in enumerate(take.points):
+        there = np.isfinite(points[:, 0])
+        seen = markers[frame][np.isfinite(markers[frame, :, 0])]
+        if len(seen):
+            distance[frame, there] = cKDTree(seen).query(points[there])[0]
+    return distance
+
+
+class _Count:
+    """Labels clouds and keeps the score."""
+
+    def __init__(self, labeler: Labeler) -> None:
+        self.labeler = labeler
+        self.num_labels = len(labeler.marker_names)
+        self.counts = LabelCounts()
+        self.right_by_marker = np.zeros(self.num_labels)
+
+    def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
+        for labelling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):
+            self.right_by_marker += self.counts.add(labelling.labels, truth, self.num_labels)
+
+    def report(self) -> Report:
+        frames = self.counts.frames
+        return Report(self.counts.figures(), self.right_by_marker / max(1, frames), frames)

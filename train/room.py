@@ -1,0 +1,211 @@
+"""The simulated capture room: hands and an object move, cameras see, an optical system makes points of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from gloves.attach import Attachment
+from gloves.identities import number_runs, pack_columns
+from gloves.mesh_sight import MeshTree, clear_of_body, clear_of_mesh
+from gloves.mirrors import cameras_by_mirror, reflect
+from gloves.optics import OpticsConfig, reconstruct
+from gloves.strays import StrayConfig, sample_strays
+from gloves.take import GlovedHand, HeldBody, Take
+from gloves.visibility import MAX_FACING, free_rays
+from handsim.cameras import CameraRig
+from handsim.model import HandModel
+from handsim.motion import BodyMotion, HandMotion
+from handsim.objects import RigidObject
+from handsim.topology import PALM
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+_CHUNK: Final = 256  # frames whose skins are in memory at once
+_FEWEST_OF_A_BODY: Final = 3  # markers without which an object cannot be tracked as a rigid body
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Actor:
+    """A hand in the room, with its glove."""
+
+    model: HandModel
+    attachment: Attachment
+    motion: HandMotion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prop:
+    """An object in the room."""
+
+    thing: RigidObject
+    motion: BodyMotion
+
+
+@dataclass(frozen=True, slots=True)
+class RoomConfig:
+    """What the room does to what is seen."""
+
+    optics: OpticsConfig = field(default_factory=OpticsConfig)
+    strays: StrayConfig = field(default_factory=StrayConfig)
+    """Carried by every hand and by the object."""
+    reflectance: float = 0.5
+    """Share of the mirror images in shiny patches that are bright enough."""
+
+
+class Sources(NamedTuple):
+    """All that shines in a room."""
+
+    places: Float[np.ndarray, "T S 3"]
+    """[m] in the world."""
+    seen: Bool[np.ndarray, "T S C"]
+    """Cameras with a free view."""
+    labels: Int[np.ndarray, "S"]
+    """Marker of each, -1 for what is none."""
+
+
+class Room:
+    """Hands, perhaps an object, and cameras around them.
+
+    Args:
+        actors: The hands; all motions have one length and rate.
+        prop: The object, if there is one.
+        rig: The cameras.
+        config: Noise, strays and mirrors.
+    """
+
+    def __init__(
+        self, actors: tuple[Actor, ...], prop: Prop | None, rig: CameraRig, config: RoomConfig
+    ) -> None:
+        self.actors, self.prop, self.rig, self.config = actors, prop, rig, config
+        self.rate = actors[0].motion.rate
+        self.num_frames = len(actors[0].motion.qpos)
+        self._bones = [actor.model.forward_kinematics(actor.motion.qpos) for actor in actors]
+
+    @cached_property
+    def markers(self) -> tuple[Float[np.ndarray, "T P 3"], Float[np.ndarray, "T P 3"]]:
+        """Centres [m] and outward directions of the hands' markers and then of the object's."""
+        worn = [
+            actor.attachment.markers(actor.model, bone)
+            for actor, bone in zip(self.actors, self._bones, strict=True)
+        ]
+        if self.prop is not None:
+            thing, pose = self.prop.thing, self.prop.motion.T_world_body
+            centres = np.einsum("tij,qj->tqi", pose[:, :3, :3], thing.markers) + pose[:, None, :3, 3]
+            worn.append((centres, np.einsum("tij,qj->tqi", pose[:, :3, :3], thing.marker_normals)))
+        centres, normals = (np.concatenate(parts, axis=1) for parts in zip(*worn, strict=True))
+        return centres, normals
+
+    @cached_property
+    def _capsules(self) -> tuple[Float[np.ndarray, "T K 2 3"], Float[np.ndarray, "K"]]:
+        posed = [a.model.capsules.posed(bone) for a, bone in zip(self.actors, self._bones, strict=True)]
+        radii = [actor.model.capsules.radii for actor in self.actors]
+        return np.concatenate(posed, axis=1), np.concatenate(radii)
+
+    def take(self, settings: dict[str, Any], *, rng: np.random.Generator) -> Take:
+        """What the optical system puts out, with the truth; `settings` are kept with it."""
+        sources = self.sources(rng=rng)
+        found = reconstruct(
+            sources.places, sources.seen, self.rig, self.config.optics, continuous=True, rng=rng
+        )
+        positions = np.concatenate([found.positions, found.false_points], axis=1)
+        labels = np.concatenate([sources.labels, np.full(found.false_points.shape[1], -1)])
+        present = np.isfinite(positions).all(axis=-1)
+        columns, count = pack_columns(present, rng=rng)
+        frame, source = np.nonzero(present)
+        column = columns[frame, source]
+        points = np.full((self.num_frames, count, 3), np.nan)
+        ids, truth = np.full((2, self.num_frames, count), -1)
+        points[frame, column] = positions[frame, source]
+        ids[frame, column] = number_runs(present)[frame, source]
+        truth[frame, column] = labels[source]
+        hands = tuple(
+            GlovedHand(actor.model.shape, actor.attachment.layout, actor.motion.qpos) for actor in self.actors
+        )
+        body = None
+        if self.prop is not None:
+            thing = self.prop.thing
+            body = HeldBody(thing.name, thing.marker_names, self.prop.motion.T_world_body)
+        return Take(self.rate, points, ids, truth, hands, body, settings)
+
+    def sources(self, *, rng: np.random.Generator) -> Sources:
+        """All that shines, and which cameras have a free view of it."""
+        markers, _ = self.markers
+        labels = np.arange(markers.shape[1])
+        if self.prop is not None and len(self.prop.thing.markers) < _FEWEST_OF_A_BODY:
+            labels[len(labels) - len(self.prop.thing.markers) :] = -1  # points like any other: ghosts
+        parts = [Sources(markers, self.markers_seen(rng=rng), labels), *self._images(rng), *self._strays(rng)]
+        places, seen, label = zip(*parts, strict=True)
+        return Sources(np.concatenate(places, 1), np.concatenate(seen, 1), np.concatenate(label))
+
+    def markers_seen(self, *, rng: np.random.Generator) -> Bool[np.ndarray, "T P C"]:
+        """Which cameras have a free view of each marker, past every skin and the object."""
+        markers, normals = self.markers
+        optics, cameras = self.config.optics, self.rig.positions
+        trees = [MeshTree(a.model.surface.vertices, a.model.surface.faces) for a in self.actors]
+        seen = np.empty((*markers.shape[:2], len(cameras)), dtype=bool)
+        for first in range(0, self.num_frames, _CHUNK):
+            part = slice(first, first + _CHUNK)
+            to_camera = cameras - markers[part, :, None]
+            ahead = np.einsum("tpci,tpi->tpc", to_camera, normals[part])
+            clear = self.rig.in_view(markers[part])
+            clear &= ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
+            reach = optics.partial * optics.marker_radius
+            starts = markers[part, :, None] + _in_ball(clear.shape, reach, rng)
+            for actor, tree in zip(self.actors, trees, strict=True):
+                vertices = actor.model.skin(actor.motion.qpos[part])
+                clear = clear_of_mesh(tree, vertices, starts, cameras, clear)
+            if self.prop is not None:
+                thing, pose = self.prop.thing, self.prop.motion.T_world_body[part]
+                clear = clear_of_body(MeshTree(thing.vertices, thing.faces), pose, starts, cameras, clear)
+            seen[part] = clear
+        return seen
+
+    def _images(self, rng: np.random.Generator) -> list[Sources]:
+        """Mirror images of all markers in the object's shiny patches, those that a camera ever sees."""
+        markers, _ = self.markers
+        parts: list[Sources] = []
+        if self.prop is None:
+            return parts
+        turn, shift = self.prop.motion.T_world_body[:, :3, :3], self.prop.motion.T_world_body[:, :3, 3]
+        for patch in self.prop.thing.shiny:
+            point, normal = turn @ patch[:3] + shift, turn @ patch[3:6]
+            bright = np.flatnonzero(rng.random(markers.shape[1]) < self.config.reflectance)
+            images = reflect(markers[:, bright], point[:, None], normal[:, None])
+            seen = cameras_by_mirror(images, point, normal, patch[6], self.rig, *self._capsules)
+            ever = seen.any(axis=(0, 2))
+            parts.append(Sources(images[:, ever], seen[:, ever], np.full(int(ever.sum()), -1)))
+        return parts
+
+    def _strays(self, rng: np.random.Generator) -> list[Sources]:
+        """Strays carried by hands and object, where nothing stands between them and a camera."""
+        carriers = [
+            (bone[:, PALM], np.array([0.6 * actor.model.skeleton.lengths[PALM], 0.0, 0.0]))
+            for actor, bone in zip(self.actors, self._bones, strict=True)
+        ]
+        if self.prop is not None:
+            carriers.append((self.prop.motion.T_world_body, np.zeros(3)))
+        parts = []
+        for pose, middle in carriers:
+            places, seen = sample_strays(
+                pose, middle, self.config.strays, rate=self.rate, num_cameras=len(self.rig.positions), rng=rng
+            )
+            segments, radii = self._capsules
+            seen &= self.rig.in_view(places) & free_rays(places, self.rig.positions, segments, radii)
+            parts.append(Sources(places, seen, np.full(places.shape[1], -1)))
+        return parts
+
+
+def _in_ball(
+    shape: tuple[int, ...], radius: float, rng: np.random.Generator
+) -> Float[np.ndarray, "*shape 3"]:
+    """Random offsets in a ball [m]."""
+    offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
+    length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
+    reach = radius * np.cbrt(rng.random(shape, dtype=np.float32)) / np.maximum(length, 1e-12)
+    scaled: np.ndarray = offsets * reach[..., None]
+    return scaled
