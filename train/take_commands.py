@@ -53,7 +53,7 @@ def reproduce(
         seed: Seed of the captures; 0 gives the twins, others give other captures of the same kinds.
     """
     del table  # one so far; the name is part of the command line's contract
-    takes = {}
+    takes: dict[str, Take] = {}
     with progress_bar("captures") as (bar, task):
         for kind in KINDS:
             takes[kind] = simulate_twin(TwinConfig(kind=kind, glove=glove, seed=seed))
