@@ -30,7 +30,7 @@ class GhostConfig:
     """Size of the shiny patch [m]."""
     reflectance: float = 0.5
     """Chance that a marker's mirror image is bright enough at all."""
-    stray_rate: float = 0.3
+    stray_rate: float = 0.8
     """Mean number of stray reflections a frame, Poisson distributed."""
     stray_margin: float = 0.3
     """Strays lie in the markers' box grown by this share."""
@@ -68,7 +68,7 @@ def sample_ghosts(
     images[shiny] = _mirror_images(
         markers[shiny], rig, segments[shiny], radii, config, min_cameras=min_cameras, rng=rng
     )
-    return _keep_some(np.concatenate([strays, images], axis=1), rng)
+    return keep_some(np.concatenate([strays, images], axis=1), rng=rng)
 
 
 def _mirror_images(
@@ -96,7 +96,9 @@ def _mirror_images(
     return images
 
 
-def _keep_some(candidates: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+def keep_some(
+    candidates: Float[np.ndarray, "T N 3"], *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 4 3"]:
     """At most `MAX_GHOSTS` of each frame's candidates, chosen at random, those that exist first."""
     order = rng.random(candidates.shape[:2]) + np.isnan(candidates[..., 0])
     chosen = order.argsort(axis=1)[:, :MAX_GHOSTS]

@@ -19,7 +19,7 @@ from handsim.io import atomic_write
 from handsim.shape import HandShape
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
 SCHEMA: Final = 1
 SUFFIX: Final = ".truth.npz"
@@ -81,6 +81,12 @@ class Take:
         frame, column = np.nonzero(mine)
         observed[frame, self.labels[frame, column] - label.start] = self.points[frame, column]
         return observed
+
+    def markers_present(self) -> Bool[np.ndarray, "T M"]:
+        """Which markers of the hands have a point in which frame."""
+        observed = [self.observed(label) for label in self.hand_labels]
+        present: np.ndarray = np.isfinite(np.concatenate(observed, axis=1)[..., 0])
+        return present
 
 
 def save_take(path: Path, take: Take) -> None:

@@ -187,11 +187,10 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
     rng = np.random.default_rng(seed)
     layout = load("gloves.layout:load_layout")(GLOVE)
     row = chain.rows[_telling_frame(chain)]
-    seen = load("gloves.visibility:seen_by_enough")(row["cameras"], chain.dataset.manifest.min_cameras)
+    seen = np.isfinite(row["observed"][:, 0])
     cloud = load("train.augmentation:corrupt")(
-        row["markers"][None].astype(np.float64),
+        row["observed"][None].astype(np.float64),
         load("train.augmentation:Corruption")(0, _PAPER_GHOSTS),
-        seen=seen[None],
         ghosts=row["ghosts"][None].astype(np.float64),
         rng=rng,
     )
@@ -221,10 +220,10 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
 def _telling_frame(chain: _Chain) -> int:
     """An early frame with hidden markers, whose seen markers lie well apart when seen from the back."""
     best, widest = 0, -1.0
-    model, seen_by_enough = HandModel.named("M"), load("gloves.visibility:seen_by_enough")
+    model = HandModel.named("M")
     for number in range(min(400, len(chain.rows))):
         row = chain.rows[number]
-        seen = seen_by_enough(row["cameras"], chain.dataset.manifest.min_cameras)
+        seen = np.isfinite(row["observed"][:, 0])
         if not 0.7 * len(seen) <= seen.sum() < len(seen):
             continue
         wrist = model.forward_kinematics(row["qpos"][None].astype(np.float64))[0, 0, :3, :3]

@@ -43,7 +43,6 @@ def corrupt(
     markers: Float[np.ndarray, "B M 3"],
     corruption: Corruption,
     *,
-    seen: Bool[np.ndarray, "B M"] | None = None,
     ghosts: Float[np.ndarray, "B G 3"] | None = None,
     rng: np.random.Generator,
 ) -> Cloud:
@@ -52,14 +51,11 @@ def corrupt(
     Args:
         markers: Marker positions; NaN rows are missing already.
         corruption: How much is drawn at random on top.
-        seen: Markers that the rig saw; all when not given.
         ghosts: Ghosts that the rig saw, NaN where none.
         rng: Source of all randomness.
     """
     batch, count = markers.shape[:2]
     present = np.isfinite(markers).all(-1)
-    if seen is not None:
-        present &= seen
     positions = markers + rng.uniform(-corruption.jitter, corruption.jitter, markers.shape)
     present &= ~_draw_drops(batch, count, corruption.occlude, rng)
     drawn = _draw_ghosts(positions, np.isfinite(markers).all(-1), corruption, rng)

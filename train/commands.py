@@ -23,9 +23,12 @@ from train.config import TrainConfig
 from train.report import write_report
 from train.shards import Dataset, save_json
 from train.synthesis import DatasetConfig, generate_dataset
+from train.twins import TwinConfig, simulate_twin
 
 if TYPE_CHECKING:
     from train.labeler import TrainedSetLabeler
+
+_TAKE = 1200  # frames of the continuous take that the report's gaps are from
 
 
 def generate(
@@ -47,7 +50,10 @@ def generate(
         )
     # Not in generate_dataset: the set is whole without its report, whose bytes hang on matplotlib's version.
     with Console(stderr=True).status("drawing the report"):
-        report = write_report(Dataset(out))
+        take = simulate_twin(
+            TwinConfig(kind="hand-hand", num_frames=_TAKE, glove=config.glove, rig=config.rig)
+        )
+        report = write_report(Dataset(out), present=take.markers_present(), rate=take.rate)
     Console().print(f"{manifest.num_frames} frames of {config.glove} in {out}")
     Console().print(f"report in {report}", soft_wrap=True, markup=False)
 

@@ -37,8 +37,8 @@ class TrainConfig:
     """Decay of the running mean of the weights, which is what is kept."""
     jitter: float = 0.0035
     """Largest half width of the uniform noise on each coordinate [m]; each batch draws its own."""
-    rig_share: float = 0.4
-    """Share of batches that keep what the rig saw; the others go through the paper's recipe."""
+    rig_share: float = 0.5
+    """Share of batches that are what the simulated rig saw; the others go through the paper's recipe."""
     anisotropy: float = 0.06
     """Stretch of each hand along three random directions, log standard deviation."""
     seed: int = 0

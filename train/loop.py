@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import torch
 
-from gloves.visibility import seen_by_enough
 from handsim._version import __version__
 from handsim.errors import DatasetError, WeightsError
 from handsim.io import atomic_write
@@ -68,7 +67,7 @@ def train_labeler(
     while state.done < config.samples:
         # One generator a step, so that a resumed run draws what it would have.
         rng = np.random.default_rng((config.seed, state.done))
-        cloud = draw_batch(rows[:-held_out], dataset.manifest.min_cameras, config, rng=rng)
+        cloud = draw_batch(rows[:-held_out], config, rng=rng)
         loss = state.step(cloud)
         if progress is not None:
             progress(min(state.done, config.samples), config.samples, loss)
@@ -144,9 +143,7 @@ class _State:
             raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
 
 
-def draw_batch(
-    rows: NDArray[np.void], min_cameras: int, config: TrainConfig, *, rng: np.random.Generator
-) -> Cloud:
+def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Generator) -> Cloud:
     """Random rows as corrupted clouds, centred."""
     chosen = rows[rng.integers(len(rows), size=config.batch)]
     markers = chosen["markers"].astype(np.float64)
@@ -155,10 +152,9 @@ def draw_batch(
     markers = (markers - centre) @ stretch
     jitter = config.jitter * rng.uniform()
     if rng.random() < config.rig_share:
-        seen = seen_by_enough(chosen["cameras"], min_cameras)
+        observed = (chosen["observed"].astype(np.float64) - centre) @ stretch
         ghosts = (chosen["ghosts"].astype(np.float64) - centre) @ stretch
-        few = Corruption(occlude=2, ghosts=0, jitter=jitter)
-        return corrupt(markers, few, seen=seen, ghosts=ghosts, rng=rng)
+        return corrupt(observed, Corruption(occlude=0, ghosts=0, jitter=jitter), ghosts=ghosts, rng=rng)
     return corrupt(markers, dataclasses.replace(PAPER, jitter=jitter), rng=rng)
 
 

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.visibility import seen_by_enough
 from handsim._page import Section, write_page
-from handsim.cameras import named_rig
+from handsim.cameras import load_rig
 from handsim.errors import DatasetError
-from handsim.topology import JOINTS
+from handsim.topology import JOINTS, SIDES
 from train import _plots
 from train.shards import Dataset, hands_name
 
@@ -173,18 +172,18 @@ def gap_lengths(present: Bool[np.ndarray, "T M"]) -> Int[np.ndarray, "G"]:
 def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section:
     manifest = dataset.manifest
     files = [dataset.path / hands_name(shard) for shard in range(len(dataset.shards))]
-    hands = np.concatenate([np.load(file, allow_pickle=False)[["left", "length"]] for file in files])
-    length = 1e3 * np.percentile(hands["length"], [0, 50, 100])
-    visible = seen_by_enough(rows["cameras"], manifest.min_cameras).sum(axis=1).mean()
+    hands = np.concatenate([np.load(file, allow_pickle=False)["length"] for file in files])
+    length = 1e3 * np.percentile(hands, [0, 50, 100])
+    found = np.isfinite(rows["observed"][..., 0]).sum(axis=1).mean()
     counts = ghost_counts(rows)
     size = sum((dataset.path / name).stat().st_size for name in manifest.files)
     table = [
         ["figure", "value"],
         ["frames", f"{manifest.num_frames:,}"],
-        ["people", f"{len(hands):,}"],
-        ["left hands", f"{100 * hands['left'].mean():.1f} %"],
+        ["people", f"{len(hands) // len(SIDES):,}"],
+        ["left hands", f"{100 * (rows['hand'] % len(SIDES) == SIDES.index('left')).mean():.1f} %"],
         ["hand length, shortest, median, longest", " / ".join(f"{value:.0f}" for value in length) + " mm"],
-        ["visible markers a frame", f"{visible:.2f} of {len(manifest.marker_names)}"],
+        ["markers found a frame", f"{found:.2f} of {len(manifest.marker_names)}"],
         ["ghosts a frame", f"{(counts * np.arange(len(counts))).sum() / len(rows):.2f}"],
         ["bytes", f"{size:,}"],
     ]
@@ -211,8 +210,8 @@ def _angles_section(rows: Shaped[np.ndarray, "T"]) -> Section:
 
 def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
     manifest = dataset.manifest
-    lost = 1.0 - seen_by_enough(rows["cameras"], manifest.min_cameras).mean(axis=0)
-    shares = camera_shares(rows, len(named_rig(manifest.config["rig"]).positions))
+    lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
+    shares = camera_shares(rows, len(load_rig(manifest.config["rig"]).positions))
     draw = partial(
         _plots.draw_sight,
         names=manifest.marker_names,
@@ -220,7 +219,10 @@ def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
         seen_by=shares,
         min_cameras=manifest.min_cameras,
     )
-    text = f"A marker exists when at least {manifest.min_cameras} cameras see it."
+    text = (
+        f"A marker has a point when the rays of at least {manifest.min_cameras} cameras meet; other hands, "
+        "held things, merged blobs and lost pictures are in it."
+    )
     caption = f"Left: how often each marker is lost. Right: how many of {shares.shape[1] - 1} cameras see it."
     size = (10.8, 1.6 + 0.21 * len(lost))
     return Section("Occlusion", text, pictures=[(_plots.picture(size, draw), caption)])

@@ -26,19 +26,24 @@ if TYPE_CHECKING:
     from jaxtyping import Shaped
     from numpy.typing import NDArray
 
-SCHEMA: Final = 1
+SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
 CONFIG: Final = "config.json"
 
 
 def row_dtype(num_markers: int) -> np.dtype[np.void]:
-    """One frame: qpos, hand (its place in the shard), markers [m], cameras that see it (bits), ghosts [m]."""
+    """One frame of one hand.
+
+    qpos, hand (its place in the shard), true markers [m], cameras with a free view of each (bits), where the
+    optical system puts them [m] (NaN where it loses them), ghosts [m].
+    """
     return np.dtype(
         [
             ("qpos", "<f4", (NUM_QPOS,)),
             ("hand", "<u4"),
             ("markers", "<f4", (num_markers, 3)),
             ("cameras", "<u4", (num_markers,)),
+            ("observed", "<f4", (num_markers, 3)),
             ("ghosts", "<f4", (MAX_GHOSTS, 3)),
         ]
     )

@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.attach import attach, wear
-from gloves.ghosts import GhostConfig, sample_ghosts
+from gloves.ghosts import GhostConfig
 from gloves.layout import MarkerLayout, load_layout
-from gloves.visibility import pack_cameras, visible_cameras
+from gloves.optics import OpticsConfig
 from handsim.cameras import ROOM_CENTRE, CameraRig, check_outside_volume, list_rigs, load_rig
 from handsim.errors import DatasetError, ShapeError
 from handsim.hand_records import HAND_DTYPE, pack_hand
-from handsim.model import HandModel, join_qpos
+from handsim.model import HandModel
 from handsim.shape import Population, sample_shape
-from handsim.topology import SIDES, Side
-from handsim.transforms import random_quaternions
+from handsim.topology import SIDES
 from poses.samplers import PoseMix
-from poses.validity import resting_angles, sample_valid_angles
+from poses.validity import resting_angles
+from train.scenes import Scene, SceneMix, alone, holding, together, watch
 from train.shards import (
     CONFIG,
     Manifest,
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ROWS_PER_SHARD: Final = 8192
+MOST_LOST: Final = 6
+"""Cameras that lose their pictures together, at most."""
 Progress = Callable[[int, int], None]
 """Called with frames done and frames wanted."""
 
@@ -71,7 +73,13 @@ class DatasetConfig:
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
     population: Population = dataclasses.field(default_factory=lambda: Population(children=0.2))
     poses: PoseMix = dataclasses.field(default_factory=PoseMix)
+    scenes: SceneMix = dataclasses.field(default_factory=SceneMix)
     ghosts: GhostConfig = dataclasses.field(default_factory=GhostConfig)
+    optics: OpticsConfig = dataclasses.field(default_factory=OpticsConfig)
+    blob_loss: tuple[float, float] = (0.0, 0.15)
+    """Least and greatest chance that a camera misses a blob; every person draws another."""
+    dropout: tuple[float, float] = (0.0, 0.4)
+    """The same for the chance a frame that some cameras lose their pictures."""
 
     def __post_init__(self) -> None:
         for name in ("num_frames", "min_cameras", "frames_per_hand"):
@@ -165,54 +173,84 @@ def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:
     layout, rig = load_layout(config.glove), load_rig(config.rig)
     size = _shard_size(config, shard)
     rows = np.zeros(size, dtype=row_dtype(layout.num_markers))
-    hands = np.zeros(-(-size // config.frames_per_hand), dtype=HAND_DTYPE)
-    for number in range(len(hands)):
-        block = rows[number * config.frames_per_hand : (number + 1) * config.frames_per_hand]
-        model = sample_hand(config.population, rng=rng)
-        hands[number] = pack_hand(model.shape)
-        block["hand"] = number
-        simulate_frames(block, model, layout, rig, config, rng=rng)
+    people = -(-size // config.frames_per_hand)
+    hands = np.zeros(len(SIDES) * people, dtype=HAND_DTYPE)
+    for person in range(people):
+        block = rows[person * config.frames_per_hand : (person + 1) * config.frames_per_hand]
+        models = sample_hands(config.population, rng=rng)
+        first = len(SIDES) * person
+        hands[first : first + len(SIDES)] = [pack_hand(model.shape) for model in models]
+        simulate_frames(block, models, layout, rig, config, rng=rng)
+        block["hand"] += first
     save_array(out / hands_name(shard), hands)
     save_array(out / rows_name(shard), rows)
     return shard
 
 
-def sample_hand(population: Population, *, rng: np.random.Generator) -> HandModel:
-    """A random person's left or right hand whose fingers have room beside each other."""
-    side: Side = SIDES[int(rng.integers(2))]
+def sample_hands(population: Population, *, rng: np.random.Generator) -> tuple[HandModel, ...]:
+    """A random person's left and right hand, whose fingers have room beside each other."""
     while True:
-        model = HandModel(sample_shape(population, side=side, rng=rng))
+        shape = sample_shape(population, side=SIDES[0], rng=rng)
+        models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
         try:
-            resting_angles(model)
+            resting_angles(models[0])
         except ShapeError:
             continue
-        return model
+        return models
 
 
 def simulate_frames(
     block: NDArray[np.void],
-    model: HandModel,
+    models: tuple[HandModel, ...],
     layout: MarkerLayout,
     rig: CameraRig,
     config: DatasetConfig,
     *,
     rng: np.random.Generator,
 ) -> None:
-    """Fill rows with random poses of one gloved hand and what the rig sees of them."""
-    count = len(block)
-    slip = np.deg2rad(config.slip_around)
-    attachment = wear(layout, model, along=config.slip_along, around=slip, rng=rng)
-    position = ROOM_CENTRE + rng.uniform(-config.volume, config.volume, size=(count, 3))
-    qpos = join_qpos(
-        sample_valid_angles(model, count, config.poses, rng=rng),
-        position=position,
-        quaternion=random_quaternions(count, rng=rng),
+    """Fill rows with random poses of one person's gloved hands and what rig and system make of them.
+
+    Two hands share the rows, one after the other.
+    """
+    scene = draw_scene(models, len(block), config, rng=rng)
+    around = np.deg2rad(config.slip_around)
+    gloves = tuple(
+        wear(layout, hand, along=config.slip_along, around=around, rng=rng) for hand in scene.hands
     )
-    bones = model.forward_kinematics(qpos)
-    markers, normals = attachment.markers(model, bones)
-    segments, radii = model.capsules.posed(bones), model.capsules.radii
-    block["qpos"], block["markers"] = qpos, markers
-    block["cameras"] = pack_cameras(visible_cameras(markers, normals, rig, segments, radii))
-    block["ghosts"] = sample_ghosts(
-        markers, rig, segments, radii, config.ghosts, min_cameras=config.min_cameras, rng=rng
+    optics = dataclasses.replace(
+        config.optics,
+        blob_loss=rng.uniform(*config.blob_loss),
+        dropout=rng.uniform(*config.dropout),
+        dropout_length=1.0,
+        dropout_cameras=int(rng.integers(1, MOST_LOST + 1)),
+        min_rays=config.min_cameras,
+        min_rays_to_start=config.min_cameras,
     )
+    begin = 0
+    for hand, qpos, sight in zip(
+        scene.hands, scene.qpos, watch(scene, gloves, rig, optics, config.ghosts, rng=rng), strict=True
+    ):
+        part = block[begin : begin + len(qpos)]
+        part["hand"] = SIDES.index(hand.shape.side)
+        part["qpos"] = qpos[: len(part)]
+        for name in ("markers", "cameras", "observed", "ghosts"):
+            part[name] = getattr(sight, name)[: len(part)]
+        begin += len(qpos)
+
+
+def draw_scene(
+    models: tuple[HandModel, ...], count: int, config: DatasetConfig, *, rng: np.random.Generator
+) -> Scene:
+    """A scene that fills `count` rows, of a kind that the mix decides."""
+    shares = np.array(dataclasses.astuple(config.scenes))
+    kind = int(rng.choice(len(shares), p=shares / shares.sum()))
+    hand = models[int(rng.integers(len(models)))]
+    try:
+        if kind == 1:
+            left, right = models
+            return together(right, left, -(-count // 2), rng=rng)
+        if kind == 2:
+            return holding(hand, count, config.volume, rng=rng)
+    except ShapeError:
+        pass  # not everybody's hands get hold of everything
+    return alone(hand, count, config.poses, config.volume, rng=rng)

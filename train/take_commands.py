@@ -34,7 +34,7 @@ def simulate(out: Path, config: Annotated[TwinConfig, tyro.conf.arg(name="")]) -
     write_capture(out, Capture(names, take.points, take.rate))
     truth = out.with_suffix(SUFFIX)
     save_take(truth, take)
-    counts = count_gaps(markers_present(take))
+    counts = count_gaps(take.markers_present())
     Console().print(
         f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}",
         highlight=False,
@@ -63,13 +63,6 @@ def reproduce(
     console.print(_by_marker(takes))
 
 
-def markers_present(take: Take) -> np.ndarray:
-    """Which markers of the hands have a point in which frame (T, M)."""
-    observed = [take.observed(label) for label in take.hand_labels]
-    present: np.ndarray = np.isfinite(np.concatenate(observed, axis=1)[..., 0])
-    return present
-
-
 def _table3(takes: dict[str, Take]) -> Table:
     table = Table(title="Table 3: ours, and the paper's in brackets")
     for column in ("Test set", "#Frame", "#Gap", "AGL", "AMF", "ghosts / labels"):
@@ -77,7 +70,7 @@ def _table3(takes: dict[str, Take]) -> Table:
             column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"
         )
     for kind, take in takes.items():
-        present = markers_present(take)
+        present = take.markers_present()
         ours, paper = count_gaps(present), TWINS[kind].paper
         ghosts = int(((take.labels < 0) & np.isfinite(take.points[..., 0])).sum())
         table.add_row(
@@ -98,7 +91,7 @@ def _by_marker(takes: dict[str, Take]) -> Table:
             column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"
         )
     for kind, take in takes.items():
-        missing = ~markers_present(take)
+        missing = ~take.markers_present()
         share, lengths = missing.mean(axis=0), run_lengths(missing)
         quantiles = np.quantile(lengths, [0.5, 0.9, 0.99]) if len(lengths) else np.full(3, np.nan)
         table.add_row(

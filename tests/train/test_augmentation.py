@@ -31,13 +31,12 @@ def test_points_keep_their_truth_through_the_shuffle(rng):
     assert len(orders) == 50
 
 
-def test_what_is_not_seen_is_not_there_and_rig_ghosts_are(rng):
+def test_what_was_not_found_is_not_there_and_rig_ghosts_are(rng):
     clean = markers(rng, 10)
-    seen = np.ones((10, 19), dtype=bool)
-    seen[:, 3] = False
+    clean[:, 3] = np.nan
     ghosts = np.full((10, 4, 3), np.nan)
     ghosts[:, 1] = 0.5
-    cloud = corrupt(clean, Corruption(0, 0), seen=seen, ghosts=ghosts, rng=rng)
+    cloud = corrupt(clean, Corruption(0, 0), ghosts=ghosts, rng=rng)
     assert not (cloud.truth[cloud.present] == 3).any()
     assert (cloud.points[(cloud.truth < 0) & cloud.present] == 0.5).all()
     assert cloud.present.sum() == 10 * 19

@@ -66,17 +66,23 @@ def test_rows_are_what_they_say(finished):
     assert len(rows) == 700
     assert dataset.marker_names[4] == "IndexMCP"
     first = dataset.shards[0]
-    for number, shape in enumerate(dataset.hands(0)):
+    assert [shape.side for shape in dataset.hands(0)[:4]] == ["left", "right"] * 2
+    rows_a_person = np.bincount(first["hand"] // 2)
+    assert (rows_a_person[:-1] == 50).all()
+    for number in np.unique(first["hand"]):
+        shape = dataset.hands(0)[number]
         model, mine = HandModel(shape), first[first["hand"] == number]
-        assert len(mine) == 50
         qpos = mine["qpos"].astype(np.float64)
         assert (qpos[:, 7:] > LOW - 1e-6).all()
         assert (qpos[:, 7:] < HIGH + 1e-6).all()
         assert model.penetration(join_qpos(qpos[:, 7:])).max() < 0.001 + 1e-6
         reach = np.linalg.norm(mine["markers"] - qpos[:, None, :3], axis=-1)
         assert 0.01 < reach.min() < reach.max() < 1.3 * shape.length
-    assert {shape.side for shape in dataset.hands(0)} == {"left", "right"}
+    assert {0, 1} == set(rows["hand"] % 2)
     assert (rows["cameras"] > 0).mean() > 0.9
+    off = np.linalg.norm(rows["observed"] - rows["markers"], axis=-1)
+    assert 0.85 < np.isfinite(off).mean() < 1.0
+    assert np.nanmedian(off) < 0.0005
     assert 0.1 < np.isfinite(rows["ghosts"][..., 0]).sum(axis=1).mean() < 2.0
 
 
