@@ -18,10 +18,8 @@ from train.twins import TWINS, TwinConfig, simulate_twin
 
 def main() -> None:
     take = simulate_twin(TwinConfig(kind="hand-pen", num_frames=300))  # 2.5 s at 120 Hz
-    markers = np.concatenate([take.observed(labels) for labels in take.hand_labels], axis=1)  # (300, 38, 3)
-    present = np.isfinite(markers[..., 0])
     ghosts = np.isfinite(take.points[..., 0]) & (take.labels < 0)  # (300, N)
-    ours, paper = count_gaps(present), TWINS["hand-pen"].paper
+    ours, paper = count_gaps(take.markers_present()), TWINS["hand-pen"].paper
     print(f"{ours.gaps} gaps in {ours.frames} frames (the paper: {paper.gaps} in {paper.frames})")
     print(f"{ours.average_length:.2f} frames a gap (the paper: {paper.average_length})")
     print(f"{ours.average_missing:.2f} markers missing in such a frame (the paper: {paper.average_missing})")
