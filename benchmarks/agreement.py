@@ -23,7 +23,7 @@ from handsim.shape import EVERYBODY
 from handsim.transforms import random_quaternions
 from poses.couplings import HIGH, LOW
 from poses.validity import sample_valid_angles
-from train.synthesis import sample_hand
+from train.synthesis import sample_hands
 
 CHECKED = 20  # frames a hand that MuJoCo repeats
 
@@ -56,7 +56,7 @@ def main() -> None:
     deepest = kinematics = 0.0
     outside = rays = disagreeing = 0
     for _ in range(arguments.hands):
-        model = sample_hand(EVERYBODY, rng=rng)
+        model = sample_hands(EVERYBODY, rng=rng)[rng.integers(2)]
         angles = sample_valid_angles(model, arguments.poses, rng=rng)
         outside += int(((angles < LOW) | (angles > HIGH)).any(axis=1).sum())
         deepest = max(deepest, float(model.penetration(join_qpos(angles)).max()))

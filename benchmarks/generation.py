@@ -29,7 +29,7 @@ from handsim.model import join_qpos
 from handsim.transforms import random_quaternions
 from poses.validity import sample_valid_angles
 from train.shards import row_dtype
-from train.synthesis import DatasetConfig, generate_dataset, sample_hand
+from train.synthesis import DatasetConfig, generate_dataset, sample_hands
 
 CONFIG = DatasetConfig()
 HANDS = 48
@@ -58,7 +58,7 @@ def one_hand(watch: Stopwatch, rng: np.random.Generator) -> None:
     """What `train.synthesis` does for one person, stage by stage."""
     layout, rig = load_layout(CONFIG.glove), named_rig(CONFIG.rig)
     with watch.stage("person: shape, skeleton, room at rest"):
-        model = sample_hand(CONFIG.population, rng=rng)
+        model = sample_hands(CONFIG.population, rng=rng)[0]
     with watch.stage("skin: cage fitted to the shape"):
         _ = model.surface
     with watch.stage("glove: 19 slipped markers on the skin"):
