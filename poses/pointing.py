@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
@@ -21,9 +21,11 @@ from poses.validity import MAX_PENETRATION
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_REFERENCE: Final = np.array(
-    [0.35, 0.8, 0.5]
-)  # where the writing arm comes from, never along the pen for long
+_REFERENCE: Final = np.array([0.53, -0.85, 0.0])  # where the writing arm is, for a user who faces +y
+_DRAW: Final = 0.02  # share by which the pen turns back to it in a frame
+_CHOICES: Final = 6  # places thought of before the next one is taken
+_FOLLOWING: Final = 0.2  # [s]
+_PEAK: Final = 1.875  # peak speed of the minimum-jerk profile, in distances per duration
 
 _MOST_RETREATS: Final = 12
 _RETREAT_STEP: Final = 0.003  # [m] beyond what is asked for
@@ -36,14 +38,28 @@ class PointingConfig:
 
     distance: tuple[float, float] = (0.006, 0.02)
     """Least and greatest distance of the tip from the place it points at [m]."""
-    retreat: float = 0.05
+    retreat: float = 0.04
     """How far the tip draws back between two places [m]."""
     stay: tuple[float, float] = (0.15, 0.6)
     """Shortest and longest time at a place [s]."""
     way: tuple[float, float] = (0.4, 0.9)
-    """Shortest and longest time from place to place [s]."""
-    tilt: float = 0.6
+    """Shortest and longest time from place to place, where the limits below do not ask for more [s]."""
+    speed: float = 0.6
+    """Fastest travel of the tip from place to place [m/s]."""
+    turning: float = 2.5
+    """Fastest turn of the pen on the way [rad/s]."""
+    tilt: float = 0.5
     """How far the pen leans from straight at the place, standard deviation of the tangent."""
+
+
+class _Visits(NamedTuple):
+    """Target, distance and lean of each visit; each frame's visit and its share of the way to the next."""
+
+    target: list[int]
+    distance: list[float]
+    lean: list[np.ndarray]
+    visit: list[int]
+    share: list[float]
 
 
 def pointing_path(
@@ -64,52 +80,77 @@ def pointing_path(
         rng: Source of all randomness.
     """
     config = config or PointingConfig()
-    frames, count = places.shape[:2]
-    share, visit = _schedule(frames, rate, config, rng)
-    number = int(visit[-1]) + 2
-    target = rng.integers(count, size=number)
-    distance = rng.uniform(*config.distance, size=number)
-    lean = config.tilt * rng.standard_normal((number, 3))
-    now = np.arange(frames)
-
-    def at(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        axis = outward[now, target[which]] + lean[which]
-        facing = np.einsum("ti,ti->t", axis, outward[now, target[which]])
-        axis += np.clip(0.5 - facing, 0.0, None)[:, None] * outward[now, target[which]]
-        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-        return places[now, target[which]] + distance[which, None] * axis, axis
-
-    (here, axis_here), (there, axis_there) = at(visit), at(visit + 1)
-    blend = share[:, None]
-    axis = (1.0 - blend) * axis_here + blend * axis_there
-    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
+    window = 2 * int(_FOLLOWING * rate / 2) + 1  # a hand follows a moving finger with some lag
+    places, outward = (uniform_filter1d(values, window, axis=0) for values in (places, outward))
+    visits = _plan(places, outward, rate, config, rng)
+    now, visit, share = np.arange(len(places)), np.array(visits.visit), np.array(visits.share)
+    target, distance, lean = np.array(visits.target), np.array(visits.distance), np.array(visits.lean)
+    tips, axes = [], []
+    for which in (visit, visit + 1):
+        axis = _axis(outward[now, target[which]], lean[which])
+        axes.append(axis)
+        tips.append(places[now, target[which]] + distance[which, None] * axis)
+    axis = _between(axes[0], axes[1], share)
     lift = config.retreat * np.sin(np.pi * share)[:, None] ** 2
-    return _frames((1.0 - blend) * here + blend * there + lift * axis, axis)
+    blend = share[:, None]
+    return _frames((1.0 - blend) * tips[0] + blend * tips[1] + lift * axis, axis)
 
 
-def _schedule(
-    frames: int, rate: float, config: PointingConfig, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """For each frame, the share of the way to the next place, and the number of the place left behind."""
-    shares: list[np.ndarray] = []
-    visits: list[np.ndarray] = []
-    length = 0
-    while length < frames:
-        stay = np.zeros(max(1, round(rng.uniform(*config.stay) * rate)))
-        way = minimum_jerk(max(2, round(rng.uniform(*config.way) * rate)))
-        shares += [stay, way]
-        visits.append(np.full(len(stay) + len(way), len(visits)))
-        length += len(stay) + len(way)
-    return np.concatenate(shares)[:frames], np.concatenate(visits)[:frames]
+def _plan(
+    places: np.ndarray, outward: np.ndarray, rate: float, config: PointingConfig, rng: np.random.Generator
+) -> _Visits:
+    """Visits one after another, the next one among a few that takes the least turning of the pen."""
+    frames, count = places.shape[:2]
+    visits = _Visits([int(rng.integers(count))], [rng.uniform(*config.distance)], [np.zeros(3)], [], [])
+    while len(visits.visit) < frames:
+        at = len(visits.visit)
+        axis = _axis(outward[at, visits.target[-1]], visits.lean[-1])
+        targets = rng.integers(count, size=_CHOICES)
+        leans = config.tilt * rng.standard_normal((_CHOICES, 3))
+        angles = np.arccos(np.clip(_axis(outward[at, targets], leans) @ axis, -1.0, 1.0))
+        best = int(angles.argmin())
+        far = np.linalg.norm(places[at, targets[best]] - places[at, visits.target[-1]]) + config.retreat
+        least = _PEAK * max(far / config.speed, angles[best] / config.turning)
+        way = minimum_jerk(max(2, round(max(rng.uniform(*config.way), least) * rate)))
+        stay = max(1, round(rng.uniform(*config.stay) * rate))
+        visits.visit.extend([len(visits.target) - 1] * (stay + len(way)))
+        visits.share.extend([0.0] * stay + way.tolist())
+        visits.target.append(int(targets[best]))
+        visits.distance.append(rng.uniform(*config.distance))
+        visits.lean.append(leans[best])
+    return visits._replace(visit=visits.visit[:frames], share=visits.share[:frames])
+
+
+def _axis(outward: np.ndarray, lean: np.ndarray) -> np.ndarray:
+    """Unit directions (..., 3) that lean from `outward`, but never by more than some 60 degrees."""
+    axis = outward + lean
+    facing = np.einsum("...i,...i->...", axis, outward)
+    axis = axis + np.clip(0.5 - facing, 0.0, None)[..., None] * outward
+    unit: np.ndarray = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-9)
+    return unit
+
+
+def _between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Unit directions (T, 3) on the great circle from one to another."""
+    angle = np.arccos(np.clip(np.einsum("ti,ti->t", first, second), -1.0, 1.0))[:, None]
+    sine = np.maximum(np.sin(angle), 1e-6)
+    blend = share[:, None]
+    axis = np.sin((1.0 - blend) * angle) / sine * first + np.sin(blend * angle) / sine * second
+    axis = np.where(angle < 1e-3, (1.0 - blend) * first + blend * second, axis)
+    unit: np.ndarray = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    return unit
 
 
 def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:
-    """Poses with +z along `axis`, turned about it so that +x keeps to where the arm comes from."""
-    x = _REFERENCE - np.einsum("ti,i->t", axis, _REFERENCE)[:, None] * axis
-    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+    """Poses with +z along `axis`; +x is carried from frame to frame and drawn slowly to where the arm is."""
     pose = np.tile(np.eye(4), (len(origin), 1, 1))
-    pose[:, :3, 0], pose[:, :3, 1], pose[:, :3, 2] = x, np.cross(axis, x), axis
-    pose[:, :3, 3] = origin
+    x = _REFERENCE
+    for frame, z in enumerate(axis):
+        x = x + _DRAW * (_REFERENCE - x)
+        x = x - (x @ z) * z
+        x = x / np.linalg.norm(x)
+        pose[frame, :3, 0] = x
+    pose[:, :3, 1], pose[:, :3, 2], pose[:, :3, 3] = np.cross(axis, pose[:, :3, 0]), axis, origin
     return pose
 
 

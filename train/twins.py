@@ -19,12 +19,14 @@ from gloves.optics import OpticsConfig
 from gloves.strays import StrayConfig
 from gloves.take import Take
 from handsim.cameras import ROOM_CENTRE, check_outside_volume, load_rig
+from handsim.contact import overlap_between
 from handsim.errors import ShapeError, choices
 from handsim.model import HandModel
 from handsim.motion import BodyMotion, HandMotion
-from handsim.objects import named_object
+from handsim.objects import RigidObject, named_object
 from handsim.shape import ADULTS, sample_shape
-from poses.objects import sample_object_motion
+from poses.motions import MotionConfig
+from poses.objects import object_penetration, sample_object_motion
 from poses.pointing import point_pen, pointing_path
 from poses.scripts import scripted_motion
 from poses.two_hands import TwoHandConfig, sample_two_hand_motion
@@ -134,7 +136,7 @@ def _cast(
     for _ in range(_MOST_PEOPLE - 1):
         try:
             return _play(kind, _couple(rng), layout, frames, rng)
-        except ShapeError:  # these hands do not get hold of the pen
+        except ShapeError:  # these hands do not get hold of the pen, or came in each other's way
             continue
     return _play(kind, _couple(rng), layout, frames, rng)
 
@@ -164,18 +166,50 @@ def _play(
             _alone(right, _IN_THE_AIR, _APART, frames, rng),
             _alone(left, _IN_THE_AIR, -_APART, frames, rng),
         )
+        _check_apart(left, motions[1], right, motions[0])
         return _actors(hands, gloves, motions, frames), None
     thing = named_object("pen" if kind == "hand-pen" else "controller")
-    holding, body = sample_object_motion(right, thing, seconds, rng=rng)
-    other = _alone(left, _AT_REST, -_APART, frames, rng)
+    near = MotionConfig(volume=0.1)
+    holding, body = sample_object_motion(right, thing, seconds, near, rng=rng)
+    other = _alone(left, _AT_REST, 0.0 if kind == "hand-pen" else -_APART, frames, rng)
+    held = HandMotion(holding.qpos[:frames], RATE), BodyMotion(body.T_world_body[:frames], RATE)
     if kind == "hand-pen":
         places, outward = gloves[1].markers(left, left.forward_kinematics(other.qpos))
         path = pointing_path(places, outward, RATE, rng=rng)
-        held = HandMotion(holding.qpos[:frames], RATE), BodyMotion(body.T_world_body[:frames], RATE)
         holding, body = point_pen(right, left, thing, held, other, path)
-    return _actors(hands, gloves, (holding, other), frames), Prop(
-        thing, BodyMotion(body.T_world_body[:frames], RATE)
+    else:
+        holding, body = _moved_aside(*held)
+        _check_apart(left, other, right, holding, thing, body)
+    return _actors(hands, gloves, (holding, other), frames), Prop(thing, body)
+
+
+def _moved_aside(holding: HandMotion, body: BodyMotion) -> tuple[HandMotion, BodyMotion]:
+    qpos, poses = holding.qpos.copy(), body.T_world_body.copy()
+    qpos[:, 0] += _APART
+    poses[:, 0, 3] += _APART
+    return HandMotion(qpos, holding.rate), BodyMotion(poses, body.rate)
+
+
+def _check_apart(
+    free: HandModel,
+    free_motion: HandMotion,
+    other: HandModel,
+    other_motion: HandMotion,
+    thing: RigidObject | None = None,
+    body: BodyMotion | None = None,
+) -> None:
+    """Raises where hands that have nothing to do with each other come too near."""
+    overlap = overlap_between(
+        free.capsules,
+        free.forward_kinematics(free_motion.qpos),
+        other.capsules,
+        other.forward_kinematics(other_motion.qpos),
     )
+    inside = np.zeros(1)
+    if thing is not None and body is not None:
+        inside = object_penetration(free, thing, free_motion.qpos, body.T_world_body)
+    if max(overlap.max(), inside.max()) > 0.0:
+        raise ShapeError("the hands get in each other's way")
 
 
 def _alone(hand: HandModel, script: str, aside: float, frames: int, rng: np.random.Generator) -> HandMotion:
