@@ -14,7 +14,7 @@ from train.shards import Dataset
 
 SMALL = [
     "--samples",
-    "60000",
+    "80000",
     "--batch",
     "128",
     "--network.width",
@@ -36,7 +36,8 @@ def one_thread():
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loop")
     sizes = ["--num-frames", "6000", "--frames-per-hand", "60", "--population.children", "0"]
-    assert main(["generate", "--out", str(folder / "set"), *sizes, "--workers", "1"]) == 0
+    scenes = ["--scenes.alone", "0.8", "--scenes.together", "0.1", "--scenes.holding", "0.1"]
+    assert main(["generate", "--out", str(folder / "set"), *sizes, *scenes, "--workers", "1"]) == 0
     assert main(["train", str(folder / "set"), "--out", str(folder / "run"), *SMALL]) == 0
     return folder
 
