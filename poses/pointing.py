@@ -21,10 +21,12 @@ from poses.validity import MAX_PENETRATION
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_REFERENCE: Final = np.array(
-    [0.35, 0.8, 0.5]
-)  # where the writing arm comes from, never along the pen for long
-
+_UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
+"""How a pen in the right hand of somebody at -y stands over a palm that looks down."""
+_ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
+_CONE: Final = 1.2  # farthest that the pen leans from upright [rad]
+_BEHIND: Final = -0.2  # places that look away from the pen by more, as a cosine, are not pointed at
+_PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
 _MOST_RETREATS: Final = 12
 _RETREAT_STEP: Final = 0.003  # [m] beyond what is asked for
 _SMOOTHING: Final = 0.25  # [s] over which the pen draws back
@@ -44,6 +46,10 @@ class PointingConfig:
     """Shortest and longest time from place to place [s]."""
     tilt: float = 0.6
     """How far the pen leans from straight at the place, standard deviation of the tangent."""
+    speed: float = 0.6
+    """Fastest way of the tip between places that keep still, retreat aside [m/s]; ways get longer for it."""
+    turning: float = 3.0
+    """The same for the turn of the pen [rad/s]."""
 
 
 def pointing_path(
@@ -64,49 +70,103 @@ def pointing_path(
         rng: Source of all randomness.
     """
     config = config or PointingConfig()
-    frames, count = places.shape[:2]
-    share, visit = _schedule(frames, rate, config, rng)
-    number = int(visit[-1]) + 2
-    target = rng.integers(count, size=number)
-    distance = rng.uniform(*config.distance, size=number)
-    lean = config.tilt * rng.standard_normal((number, 3))
-    now = np.arange(frames)
+    visits = _plan(places, outward, rate, config, rng)
+    share = np.concatenate([visit.share for visit in visits])
+    number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
+    now = np.arange(len(places))
+    share, number = share[now], number[now]
 
     def at(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        axis = outward[now, target[which]] + lean[which]
-        facing = np.einsum("ti,ti->t", axis, outward[now, target[which]])
-        axis += np.clip(0.5 - facing, 0.0, None)[:, None] * outward[now, target[which]]
-        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-        return places[now, target[which]] + distance[which, None] * axis, axis
+        target = np.array([visit.target for visit in visits])[which]
+        lean = np.stack([visit.lean for visit in visits])[which]
+        distance = np.array([visit.distance for visit in visits])[which]
+        axis = _axes(outward[now, target], lean)
+        return places[now, target] + distance[:, None] * axis, axis
 
-    (here, axis_here), (there, axis_there) = at(visit), at(visit + 1)
+    (here, axis_here), (there, axis_there) = at(number), at(number + 1)
     blend = share[:, None]
-    axis = (1.0 - blend) * axis_here + blend * axis_there
-    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-9)
-    lift = config.retreat * np.sin(np.pi * share)[:, None] ** 2
+    axis = _between(axis_here, axis_there, blend)
+    lift = config.retreat * np.sin(np.pi * blend) ** 2
     return _frames((1.0 - blend) * here + blend * there + lift * axis, axis)
 
 
-def _schedule(
-    frames: int, rate: float, config: PointingConfig, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """For each frame, the share of the way to the next place, and the number of the place left behind."""
-    shares: list[np.ndarray] = []
-    visits: list[np.ndarray] = []
-    length = 0
-    while length < frames:
+@dataclass(frozen=True, slots=True)
+class _Visit:
+    """One place, and the way from it to the next."""
+
+    target: int
+    distance: float
+    lean: Float[np.ndarray, "3"]
+    share: Float[np.ndarray, "S"]
+    """Of the way, for each frame."""
+
+
+def _plan(
+    places: Float[np.ndarray, "T M 3"],
+    outward: Float[np.ndarray, "T M 3"],
+    rate: float,
+    config: PointingConfig,
+    rng: np.random.Generator,
+) -> list[_Visit]:
+    """Visits for all frames, and one more where the last way leads."""
+    visits: list[_Visit] = []
+    frame = 0
+    target, lean = _draw(outward[0], config, rng)
+    while frame < len(places):
+        here, axis = places[frame], _axes(outward[frame, target], lean)
+        following, next_lean = _draw(outward[frame], config, rng)
+        next_axis = _axes(outward[frame, following], next_lean)
+        turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
+        seconds = max(
+            rng.uniform(*config.way),
+            _PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / config.speed,
+            _PEAK_SPEED * turn / config.turning,
+        )
         stay = np.zeros(max(1, round(rng.uniform(*config.stay) * rate)))
-        way = minimum_jerk(max(2, round(rng.uniform(*config.way) * rate)))
-        shares += [stay, way]
-        visits.append(np.full(len(stay) + len(way), len(visits)))
-        length += len(stay) + len(way)
-    return np.concatenate(shares)[:frames], np.concatenate(visits)[:frames]
+        share = np.concatenate([stay, minimum_jerk(max(2, int(np.ceil(seconds * rate))))])
+        visits.append(_Visit(target, rng.uniform(*config.distance), lean, share))
+        frame, target, lean = frame + len(share), following, next_lean
+    return [*visits, _Visit(target, rng.uniform(*config.distance), lean, np.zeros(0))]
+
+
+def _draw(
+    outward: Float[np.ndarray, "M 3"], config: PointingConfig, rng: np.random.Generator
+) -> tuple[int, Float[np.ndarray, "3"]]:
+    """A place that can be reached now, and how the pen leans there."""
+    open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _BEHIND)
+    target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
+    return target, config.tilt * rng.standard_normal(3)
+
+
+def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
+    """Directions of the pen at places: off the skin, and never far from upright, smoothly in both."""
+    axis = outward + lean
+    facing = np.einsum("...i,...i->...", axis, outward)[..., None]
+    axis = axis + np.clip(0.5 - facing, 0.0, None) * outward
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    upright = np.broadcast_to(_UPRIGHT, axis.shape)
+    angle = np.arccos(np.clip(axis @ _UPRIGHT, -1.0, 1.0))[..., None]
+    return _between(upright, axis, _CONE * np.tanh(angle / _CONE) / np.maximum(angle, 1e-9))
+
+
+def _between(
+    start: Float[np.ndarray, "*T 3"], end: Float[np.ndarray, "*T 3"], share: Float[np.ndarray, "*T 1"]
+) -> Float[np.ndarray, "*T 3"]:
+    """Directions a share of the shortest turn from one to another."""
+    angle = np.arccos(np.clip(np.einsum("...i,...i->...", start, end), -1.0, 1.0))[..., None]
+    mixed = np.sin((1.0 - share) * angle) * start + np.sin(share * angle) * end
+    mixed = np.where(angle > 1e-6, mixed, start)
+    between: np.ndarray = mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12)
+    return between
 
 
 def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:
-    """Poses with +z along `axis`, turned about it so that +x keeps to where the arm comes from."""
-    x = _REFERENCE - np.einsum("ti,i->t", axis, _REFERENCE)[:, None] * axis
-    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+    """Poses with +z along `axis`, by the shortest turn from upright, where +x looks to the arm."""
+    x = _ARM - (_ARM @ _UPRIGHT) * _UPRIGHT
+    x /= np.linalg.norm(x)
+    # The shortest turn from u to a moves v to v - (v . (u + a)) / (1 + u . a) (u + a) + 2 (v . u) a.
+    middle = axis + _UPRIGHT
+    x = x - (middle @ x / (1.0 + axis @ _UPRIGHT))[:, None] * middle
     pose = np.tile(np.eye(4), (len(origin), 1, 1))
     pose[:, :3, 0], pose[:, :3, 1], pose[:, :3, 2] = x, np.cross(axis, x), axis
     pose[:, :3, 3] = origin

@@ -10,7 +10,7 @@ import numpy as np
 
 from gloves.attach import Attachment
 from gloves.identities import number_runs, pack_columns
-from gloves.mesh_sight import MeshTree, clear_of_body, clear_of_mesh
+from gloves.mesh_sight import MeshTree, clear_of_body, clear_of_mesh, hand_tree
 from gloves.mirrors import cameras_by_mirror, reflect
 from gloves.optics import OpticsConfig, reconstruct
 from gloves.strays import StrayConfig, sample_strays
@@ -112,8 +112,10 @@ class Room:
         found = reconstruct(
             sources.places, sources.seen, self.rig, self.config.optics, continuous=True, rng=rng
         )
-        positions = np.concatenate([found.positions, found.false_points], axis=1)
         labels = np.concatenate([sources.labels, np.full(found.false_points.shape[1], -1)])
+        order = rng.permutation(len(labels))  # neither IDs nor columns may tell what a point comes from
+        positions = np.concatenate([found.positions, found.false_points], axis=1)[:, order]
+        labels = labels[order]
         present = np.isfinite(positions).all(axis=-1)
         columns, count = pack_columns(present, rng=rng)
         frame, source = np.nonzero(present)
@@ -146,7 +148,10 @@ class Room:
         """Which cameras have a free view of each marker, past every skin and the object."""
         markers, normals = self.markers
         optics, cameras = self.config.optics, self.rig.positions
-        trees = [MeshTree(a.model.surface.vertices, a.model.surface.faces) for a in self.actors]
+        bodies = []
+        if self.prop is not None:
+            thing = self.prop.thing
+            bodies.append((MeshTree(thing.vertices, thing.faces), self.prop.motion.T_world_body))
         seen = np.empty((*markers.shape[:2], len(cameras)), dtype=bool)
         for first in range(0, self.num_frames, _CHUNK):
             part = slice(first, first + _CHUNK)
@@ -156,12 +161,11 @@ class Room:
             clear &= ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
             reach = optics.partial * optics.marker_radius
             starts = markers[part, :, None] + _in_ball(clear.shape, reach, rng)
-            for actor, tree in zip(self.actors, trees, strict=True):
+            for actor in self.actors:
                 vertices = actor.model.skin(actor.motion.qpos[part])
-                clear = clear_of_mesh(tree, vertices, starts, cameras, clear)
-            if self.prop is not None:
-                thing, pose = self.prop.thing, self.prop.motion.T_world_body[part]
-                clear = clear_of_body(MeshTree(thing.vertices, thing.faces), pose, starts, cameras, clear)
+                clear = clear_of_mesh(hand_tree(), vertices, starts, cameras, clear)
+            for tree, poses in bodies:
+                clear = clear_of_body(tree, poses[part], starts, cameras, clear)
             seen[part] = clear
         return seen
 
