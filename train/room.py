@@ -25,7 +25,8 @@ from handsim.topology import PALM
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_CHUNK: Final = 256  # frames whose skins are in memory at once
+_CHUNK: Final = 256  # frames whose lines of sight are in memory at once
+_SKINS: Final = 16  # and their skins: so few stay in the processor's cache
 _FEWEST_OF_A_BODY: Final = 3  # markers without which an object cannot be tracked as a rigid body
 
 
@@ -148,26 +149,39 @@ class Room:
         """Which cameras have a free view of each marker, past every skin and the object."""
         markers, normals = self.markers
         optics, cameras = self.config.optics, self.rig.positions
-        bodies = []
-        if self.prop is not None:
-            thing = self.prop.thing
-            bodies.append((MeshTree(thing.vertices, thing.faces), self.prop.motion.T_world_body))
         seen = np.empty((*markers.shape[:2], len(cameras)), dtype=bool)
         for first in range(0, self.num_frames, _CHUNK):
             part = slice(first, first + _CHUNK)
             to_camera = cameras - markers[part, :, None]
             ahead = np.einsum("tpci,tpi->tpc", to_camera, normals[part])
-            clear = self.rig.in_view(markers[part])
-            clear &= ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
+            wanted = self.rig.in_view(markers[part])
+            wanted &= ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
             reach = optics.partial * optics.marker_radius
-            starts = markers[part, :, None] + _in_ball(clear.shape, reach, rng)
-            for actor in self.actors:
-                vertices = actor.model.skin(actor.motion.qpos[part])
-                clear = clear_of_mesh(hand_tree(), vertices, starts, cameras, clear)
-            for tree, poses in bodies:
-                clear = clear_of_body(tree, poses[part], starts, cameras, clear)
-            seen[part] = clear
+            starts = markers[part, :, None] + _in_ball(wanted.shape, reach, rng)
+            for begin in range(0, len(wanted), _SKINS):
+                few = slice(begin, begin + _SKINS)
+                frames = slice(first + begin, first + begin + _SKINS)
+                seen[frames] = self._past_all(frames, starts[few], wanted[few])
         return seen
+
+    def _past_all(
+        self, frames: slice, starts: Float[np.ndarray, "t P C 3"], wanted: Bool[np.ndarray, "t P C"]
+    ) -> Bool[np.ndarray, "t P C"]:
+        """Which wanted lines from the starts to the cameras pass every skin and the object."""
+        clear = wanted
+        for actor in self.actors:
+            vertices = actor.model.skin(actor.motion.qpos[frames])
+            clear = clear_of_mesh(hand_tree(), vertices, starts, self.rig.positions, clear)
+        for tree, poses in self._bodies:
+            clear = clear_of_body(tree, poses[frames], starts, self.rig.positions, clear)
+        return clear
+
+    @cached_property
+    def _bodies(self) -> list[tuple[MeshTree, Float[np.ndarray, "T 4 4"]]]:
+        if self.prop is None:
+            return []
+        thing = self.prop.thing
+        return [(MeshTree(thing.vertices, thing.faces), self.prop.motion.T_world_body)]
 
     def _images(self, rng: np.random.Generator) -> list[Sources]:
         """Mirror images of all markers in the object's shiny patches, those that a camera ever sees."""
