@@ -161,7 +161,11 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
 def _check(take: Take) -> None:
     """Whether the parts of a take fit together."""
     frames, columns = take.points.shape[:2]
-    shapes = [(take.points, (frames, columns, 3)), (take.ids, (frames, columns)), (take.labels, take.ids.shape)]
+    shapes = [
+        (take.points, (frames, columns, 3)),
+        (take.ids, (frames, columns)),
+        (take.labels, take.ids.shape),
+    ]
     shapes += [(hand.qpos, (frames, NUM_QPOS)) for hand in take.hands]
     shapes += [] if take.body is None else [(take.body.T_world_body, (frames, 4, 4))]
     if any(array.shape != shape for array, shape in shapes):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from handsim.contact import overlap_between
 from handsim.errors import ShapeError
@@ -25,9 +25,11 @@ _UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.
 """How a pen in the right hand of somebody at -y stands over a palm that looks down."""
 _ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
 _CONE: Final = 1.2  # farthest that the pen leans from upright [rad]
+_MOST_LEAN: Final = 1.0  # as a tangent
 _BEHIND: Final = -0.2  # places that look away from the pen by more, as a cosine, are not pointed at
 _PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
 _MOST_RETREATS: Final = 12
+_STEADY: Final = 0.15  # [s] over which the pen follows what its places look at, standard deviation
 _RETREAT_STEP: Final = 0.003  # [m] beyond what is asked for
 _SMOOTHING: Final = 0.25  # [s] over which the pen draws back
 
@@ -70,6 +72,8 @@ def pointing_path(
         rng: Source of all randomness.
     """
     config = config or PointingConfig()
+    outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
     visits = _plan(places, outward, rate, config, rng)
     share = np.concatenate([visit.share for visit in visits])
     number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
@@ -135,7 +139,9 @@ def _draw(
     """A place that can be reached now, and how the pen leans there."""
     open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _BEHIND)
     target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
-    return target, config.tilt * rng.standard_normal(3)
+    lean = config.tilt * rng.standard_normal(3)
+    lean -= (lean @ outward[target]) * outward[target]  # sideways, or a turn of the place would swing the pen
+    return target, lean * min(1.0, _MOST_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
 
 
 def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
@@ -196,27 +202,53 @@ def point_pen(
     """
     motion, body = held
     T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
-    T_path_pen = _turned_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
-    back = np.zeros(len(path))
+    T_world_pen = path @ _turned_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
+    qpos = motion.qpos.copy()
+    qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+    led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
+    return keep_apart(holder, other, pen, led, other_motion, path[:, :3, 2])
+
+
+def keep_apart(
+    holder: HandModel,
+    other: HandModel,
+    thing: RigidObject,
+    held: tuple[HandMotion, BodyMotion],
+    other_motion: HandMotion,
+    direction: Float[np.ndarray, "T 3"],
+) -> tuple[HandMotion, BodyMotion]:
+    """A hand and what it holds, drawn back smoothly wherever either would touch the other hand.
+
+    Args:
+        holder: The hand with the thing.
+        other: The hand that is in the way.
+        thing: What is held.
+        held: How hand and thing would move.
+        other_motion: What the other hand does.
+        direction: Unit directions to draw back in.
+
+    Raises:
+        ShapeError: Even drawn back, something touches.
+    """
+    motion, body = held
+    back = np.zeros(len(direction))
     for _ in range(_MOST_RETREATS):
-        pose = path.copy()
-        pose[:, :3, 3] += back[:, None] * path[:, :3, 2]
-        T_world_pen = pose @ T_path_pen
-        qpos = motion.qpos.copy()
-        qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+        qpos, poses = motion.qpos.copy(), body.T_world_body.copy()
+        qpos[:, :3] += back[:, None] * direction
+        poses[:, :3, 3] += back[:, None] * direction
         deep = np.maximum(
             overlap_between(
                 holder.capsules, holder.forward_kinematics(qpos),
                 other.capsules, other.forward_kinematics(other_motion.qpos),
             ),
-            object_penetration(other, pen, other_motion.qpos, T_world_pen),
+            object_penetration(other, thing, other_motion.qpos, poses),
         )  # fmt: skip
         if deep.max() <= MAX_PENETRATION:
-            return HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
+            return HandMotion(qpos, motion.rate), BodyMotion(poses, motion.rate)
         needed = np.where(deep > 0.5 * MAX_PENETRATION, back + deep + _RETREAT_STEP, back)
         window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
         back = uniform_filter1d(maximum_filter1d(needed, window), window)
-    raise ShapeError("the hands touch wherever the pen points, however far it draws back")
+    raise ShapeError("the hands touch, however far one of them draws back")
 
 
 def _turned_to_the_arm(

@@ -15,7 +15,7 @@ from gloves.mirrors import cameras_by_mirror, reflect
 from gloves.optics import OpticsConfig, reconstruct
 from gloves.strays import StrayConfig, sample_strays
 from gloves.take import GlovedHand, HeldBody, Take
-from gloves.visibility import MAX_FACING, free_rays
+from gloves.visibility import facing_cameras, free_rays
 from handsim.cameras import CameraRig
 from handsim.model import HandModel
 from handsim.motion import BodyMotion, HandMotion
@@ -148,15 +148,11 @@ class Room:
     def markers_seen(self, *, rng: np.random.Generator) -> Bool[np.ndarray, "T P C"]:
         """Which cameras have a free view of each marker, past every skin and the object."""
         markers, normals = self.markers
-        optics, cameras = self.config.optics, self.rig.positions
-        seen = np.empty((*markers.shape[:2], len(cameras)), dtype=bool)
+        reach = self.config.optics.partial * self.config.optics.marker_radius
+        seen = np.empty((*markers.shape[:2], len(self.rig.positions)), dtype=bool)
         for first in range(0, self.num_frames, _CHUNK):
             part = slice(first, first + _CHUNK)
-            to_camera = cameras - markers[part, :, None]
-            ahead = np.einsum("tpci,tpi->tpc", to_camera, normals[part])
-            wanted = self.rig.in_view(markers[part])
-            wanted &= ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
-            reach = optics.partial * optics.marker_radius
+            wanted = facing_cameras(markers[part], normals[part], self.rig)
             starts = markers[part, :, None] + _in_ball(wanted.shape, reach, rng)
             for begin in range(0, len(wanted), _SKINS):
                 few = slice(begin, begin + _SKINS)
@@ -225,5 +221,5 @@ def _in_ball(
     offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
     length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
     reach = radius * np.cbrt(rng.random(shape, dtype=np.float32)) / np.maximum(length, 1e-12)
-    scaled: np.ndarray = offsets * reach[..., None]
-    return scaled
+    offsets *= reach[..., None]
+    return offsets

@@ -25,7 +25,7 @@ from handsim.motion import BodyMotion, HandMotion
 from handsim.objects import named_object
 from handsim.shape import ADULTS, sample_shape
 from poses.objects import sample_object_motion
-from poses.pointing import point_pen, pointing_path
+from poses.pointing import keep_apart, point_pen, pointing_path
 from poses.scripts import scripted_motion
 from poses.two_hands import TwoHandConfig, sample_two_hand_motion
 from poses.wrists import WristConfig, wrist_path
@@ -35,6 +35,7 @@ Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 RATE: Final = 120.0
 _APART: Final = 0.22  # from the middle to a hand that touches nothing [m]
+_ASIDE: Final = np.array([1.0, 0.0, 0.0])  # where a right hand makes room
 _MOST_PEOPLE: Final = 10
 _SPACE: Final = 0.5  # half side of the cube that wrists stay in [m]
 _APART_TIME: Final = (2.0, 4.0)
@@ -167,15 +168,15 @@ def _play(
         return _actors(hands, gloves, motions, frames), None
     thing = named_object("pen" if kind == "hand-pen" else "controller")
     holding, body = sample_object_motion(right, thing, seconds, rng=rng)
+    held = HandMotion(holding.qpos[:frames], RATE), BodyMotion(body.T_world_body[:frames], RATE)
     other = _alone(left, _AT_REST, -_APART, frames, rng)
     if kind == "hand-pen":
         places, outward = gloves[1].markers(left, left.forward_kinematics(other.qpos))
         path = pointing_path(places, outward, RATE, rng=rng)
-        held = HandMotion(holding.qpos[:frames], RATE), BodyMotion(body.T_world_body[:frames], RATE)
         holding, body = point_pen(right, left, thing, held, other, path)
-    return _actors(hands, gloves, (holding, other), frames), Prop(
-        thing, BodyMotion(body.T_world_body[:frames], RATE)
-    )
+    else:
+        holding, body = keep_apart(right, left, thing, held, other, np.tile(_ASIDE, (frames, 1)))
+    return _actors(hands, gloves, (holding, other), frames), Prop(thing, body)
 
 
 def _alone(hand: HandModel, script: str, aside: float, frames: int, rng: np.random.Generator) -> HandMotion:

@@ -1,4 +1,4 @@
-"""The capture room: points lie where truth says, lines of sight are embree's, IDs and labels keep their word."""
+"""The capture room: points where truth says, sight lines as embree's, IDs and labels that keep their word."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_markers_are_seen_as_embree_sees_them(name, rng):
     ahead = np.einsum("tpci,tpi->tpc", to_camera, normals)
     wanted = RIG.in_view(markers) & (ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1))
     assert not (ours & ~wanted).any()
-    skins = [hand.model.skin(hand.motion.qpos) for hand in room.actors]
+    skins = [(hand.model.skin(hand.motion.qpos), hand) for hand in room.actors]
     frames = np.arange(0, FRAMES, 4)
     reference = np.zeros_like(ours)
     for frame in frames:
@@ -107,7 +107,7 @@ def test_markers_are_seen_as_embree_sees_them(name, rng):
         meshes = [
             trimesh.Trimesh(vertices, faces, process=False)
             for vertices, faces in (
-                *((skin[frame], hand.model.surface.faces) for skin, hand in zip(skins, room.actors, strict=True)),
+                *((skin[frame], hand.model.surface.faces) for skin, hand in skins),
                 (thing, room.prop.thing.faces),
             )
         ]  # fmt: skip
@@ -191,12 +191,10 @@ def test_a_seed_decides_everything():
 
 
 def test_losses_cost_markers(rng):
-    kept = [
-        np.isfinite(take.observed(range(38))[..., 0]).mean()
-        for take in (
-            two_hands(config=dataclasses.replace(CLEAN, optics=optics)).take({}, rng=rng)
-            for optics in (CLEAN.optics, OpticsConfig(blob_loss=0.5), OpticsConfig(dropout=0.5, dropout_cameras=13))
-        )
-    ]  # fmt: skip
+    lossy = OpticsConfig(blob_loss=0.5), OpticsConfig(dropout=0.5, dropout_cameras=13)
+    kept = []
+    for optics in (CLEAN.optics, *lossy):
+        take = two_hands(config=dataclasses.replace(CLEAN, optics=optics)).take({}, rng=rng)
+        kept.append(np.isfinite(take.observed(range(38))[..., 0]).mean())
     assert kept[0] > kept[1] + 0.01
     assert kept[0] > kept[2] + 0.05

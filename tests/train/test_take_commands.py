@@ -27,7 +27,9 @@ def one_thread():
 def taken(tmp_path_factory):
     folder = tmp_path_factory.mktemp("take")
     out = folder / "take.c3d"
-    assert main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
     return out
 
 
@@ -45,7 +47,9 @@ def test_the_capture_and_its_truth_agree(taken):
 
 def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, capsys):
     out = tmp_path / "again" / "take.c3d"
-    assert main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
     said = capsys.readouterr().out
     assert f"{out}: {FRAMES} frames, " in said and str(out.with_suffix(".truth.npz")) in said
     assert out.read_bytes() == taken.read_bytes()
@@ -115,7 +119,11 @@ def test_table_3_has_a_row_a_capture_with_the_papers_figures(capsys, monkeypatch
         paper, ghosts = TWINS[kind].paper, TWINS[kind].ghost_ratio
         frames, gaps, length, missing, share = (cell.strip() for cell in row.split("│")[2:7])
         assert frames == f"{paper.frames} ({paper.frames})"
-        for cell, wanted in ((gaps, paper.gaps), (length, paper.average_length), (missing, paper.average_missing)):
+        for cell, wanted in (
+            (gaps, paper.gaps),
+            (length, paper.average_length),
+            (missing, paper.average_missing),
+        ):
             ours, theirs = cell.rstrip(")").split(" (")
             assert float(theirs) == pytest.approx(wanted)
             assert float(ours) == pytest.approx(wanted, rel=0.4), f"{kind}: {cell}"

@@ -1,4 +1,4 @@
-"""Twins of the paper's captures: all kinds, hands that are valid in every frame, and Table 3 near the paper's."""
+"""Twins of the paper's captures: every kind, valid in every frame, and Table 3 near the paper's."""
 
 from __future__ import annotations
 
@@ -28,6 +28,11 @@ def short(kind: str) -> Take:
     return simulate_twin(TwinConfig(kind=kind, num_frames=FRAMES))
 
 
+@functools.cache
+def whole() -> Take:
+    return simulate_twin(TwinConfig(kind="hand-controller"))
+
+
 def models(take: Take) -> tuple[HandModel, HandModel]:
     right, left = (HandModel(hand.shape) for hand in take.hands)
     return right, left
@@ -51,9 +56,9 @@ def test_shapes_and_settings(kind):
         assert np.isfinite(take.observed(label)[..., 0]).mean() > 0.5, "clasped hands hide a lot"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, "the whole hand-controller"])
 def test_every_frame_is_valid(kind):
-    take = short(kind)
+    take = short(kind) if kind in KINDS else whole()
     right, left = models(take)
     for model, hand in zip((right, left), take.hands, strict=True):
         angles = hand.qpos[:, 7:]
@@ -71,11 +76,11 @@ def test_every_frame_is_valid(kind):
 def test_hands_move_as_hands_do(kind):
     for hand in short(kind).hands:
         wrist = np.linalg.norm(np.diff(hand.qpos[:, :3], axis=0), axis=1) * RATE
-        assert wrist.max() < 4.0, "m/s"
+        assert wrist.max() < 3.0, "m/s"
         turns = quaternion_matrix(hand.qpos[:, 3:7])
         cosine = (np.einsum("tij,tij->t", turns[1:], turns[:-1]) - 1.0) / 2.0
-        assert np.arccos(np.clip(cosine, -1.0, 1.0)).max() * RATE < 20.0, "rad/s"
-        assert np.abs(np.diff(hand.qpos[:, 7:], axis=0)).max() * RATE < 25.0
+        assert np.arccos(np.clip(cosine, -1.0, 1.0)).max() * RATE < 12.0, "rad/s"
+        assert np.abs(np.diff(hand.qpos[:, 7:], axis=0)).max() * RATE < 15.0
 
 
 def test_the_pen_points_at_markers_of_the_other_hand():
@@ -104,7 +109,7 @@ def test_a_single_frame_is_a_capture(kind):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"kind": "hand-pn"}, "unknown kind of capture 'hand-pn' (did you mean 'hand-pen'?); valid names: single"),
+        ({"kind": "hand-pn"}, "unknown kind of capture 'hand-pn' (did you mean 'hand-pen'?); valid names: "),
         ({"num_frames": 0}, "num_frames is 0, wanted at least 1"),
         ({"num_frames": -5}, "num_frames is -5, wanted at least 1"),
         ({"seed": -1}, "seed is -1, wanted 0 or more"),
@@ -116,14 +121,16 @@ def test_a_mistake_is_one_sentence(arguments, words):
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("arguments", "words"), [({"glove": "dens19"}, "dense19"), ({"rig": "ten"}, "figure5")])
+@pytest.mark.parametrize(
+    ("arguments", "words"), [({"glove": "dens19"}, "dense19"), ({"rig": "ten"}, "figure5")]
+)
 def test_unknown_gloves_and_rigs_are_told(arguments, words):
     with pytest.raises(HandSimError, match=words):
         simulate_twin(TwinConfig(num_frames=5, **arguments))
 
 
 def test_the_whole_hand_controller_twin_is_near_table_3():
-    take = simulate_twin(TwinConfig(kind="hand-controller"))
+    take = whole()
     paper = TWINS["hand-controller"].paper
     observed = np.concatenate([take.observed(label) for label in take.hand_labels], axis=1)
     ours = count_gaps(np.isfinite(observed[..., 0]))
