@@ -105,7 +105,7 @@ TWINS: Final[dict[str, Twin]] = {
         GapCounts(4511, 481, 3.39, 2.31), 0.0755, _room(3.0, **_losses(0.002, 0.17, 1.4, 6)), draw=15
     ),
     "hand-controller": Twin(
-        GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(2.0, **_losses(0.12, 0.0, 1.0, 1)), draw=9
+        GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(1.7, **_losses(0.115, 0.0, 1.0, 1)), draw=2
     ),
 }
 
