@@ -106,6 +106,17 @@ def test_it_follows_places_that_move(rng):
     np.testing.assert_allclose(moving[:, :3, :3], still[:, :3, :3], atol=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_pen_keeps_steady_over_fingers_that_flutter(seed):
+    """A finger that taps twice a second turns its markers by up to 10 rad/s; the pen must not go along."""
+    rng = np.random.default_rng(seed)
+    angle = 0.8 * np.sin(4.0 * np.pi * np.arange(FRAMES) / RATE)[:, None] + rng.uniform(-0.5, 0.5, size=6)
+    outward = np.stack([np.zeros_like(angle), np.sin(angle), np.cos(angle)], axis=-1)
+    places = np.tile(rng.uniform(-0.1, 0.1, size=(6, 3)), (FRAMES, 1, 1))
+    path = pointing_path(places, outward, RATE, rng=rng)
+    assert turns(path).max() < 5.0
+
+
 def test_the_same_seed_leads_the_same_way():
     places, outward = markers_of(hands()[1], resting(hands()[1], 100))
     first, again, other = (
