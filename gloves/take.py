@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -13,16 +14,22 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gloves.layout import MarkerLayout, MarkerPlace
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, HandSimError
 from handsim.hand_records import HAND_DTYPE, pack_hand, unpack_hand
 from handsim.io import atomic_write
 from handsim.shape import HandShape
+from handsim.topology import NUM_QPOS
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 SCHEMA: Final = 1
 SUFFIX: Final = ".truth.npz"
+_DAMAGE: Final = (
+    HandSimError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What reading a damaged file may end in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +135,9 @@ def load_take(path: Path) -> Take:
         return _unpack(header, arrays)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except CaptureError:
+        raise
+    except _DAMAGE as error:
         raise CaptureError(f"{path}: not a take, or a damaged one") from error
 
 
@@ -138,11 +147,11 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
         for stored in header["layouts"]
     ]
     shapes = [unpack_hand(record) for record in arrays["hands"]]
-    hands = tuple(map(GlovedHand, shapes, layouts, arrays["qpos"]))
+    hands = tuple(GlovedHand(*parts) for parts in zip(shapes, layouts, arrays["qpos"], strict=True))
     body = header["body"] and HeldBody(
         header["body"]["name"], tuple(header["body"]["marker_names"]), arrays["T_world_body"]
     )
-    return Take(
+    take = Take(
         rate=float(header["rate"]),
         points=arrays["points"],
         ids=arrays["ids"],
@@ -151,3 +160,23 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
         body=body,
         settings=header["settings"],
     )
+    _check(take)
+    return take
+
+
+def _check(take: Take) -> None:
+    """Whether the parts of a take fit together."""
+    frames, columns = take.points.shape[:2]
+    shapes = [
+        (take.points, (frames, columns, 3)),
+        (take.ids, (frames, columns)),
+        (take.labels, take.ids.shape),
+    ]
+    shapes += [(hand.qpos, (frames, NUM_QPOS)) for hand in take.hands]
+    shapes += [] if take.body is None else [(take.body.T_world_body, (frames, 4, 4))]
+    if any(array.shape != shape for array, shape in shapes):
+        raise ValueError("the arrays of a take do not fit together")
+    known = sum(hand.layout.num_markers for hand in take.hands)
+    known += 0 if take.body is None else len(take.body.marker_names)
+    if not 0.0 < take.rate < np.inf or (take.labels < -1).any() or (take.labels >= known).any():
+        raise ValueError("the rate is none, or a label names no marker")

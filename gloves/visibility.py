@@ -50,14 +50,27 @@ def visible_cameras(
         segments: Both ends of every capsule's axis in the world [m].
         radii: Capsule radii [m].
     """
+    clear = free_rays(markers, rig.positions, segments, radii)
+    seen: NDArray[np.bool_] = facing_cameras(markers, normals, rig) & clear
+    return seen
+
+
+def facing_cameras(
+    markers: Float[np.ndarray, "T M 3"], normals: Float[np.ndarray, "T M 3"], rig: CameraRig
+) -> Bool[np.ndarray, "T M C"]:
+    """Which cameras would see each marker if nothing stood in the way: in view, and on its open side.
+
+    Args:
+        markers: Marker centres in the world [m].
+        normals: Unit directions in which the markers look away from what carries them.
+        rig: The cameras.
+    """
     cameras = rig.positions
     ahead = normals @ cameras.T - np.einsum("tmi,tmi->tm", normals, markers)[..., None]
     squared = np.einsum("tmi,tmi->tm", markers, markers)[..., None] - markers @ (2.0 * cameras.T)
     squared += np.einsum("ci,ci->c", cameras, cameras)
-    facing = ahead > np.cos(MAX_FACING) * np.sqrt(squared)
-    clear = free_rays(markers, cameras, segments, radii)
-    seen: NDArray[np.bool_] = rig.in_view(markers) & facing & clear
-    return seen
+    facing: NDArray[np.bool_] = ahead > np.cos(MAX_FACING) * np.sqrt(squared)
+    return rig.in_view(markers) & facing
 
 
 def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
 from handsim.contact import overlap_between
 from handsim.errors import ShapeError
@@ -21,13 +21,15 @@ from poses.validity import MAX_PENETRATION
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_REFERENCE: Final = np.array([0.53, -0.85, 0.0])  # where the writing arm is, for a user who faces +y
-_DRAW: Final = 0.02  # share by which the pen turns back to it in a frame
-_CHOICES: Final = 6  # places thought of before the next one is taken
-_FOLLOWING: Final = 0.2  # [s]
-_PEAK: Final = 1.875  # peak speed of the minimum-jerk profile, in distances per duration
-
+_UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
+"""How a pen in the right hand of somebody at -y stands over a palm that looks down."""
+_ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
+_CONE: Final = 1.2  # farthest that the pen leans from upright [rad]
+_MOST_LEAN: Final = 1.0  # as a tangent
+_BEHIND: Final = -0.2  # places that look away from the pen by more, as a cosine, are not pointed at
+_PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
 _MOST_RETREATS: Final = 12
+_STEADY: Final = 0.15  # [s] over which the pen follows what its places look at, standard deviation
 _RETREAT_STEP: Final = 0.003  # [m] beyond what is asked for
 _SMOOTHING: Final = 0.25  # [s] over which the pen draws back
 
@@ -38,28 +40,18 @@ class PointingConfig:
 
     distance: tuple[float, float] = (0.006, 0.02)
     """Least and greatest distance of the tip from the place it points at [m]."""
-    retreat: float = 0.04
+    retreat: float = 0.05
     """How far the tip draws back between two places [m]."""
     stay: tuple[float, float] = (0.15, 0.6)
     """Shortest and longest time at a place [s]."""
     way: tuple[float, float] = (0.4, 0.9)
-    """Shortest and longest time from place to place, where the limits below do not ask for more [s]."""
-    speed: float = 0.6
-    """Fastest travel of the tip from place to place [m/s]."""
-    turning: float = 2.5
-    """Fastest turn of the pen on the way [rad/s]."""
-    tilt: float = 0.5
+    """Shortest and longest time from place to place [s]."""
+    tilt: float = 0.6
     """How far the pen leans from straight at the place, standard deviation of the tangent."""
-
-
-class _Visits(NamedTuple):
-    """Target, distance and lean of each visit; each frame's visit and its share of the way to the next."""
-
-    target: list[int]
-    distance: list[float]
-    lean: list[np.ndarray]
-    visit: list[int]
-    share: list[float]
+    speed: float = 0.6
+    """Fastest way of the tip between places that keep still, retreat aside [m/s]; ways get longer for it."""
+    turning: float = 3.0
+    """The same for the turn of the pen [rad/s]."""
 
 
 def pointing_path(
@@ -80,77 +72,110 @@ def pointing_path(
         rng: Source of all randomness.
     """
     config = config or PointingConfig()
-    window = 2 * int(_FOLLOWING * rate / 2) + 1  # a hand follows a moving finger with some lag
-    places, outward = (uniform_filter1d(values, window, axis=0) for values in (places, outward))
+    outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
+    outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
     visits = _plan(places, outward, rate, config, rng)
-    now, visit, share = np.arange(len(places)), np.array(visits.visit), np.array(visits.share)
-    target, distance, lean = np.array(visits.target), np.array(visits.distance), np.array(visits.lean)
-    tips, axes = [], []
-    for which in (visit, visit + 1):
-        axis = _axis(outward[now, target[which]], lean[which])
-        axes.append(axis)
-        tips.append(places[now, target[which]] + distance[which, None] * axis)
-    axis = _between(axes[0], axes[1], share)
-    lift = config.retreat * np.sin(np.pi * share)[:, None] ** 2
+    share = np.concatenate([visit.share for visit in visits])
+    number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
+    now = np.arange(len(places))
+    share, number = share[now], number[now]
+
+    def at(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        target = np.array([visit.target for visit in visits])[which]
+        lean = np.stack([visit.lean for visit in visits])[which]
+        distance = np.array([visit.distance for visit in visits])[which]
+        axis = _axes(outward[now, target], lean)
+        return places[now, target] + distance[:, None] * axis, axis
+
+    (here, axis_here), (there, axis_there) = at(number), at(number + 1)
     blend = share[:, None]
-    return _frames((1.0 - blend) * tips[0] + blend * tips[1] + lift * axis, axis)
+    axis = _between(axis_here, axis_there, blend)
+    lift = config.retreat * np.sin(np.pi * blend) ** 2
+    return _frames((1.0 - blend) * here + blend * there + lift * axis, axis)
+
+
+@dataclass(frozen=True, slots=True)
+class _Visit:
+    """One place, and the way from it to the next."""
+
+    target: int
+    distance: float
+    lean: Float[np.ndarray, "3"]
+    share: Float[np.ndarray, "S"]
+    """Of the way, for each frame."""
 
 
 def _plan(
-    places: np.ndarray, outward: np.ndarray, rate: float, config: PointingConfig, rng: np.random.Generator
-) -> _Visits:
-    """Visits one after another, the next one among a few that takes the least turning of the pen."""
-    frames, count = places.shape[:2]
-    visits = _Visits([int(rng.integers(count))], [rng.uniform(*config.distance)], [np.zeros(3)], [], [])
-    while len(visits.visit) < frames:
-        at = len(visits.visit)
-        axis = _axis(outward[at, visits.target[-1]], visits.lean[-1])
-        targets = rng.integers(count, size=_CHOICES)
-        leans = config.tilt * rng.standard_normal((_CHOICES, 3))
-        angles = np.arccos(np.clip(_axis(outward[at, targets], leans) @ axis, -1.0, 1.0))
-        best = int(angles.argmin())
-        far = np.linalg.norm(places[at, targets[best]] - places[at, visits.target[-1]]) + config.retreat
-        least = _PEAK * max(far / config.speed, angles[best] / config.turning)
-        way = minimum_jerk(max(2, round(max(rng.uniform(*config.way), least) * rate)))
-        stay = max(1, round(rng.uniform(*config.stay) * rate))
-        visits.visit.extend([len(visits.target) - 1] * (stay + len(way)))
-        visits.share.extend([0.0] * stay + way.tolist())
-        visits.target.append(int(targets[best]))
-        visits.distance.append(rng.uniform(*config.distance))
-        visits.lean.append(leans[best])
-    return visits._replace(visit=visits.visit[:frames], share=visits.share[:frames])
+    places: Float[np.ndarray, "T M 3"],
+    outward: Float[np.ndarray, "T M 3"],
+    rate: float,
+    config: PointingConfig,
+    rng: np.random.Generator,
+) -> list[_Visit]:
+    """Visits for all frames, and one more where the last way leads."""
+    visits: list[_Visit] = []
+    frame = 0
+    target, lean = _draw(outward[0], config, rng)
+    while frame < len(places):
+        here, axis = places[frame], _axes(outward[frame, target], lean)
+        following, next_lean = _draw(outward[frame], config, rng)
+        next_axis = _axes(outward[frame, following], next_lean)
+        turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
+        seconds = max(
+            rng.uniform(*config.way),
+            _PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / config.speed,
+            _PEAK_SPEED * turn / config.turning,
+        )
+        stay = np.zeros(max(1, round(rng.uniform(*config.stay) * rate)))
+        share = np.concatenate([stay, minimum_jerk(max(2, int(np.ceil(seconds * rate))))])
+        visits.append(_Visit(target, rng.uniform(*config.distance), lean, share))
+        frame, target, lean = frame + len(share), following, next_lean
+    return [*visits, _Visit(target, rng.uniform(*config.distance), lean, np.zeros(0))]
 
 
-def _axis(outward: np.ndarray, lean: np.ndarray) -> np.ndarray:
-    """Unit directions (..., 3) that lean from `outward`, but never by more than some 60 degrees."""
+def _draw(
+    outward: Float[np.ndarray, "M 3"], config: PointingConfig, rng: np.random.Generator
+) -> tuple[int, Float[np.ndarray, "3"]]:
+    """A place that can be reached now, and how the pen leans there."""
+    open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _BEHIND)
+    target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
+    lean = config.tilt * rng.standard_normal(3)
+    lean -= (lean @ outward[target]) * outward[target]  # sideways, or a turn of the place would swing the pen
+    return target, lean * min(1.0, _MOST_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
+
+
+def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
+    """Directions of the pen at places: off the skin, and never far from upright, smoothly in both."""
     axis = outward + lean
-    facing = np.einsum("...i,...i->...", axis, outward)
-    axis = axis + np.clip(0.5 - facing, 0.0, None)[..., None] * outward
-    unit: np.ndarray = axis / np.maximum(np.linalg.norm(axis, axis=-1, keepdims=True), 1e-9)
-    return unit
+    facing = np.einsum("...i,...i->...", axis, outward)[..., None]
+    axis = axis + np.clip(0.5 - facing, 0.0, None) * outward
+    axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
+    upright = np.broadcast_to(_UPRIGHT, axis.shape)
+    angle = np.arccos(np.clip(axis @ _UPRIGHT, -1.0, 1.0))[..., None]
+    return _between(upright, axis, _CONE * np.tanh(angle / _CONE) / np.maximum(angle, 1e-9))
 
 
-def _between(first: np.ndarray, second: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Unit directions (T, 3) on the great circle from one to another."""
-    angle = np.arccos(np.clip(np.einsum("ti,ti->t", first, second), -1.0, 1.0))[:, None]
-    sine = np.maximum(np.sin(angle), 1e-6)
-    blend = share[:, None]
-    axis = np.sin((1.0 - blend) * angle) / sine * first + np.sin(blend * angle) / sine * second
-    axis = np.where(angle < 1e-3, (1.0 - blend) * first + blend * second, axis)
-    unit: np.ndarray = axis / np.linalg.norm(axis, axis=1, keepdims=True)
-    return unit
+def _between(
+    start: Float[np.ndarray, "*T 3"], end: Float[np.ndarray, "*T 3"], share: Float[np.ndarray, "*T 1"]
+) -> Float[np.ndarray, "*T 3"]:
+    """Directions a share of the shortest turn from one to another."""
+    angle = np.arccos(np.clip(np.einsum("...i,...i->...", start, end), -1.0, 1.0))[..., None]
+    mixed = np.sin((1.0 - share) * angle) * start + np.sin(share * angle) * end
+    mixed = np.where(angle > 1e-6, mixed, start)
+    between: np.ndarray = mixed / np.maximum(np.linalg.norm(mixed, axis=-1, keepdims=True), 1e-12)
+    return between
 
 
 def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:
-    """Poses with +z along `axis`; +x is carried from frame to frame and drawn slowly to where the arm is."""
+    """Poses with +z along `axis`, by the shortest turn from upright, where +x looks to the arm."""
+    x = _ARM - (_ARM @ _UPRIGHT) * _UPRIGHT
+    x /= np.linalg.norm(x)
+    # The shortest turn from u to a moves v to v - (v . (u + a)) / (1 + u . a) (u + a) + 2 (v . u) a.
+    middle = axis + _UPRIGHT
+    x = x - (middle @ x / (1.0 + axis @ _UPRIGHT))[:, None] * middle
     pose = np.tile(np.eye(4), (len(origin), 1, 1))
-    x = _REFERENCE
-    for frame, z in enumerate(axis):
-        x = x + _DRAW * (_REFERENCE - x)
-        x = x - (x @ z) * z
-        x = x / np.linalg.norm(x)
-        pose[frame, :3, 0] = x
-    pose[:, :3, 1], pose[:, :3, 2], pose[:, :3, 3] = np.cross(axis, pose[:, :3, 0]), axis, origin
+    pose[:, :3, 0], pose[:, :3, 1], pose[:, :3, 2] = x, np.cross(axis, x), axis
+    pose[:, :3, 3] = origin
     return pose
 
 
@@ -177,27 +202,53 @@ def point_pen(
     """
     motion, body = held
     T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
-    T_path_pen = _turned_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
-    back = np.zeros(len(path))
+    T_world_pen = path @ _turned_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
+    qpos = motion.qpos.copy()
+    qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+    led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
+    return keep_apart(holder, other, pen, led, other_motion, path[:, :3, 2])
+
+
+def keep_apart(
+    holder: HandModel,
+    other: HandModel,
+    thing: RigidObject,
+    held: tuple[HandMotion, BodyMotion],
+    other_motion: HandMotion,
+    direction: Float[np.ndarray, "T 3"],
+) -> tuple[HandMotion, BodyMotion]:
+    """A hand and what it holds, drawn back smoothly wherever either would touch the other hand.
+
+    Args:
+        holder: The hand with the thing.
+        other: The hand that is in the way.
+        thing: What is held.
+        held: How hand and thing would move.
+        other_motion: What the other hand does.
+        direction: Unit directions to draw back in.
+
+    Raises:
+        ShapeError: Even drawn back, something touches.
+    """
+    motion, body = held
+    back = np.zeros(len(direction))
     for _ in range(_MOST_RETREATS):
-        pose = path.copy()
-        pose[:, :3, 3] += back[:, None] * path[:, :3, 2]
-        T_world_pen = pose @ T_path_pen
-        qpos = motion.qpos.copy()
-        qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
+        qpos, poses = motion.qpos.copy(), body.T_world_body.copy()
+        qpos[:, :3] += back[:, None] * direction
+        poses[:, :3, 3] += back[:, None] * direction
         deep = np.maximum(
             overlap_between(
                 holder.capsules, holder.forward_kinematics(qpos),
                 other.capsules, other.forward_kinematics(other_motion.qpos),
             ),
-            object_penetration(other, pen, other_motion.qpos, T_world_pen),
+            object_penetration(other, thing, other_motion.qpos, poses),
         )  # fmt: skip
         if deep.max() <= MAX_PENETRATION:
-            return HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
+            return HandMotion(qpos, motion.rate), BodyMotion(poses, motion.rate)
         needed = np.where(deep > 0.5 * MAX_PENETRATION, back + deep + _RETREAT_STEP, back)
         window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
         back = uniform_filter1d(maximum_filter1d(needed, window), window)
-    raise ShapeError("the hands touch wherever the pen points, however far it draws back")
+    raise ShapeError("the hands touch, however far one of them draws back")
 
 
 def _turned_to_the_arm(

@@ -37,7 +37,7 @@ def wrist_path(
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"]]:
     """Positions [m] and orientations (wxyz) of a wrist on its way through the room."""
     shares = [np.zeros(1)]
-    while sum(map(len, shares)) < frames:
+    while sum(map(len, shares)) < max(frames, 2):  # turns need two places
         steps = int(rng.uniform(*config.times) * rate) + 1
         shares.append(len(shares) - 1 + minimum_jerk(steps))
     progress = np.concatenate(shares)[:frames]

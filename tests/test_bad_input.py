@@ -19,11 +19,17 @@ from handsim.cli import main
 GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
 TOP = 'name = "mine"\nradius_mm = 3.2\n'
+RIG = 'name = "mine"\nfield_of_view = 60.0\n'
+CAMERA = "[[camera]]\nposition = {}\ntarget = [0.0, 0.0, 1.1]\n"
 FIVE = [("a", "index_distal"), ("b", "ring_distal"), ("c", "thumb_distal"), ("d", "little_distal")]
 
 
 def layout(*markers: tuple[str, str]) -> str:
     return TOP + "\n".join(MARKER.format(*marker) for marker in markers)
+
+
+def rig(*positions: list[float]) -> str:
+    return RIG + "\n".join(CAMERA.format(position) for position in positions)
 
 
 def good_capture(folder: Path) -> str:
@@ -41,6 +47,10 @@ def folder(tmp_path, monkeypatch):
         "unknown_bone.toml": layout(*FIVE, ("e", "indx_middle")),
         "twice.toml": layout(*FIVE, ("a", "index_middle")),
         "two_markers.toml": layout(*FIVE[:2]),
+        "one_camera.toml": rig([1.5, 0.0, 2.0]),
+        "in_the_way.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.1, 0.0, 1.3]),
+        "at_the_hands.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.0, 0.65, 1.1]),
+        "damaged.truth.npz": "PK",
         "furlongs.trc": text.replace("\tmm\t", "\tfurlongs\t"),
         "empty.trc": "\n".join(text.split("\n")[:5]) + "\n",
         "nothing.trc": "",
@@ -71,6 +81,21 @@ CASES = {
     "no labeler for this glove": ["label", "good.trc", "--glove", "copy.toml", "--out", "out.trc"],
     "no frames": ["generate", "--num-frames", "0", "--out", "out"],
     "an existing layout": ["glove", "new", "copy.toml"],
+    "a rig with one camera": ["generate", "--rig", "one_camera.toml", "--out", "out"],
+    "a capture by one camera": ["simulate", "--rig", "one_camera.toml", "--out", "out.c3d"],
+    "a camera among the hands": ["generate", "--rig", "in_the_way.toml", "--out", "out"],
+    "a camera among the hands of a capture": ["simulate", "--rig", "in_the_way.toml", "--out", "out.c3d"],
+    "a camera where two hands may come": ["simulate", "--rig", "at_the_hands.toml", "--out", "out.c3d"],
+    "an unknown rig": ["simulate", "--rig", "figure6", "--out", "out.c3d"],
+    "an unknown glove of a capture": ["simulate", "--glove", "dense91", "--out", "out.c3d"],
+    "a glove file that is none": ["simulate", "--glove", "unknown_bone.toml", "--out", "out.c3d"],
+    "a capture without frames": ["simulate", "--num-frames", "0", "--out", "out.c3d"],
+    "a negative seed": ["simulate", "--seed", "-1", "--out", "out.c3d"],
+    "a capture in another kind of file": ["simulate", "--out", "out.fbx"],
+    "a damaged take": ["evaluate", "damaged.truth.npz", "--json", "out.json"],
+    "no such take": ["evaluate", "missing.truth.npz", "--json", "out.json"],
+    "an unknown glove of a table": ["reproduce", "table3", "--glove", "dense91"],
+    "a negative seed of a table": ["reproduce", "table3", "--seed", "-1"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }
 
@@ -87,3 +112,21 @@ def test_a_mistake_is_one_sentence(name, folder, capsys):
         golden[name] = said.strip()
         GOLDEN.write_text(json.dumps(golden, indent=1, sort_keys=True) + "\n")
     assert said.strip() == golden[name]
+
+
+USAGE = {
+    "an unknown kind of capture": ["simulate", "--kind", "hand-pn", "--out", "out.c3d"],
+    "frames that are no number": ["simulate", "--num-frames", "many", "--out", "out.c3d"],
+    "no output": ["simulate", "--kind", "hand-pen"],
+    "an unknown table": ["reproduce", "table9"],
+}
+
+
+@pytest.mark.parametrize("name", USAGE)
+def test_wrong_usage_is_code_2(name, folder, capsys):
+    before = {path.name for path in folder.iterdir()}
+    with pytest.raises(SystemExit) as caught:
+        main(USAGE[name])
+    assert caught.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == before, "something was left behind"

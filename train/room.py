@@ -10,12 +10,12 @@ import numpy as np
 
 from gloves.attach import Attachment
 from gloves.identities import number_runs, pack_columns
-from gloves.mesh_sight import MeshTree, clear_of_body, clear_of_mesh
+from gloves.mesh_sight import MeshTree, clear_of_body, clear_of_mesh, hand_tree
 from gloves.mirrors import cameras_by_mirror, reflect
 from gloves.optics import OpticsConfig, reconstruct
 from gloves.strays import StrayConfig, sample_strays
 from gloves.take import GlovedHand, HeldBody, Take
-from gloves.visibility import MAX_FACING, free_rays
+from gloves.visibility import facing_cameras, free_rays
 from handsim.cameras import CameraRig
 from handsim.model import HandModel
 from handsim.motion import BodyMotion, HandMotion
@@ -25,7 +25,8 @@ from handsim.topology import PALM
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
-_CHUNK: Final = 256  # frames whose skins are in memory at once
+_CHUNK: Final = 256  # frames whose lines of sight are in memory at once
+_SKINS: Final = 16  # and their skins: so few stay in the processor's cache
 _FEWEST_OF_A_BODY: Final = 3  # markers without which an object cannot be tracked as a rigid body
 
 
@@ -112,8 +113,10 @@ class Room:
         found = reconstruct(
             sources.places, sources.seen, self.rig, self.config.optics, continuous=True, rng=rng
         )
-        positions = np.concatenate([found.positions, found.false_points], axis=1)
         labels = np.concatenate([sources.labels, np.full(found.false_points.shape[1], -1)])
+        order = rng.permutation(len(labels))  # neither IDs nor columns may tell what a point comes from
+        positions = np.concatenate([found.positions, found.false_points], axis=1)[:, order]
+        labels = labels[order]
         present = np.isfinite(positions).all(axis=-1)
         columns, count = pack_columns(present, rng=rng)
         frame, source = np.nonzero(present)
@@ -145,25 +148,36 @@ class Room:
     def markers_seen(self, *, rng: np.random.Generator) -> Bool[np.ndarray, "T P C"]:
         """Which cameras have a free view of each marker, past every skin and the object."""
         markers, normals = self.markers
-        optics, cameras = self.config.optics, self.rig.positions
-        trees = [MeshTree(a.model.surface.vertices, a.model.surface.faces) for a in self.actors]
-        seen = np.empty((*markers.shape[:2], len(cameras)), dtype=bool)
+        reach = self.config.optics.partial * self.config.optics.marker_radius
+        seen = np.empty((*markers.shape[:2], len(self.rig.positions)), dtype=bool)
         for first in range(0, self.num_frames, _CHUNK):
             part = slice(first, first + _CHUNK)
-            to_camera = cameras - markers[part, :, None]
-            ahead = np.einsum("tpci,tpi->tpc", to_camera, normals[part])
-            clear = self.rig.in_view(markers[part])
-            clear &= ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1)
-            reach = optics.partial * optics.marker_radius
-            starts = markers[part, :, None] + _in_ball(clear.shape, reach, rng)
-            for actor, tree in zip(self.actors, trees, strict=True):
-                vertices = actor.model.skin(actor.motion.qpos[part])
-                clear = clear_of_mesh(tree, vertices, starts, cameras, clear)
-            if self.prop is not None:
-                thing, pose = self.prop.thing, self.prop.motion.T_world_body[part]
-                clear = clear_of_body(MeshTree(thing.vertices, thing.faces), pose, starts, cameras, clear)
-            seen[part] = clear
+            wanted = facing_cameras(markers[part], normals[part], self.rig)
+            starts = markers[part, :, None] + _in_ball(wanted.shape, reach, rng)
+            for begin in range(0, len(wanted), _SKINS):
+                few = slice(begin, begin + _SKINS)
+                frames = slice(first + begin, first + begin + _SKINS)
+                seen[frames] = self._past_all(frames, starts[few], wanted[few])
         return seen
+
+    def _past_all(
+        self, frames: slice, starts: Float[np.ndarray, "t P C 3"], wanted: Bool[np.ndarray, "t P C"]
+    ) -> Bool[np.ndarray, "t P C"]:
+        """Which wanted lines from the starts to the cameras pass every skin and the object."""
+        clear = wanted
+        for actor in self.actors:
+            vertices = actor.model.skin(actor.motion.qpos[frames])
+            clear = clear_of_mesh(hand_tree(), vertices, starts, self.rig.positions, clear)
+        for tree, poses in self._bodies:
+            clear = clear_of_body(tree, poses[frames], starts, self.rig.positions, clear)
+        return clear
+
+    @cached_property
+    def _bodies(self) -> list[tuple[MeshTree, Float[np.ndarray, "T 4 4"]]]:
+        if self.prop is None:
+            return []
+        thing = self.prop.thing
+        return [(MeshTree(thing.vertices, thing.faces), self.prop.motion.T_world_body)]
 
     def _images(self, rng: np.random.Generator) -> list[Sources]:
         """Mirror images of all markers in the object's shiny patches, those that a camera ever sees."""
@@ -207,5 +221,5 @@ def _in_ball(
     offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
     length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
     reach = radius * np.cbrt(rng.random(shape, dtype=np.float32)) / np.maximum(length, 1e-12)
-    scaled: np.ndarray = offsets * reach[..., None]
-    return scaled
+    offsets *= reach[..., None]
+    return offsets

@@ -19,15 +19,13 @@ from gloves.optics import OpticsConfig
 from gloves.strays import StrayConfig
 from gloves.take import Take
 from handsim.cameras import ROOM_CENTRE, check_outside_volume, load_rig
-from handsim.contact import overlap_between
 from handsim.errors import ShapeError, choices
 from handsim.model import HandModel
 from handsim.motion import BodyMotion, HandMotion
-from handsim.objects import RigidObject, named_object
+from handsim.objects import named_object
 from handsim.shape import ADULTS, sample_shape
-from poses.motions import MotionConfig
-from poses.objects import object_penetration, sample_object_motion
-from poses.pointing import point_pen, pointing_path
+from poses.objects import sample_object_motion
+from poses.pointing import keep_apart, point_pen, pointing_path
 from poses.scripts import scripted_motion
 from poses.two_hands import TwoHandConfig, sample_two_hand_motion
 from poses.wrists import WristConfig, wrist_path
@@ -37,8 +35,9 @@ Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 RATE: Final = 120.0
 _APART: Final = 0.22  # from the middle to a hand that touches nothing [m]
+_ASIDE: Final = np.array([1.0, 0.0, 0.0])  # where a right hand makes room
 _MOST_PEOPLE: Final = 10
-_SPACE: Final = 0.3  # half side of the cube that wrists stay in [m]
+_SPACE: Final = 0.5  # half side of the cube that wrists stay in [m]
 _APART_TIME: Final = (2.0, 4.0)
 _IN_THE_AIR, _AT_REST, _TURNING = "piano", "typing", 0.5
 _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)
@@ -103,10 +102,10 @@ TWINS: Final[dict[str, Twin]] = {
         GapCounts(3312, 331, 4.01, 3.30), 0.1063, _room(7.0, **_losses(0.002, 0.35, 1.5, 4)), draw=8
     ),
     "hand-pen": Twin(
-        GapCounts(4511, 481, 3.39, 2.31), 0.0755, _room(3.0, **_losses(0.002, 0.22, 1.3, 4)), draw=2
+        GapCounts(4511, 481, 3.39, 2.31), 0.0755, _room(3.0, **_losses(0.002, 0.17, 1.4, 6)), draw=15
     ),
     "hand-controller": Twin(
-        GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(2.0, **_losses(0.12, 0.0, 1.0, 1)), draw=7
+        GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(1.7, **_losses(0.115, 0.0, 1.0, 1)), draw=2
     ),
 }
 
@@ -136,7 +135,7 @@ def _cast(
     for _ in range(_MOST_PEOPLE - 1):
         try:
             return _play(kind, _couple(rng), layout, frames, rng)
-        except ShapeError:  # these hands do not get hold of the pen, or came in each other's way
+        except ShapeError:  # these hands do not get hold of the pen
             continue
     return _play(kind, _couple(rng), layout, frames, rng)
 
@@ -166,50 +165,18 @@ def _play(
             _alone(right, _IN_THE_AIR, _APART, frames, rng),
             _alone(left, _IN_THE_AIR, -_APART, frames, rng),
         )
-        _check_apart(left, motions[1], right, motions[0])
         return _actors(hands, gloves, motions, frames), None
     thing = named_object("pen" if kind == "hand-pen" else "controller")
-    near = MotionConfig(volume=0.1)
-    holding, body = sample_object_motion(right, thing, seconds, near, rng=rng)
-    other = _alone(left, _AT_REST, 0.0 if kind == "hand-pen" else -_APART, frames, rng)
+    holding, body = sample_object_motion(right, thing, seconds, rng=rng)
     held = HandMotion(holding.qpos[:frames], RATE), BodyMotion(body.T_world_body[:frames], RATE)
+    other = _alone(left, _AT_REST, -_APART, frames, rng)
     if kind == "hand-pen":
         places, outward = gloves[1].markers(left, left.forward_kinematics(other.qpos))
         path = pointing_path(places, outward, RATE, rng=rng)
         holding, body = point_pen(right, left, thing, held, other, path)
     else:
-        holding, body = _moved_aside(*held)
-        _check_apart(left, other, right, holding, thing, body)
+        holding, body = keep_apart(right, left, thing, held, other, np.tile(_ASIDE, (frames, 1)))
     return _actors(hands, gloves, (holding, other), frames), Prop(thing, body)
-
-
-def _moved_aside(holding: HandMotion, body: BodyMotion) -> tuple[HandMotion, BodyMotion]:
-    qpos, poses = holding.qpos.copy(), body.T_world_body.copy()
-    qpos[:, 0] += _APART
-    poses[:, 0, 3] += _APART
-    return HandMotion(qpos, holding.rate), BodyMotion(poses, body.rate)
-
-
-def _check_apart(
-    free: HandModel,
-    free_motion: HandMotion,
-    other: HandModel,
-    other_motion: HandMotion,
-    thing: RigidObject | None = None,
-    body: BodyMotion | None = None,
-) -> None:
-    """Raises where hands that have nothing to do with each other come too near."""
-    overlap = overlap_between(
-        free.capsules,
-        free.forward_kinematics(free_motion.qpos),
-        other.capsules,
-        other.forward_kinematics(other_motion.qpos),
-    )
-    inside = np.zeros(1)
-    if thing is not None and body is not None:
-        inside = object_penetration(free, thing, free_motion.qpos, body.T_world_body)
-    if max(overlap.max(), inside.max()) > 0.0:
-        raise ShapeError("the hands get in each other's way")
 
 
 def _alone(hand: HandModel, script: str, aside: float, frames: int, rng: np.random.Generator) -> HandMotion:

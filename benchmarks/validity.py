@@ -1,0 +1,119 @@
+"""How valid motions are, frame by frame: the deepest overlaps, the angles out of range, the fastest wrists.
+
+    python benchmarks/validity.py [--frames N --seeds 3 --people 5]
+
+All twins of the paper's captures at full length (or N frames), and every script by people drawn at random for
+ten seconds each. Overlaps are of the capsules that stand for flesh, and of an object's parts, as MuJoCo
+collides them; poses allow 1 mm, what skin gives way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+
+import numpy as np
+from machine import describe
+
+from gloves.take import Take
+from handsim.errors import HandSimError
+from handsim.model import HandModel
+from handsim.objects import named_object
+from handsim.shape import EVERYBODY, sample_shape
+from handsim.transforms import quaternion_matrix
+from poses.couplings import HIGH, LOW
+from poses.objects import object_penetration
+from poses.scripts import script_names, scripted_motion
+from poses.two_hands import two_hands_penetration
+from train.twins import KINDS, TwinConfig, simulate_twin
+
+SECONDS = 10.0
+
+
+def fastest(qpos: np.ndarray, rate: float) -> tuple[float, float, float]:
+    """Wrist [m/s] and [rad/s], hinges [rad/s]."""
+    turns = quaternion_matrix(qpos[:, 3:7])
+    cosine = (np.einsum("tij,tij->t", turns[1:], turns[:-1]) - 1.0) / 2.0
+    return (
+        rate * float(np.linalg.norm(np.diff(qpos[:, :3], axis=0), axis=1).max()),
+        rate * float(np.arccos(np.clip(cosine, -1.0, 1.0)).max()),
+        rate * float(np.abs(np.diff(qpos[:, 7:], axis=0)).max()),
+    )
+
+
+def out_of_range(qpos: np.ndarray) -> int:
+    angles = qpos[:, 7:]
+    return int(((angles < LOW - 1e-9) | (angles > HIGH + 1e-9)).sum())
+
+
+def overlaps(take: Take) -> tuple[float, float, float]:
+    """Deepest in themselves, between hands, and with the object [mm]."""
+    right, left = models = [HandModel(hand.shape) for hand in take.hands]
+    qpos = [hand.qpos for hand in take.hands]
+    own = max(model.penetration(values).max() for model, values in zip(models, qpos, strict=True))
+    between = two_hands_penetration(right, left, *qpos).max()
+    thing = 0.0
+    if take.body is not None:
+        poses, held = take.body.T_world_body, named_object(take.body.name)
+        thing = max(
+            object_penetration(model, held, values, poses).max()
+            for model, values in zip(models, qpos, strict=True)
+        )
+    return 1e3 * own, 1e3 * between, 1e3 * thing
+
+
+def twins(frames: int | None, seeds: int) -> None:
+    print(
+        "\ntwins: deepest overlap [mm] of a hand in itself, hand in hand, hand in object; angles out of "
+        "range;"
+    )
+    print(
+        "fastest wrist [m/s], [rad/s] and hinge [rad/s]; farthest wrist from the room's middle, an axis [m]"
+    )
+    for kind, seed in itertools.product(KINDS, range(seeds)):
+        take = simulate_twin(TwinConfig(kind=kind, num_frames=frames, seed=seed))
+        own, between, thing = overlaps(take)
+        outside = sum(out_of_range(hand.qpos) for hand in take.hands)
+        speeds = np.max([fastest(hand.qpos, take.rate) for hand in take.hands], axis=0)
+        reach = max(np.abs(hand.qpos[:, :3] - [0.0, 0.0, 1.1]).max() for hand in take.hands)
+        print(
+            f"  {kind:16s} seed {seed}, {take.num_frames} frames: {own:.3f}, {between:.3f}, {thing:.3f}; "
+            f"{outside}; {speeds[0]:.2f}, {speeds[1]:.1f}, {speeds[2]:.1f}; {reach:.2f}"
+        )
+
+
+def scripts(people: int) -> None:
+    print(
+        f"\nscripts, {people} people, {SECONDS:g} s each: deepest overlap [mm], angles out of range, "
+        "fastest hinge"
+    )
+    for name in script_names():
+        deepest, outside, speed, failed = 0.0, 0, 0.0, 0
+        for person in range(people):
+            rng = np.random.default_rng(person)
+            model = HandModel(sample_shape(EVERYBODY, side="right" if person % 2 else "left", rng=rng))
+            try:
+                motion = scripted_motion(model, name, SECONDS, rng=rng)
+            except HandSimError:
+                failed += 1
+                continue
+            deepest = max(deepest, 1e3 * model.penetration(motion.qpos).max())
+            outside += out_of_range(motion.qpos)
+            speed = max(speed, fastest(motion.qpos, motion.rate)[2])
+        unable = f"; {failed} people cannot" if failed else ""
+        print(f"  {name:20s} {deepest:.3f}, {outside}, {speed:.1f}{unable}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--frames", type=int, default=None)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--people", type=int, default=5)
+    arguments = parser.parse_args()
+    print(describe("mujoco", "numba", "scipy"))
+    twins(arguments.frames, arguments.seeds)
+    scripts(arguments.people)
+
+
+if __name__ == "__main__":
+    main()
