@@ -11,7 +11,6 @@ import torch
 from gloves.captures import read_capture
 from gloves.take import load_take
 from handsim.cli import main
-from train.take_commands import markers_present
 from train.twins import KINDS, TWINS
 
 FRAMES = 60
@@ -56,7 +55,7 @@ def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, 
     assert main(["simulate", "--num-frames", "20", "--out", str(tmp_path / "text.trc"), "--seed", "4"]) == 0
     trc, truth = read_capture(tmp_path / "text.trc"), load_take(tmp_path / "text.truth.npz")
     np.testing.assert_allclose(trc.positions, truth.points, atol=1e-6)
-    present = markers_present(truth)
+    present = truth.markers_present()
     assert present.shape == (20, 38) and present.mean() > 0.8
 
 
