@@ -3,8 +3,9 @@
     python benchmarks/generation.py [--frames 170330]
 
 The floor of a frame is what cannot be left out: its rays, 19 markers x 16 cameras, each against 21 capsules,
-and its row on the disk. Then come the stages of `train.synthesis` one by one, a new person every 128 frames,
-in microseconds of processor time a frame, and `handsim generate` whole with one worker and with two.
+and its row on the disk. Then come the stages of `train.synthesis` for a hand alone, a new person every 128
+frames, in microseconds of processor time a frame, and `handsim generate` whole: single hands with one worker
+and with two, then the default mix of hands alone, together and holding something.
 """
 
 from __future__ import annotations
@@ -23,11 +24,13 @@ from machine import describe
 from gloves.attach import wear
 from gloves.ghosts import sample_ghosts
 from gloves.layout import load_layout
+from gloves.optics import reconstruct
 from gloves.visibility import free_rays, pack_cameras, visible_cameras
 from handsim.cameras import named_rig
 from handsim.model import join_qpos
 from handsim.transforms import random_quaternions
 from poses.validity import sample_valid_angles
+from train.scenes import SceneMix
 from train.shards import row_dtype
 from train.synthesis import DatasetConfig, generate_dataset, sample_hands
 
@@ -73,11 +76,14 @@ def one_hand(watch: Stopwatch, rng: np.random.Generator) -> None:
         markers, normals = attachment.markers(model, bones)
         segments, radii = model.capsules.posed(bones), model.capsules.radii
     with watch.stage("sight: rays, facing, field of view"):
-        pack_cameras(visible_cameras(markers, normals, rig, segments, radii))
+        seen = visible_cameras(markers, normals, rig, segments, radii)
+        pack_cameras(seen)
     with watch.stage("  of these the rays alone"):
         free_rays(markers, rig.positions, segments, radii)
     with watch.stage("ghosts: mirror images and strays"):
         sample_ghosts(markers, rig, segments, radii, CONFIG.ghosts, min_cameras=2, rng=rng)
+    with watch.stage("optics: blobs, triangulation, false points"):
+        reconstruct(markers, seen, rig, CONFIG.optics, continuous=False, rng=rng)
 
 
 def stages() -> dict[str, float]:
@@ -105,14 +111,20 @@ def main() -> None:
     for name, microseconds in parts.items():
         print(f"  {name:40s} {microseconds:6.1f} us/frame")
     print(f"  {'sum':40s} {sum(parts.values()) - kernel:6.1f} us/frame")
-    for workers in (1, 2):
+    single = SceneMix(alone=1.0, together=0.0, holding=0.0)
+    for name, scenes, workers in (
+        ("single hands", single, 1),
+        ("single hands", single, 2),
+        ("the mix", SceneMix(), 2),
+    ):
         with tempfile.TemporaryDirectory() as folder:
+            config = DatasetConfig(num_frames=frames, scenes=scenes)
             start, busy = time.perf_counter(), sum(os.times()[:4])
-            generate_dataset(DatasetConfig(num_frames=frames), Path(folder) / "set", workers=workers)
+            generate_dataset(config, Path(folder) / "set", workers=workers)
             seconds, busy = time.perf_counter() - start, sum(os.times()[:4]) - busy  # workers' time too
         print(
-            f"{workers} worker(s): {frames:,} frames in {seconds:.1f} s, {frames / seconds:,.0f} frames/s; "
-            f"{frames / busy:,.0f} frames a second of processor time"
+            f"{name}, {workers} worker(s): {frames:,} frames in {seconds:.1f} s, {frames / seconds:,.0f} "
+            f"frames/s; {frames / busy:,.0f} frames a second of processor time"
         )
 
 

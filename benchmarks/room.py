@@ -31,7 +31,7 @@ from handsim.model import join_qpos
 from handsim.transforms import random_quaternions
 from poses.validity import sample_valid_angles
 from train.room import _SKINS, Room
-from train.synthesis import DatasetConfig, sample_hand
+from train.synthesis import DatasetConfig, sample_hands
 from train.twins import TWINS, TwinConfig, _cast, simulate_twin
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
