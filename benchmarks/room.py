@@ -81,7 +81,7 @@ def one_hand(frames: int, seed: int, watch: Stopwatch) -> None:
 
     count = PEOPLE.frames_per_hand
     for _ in range(frames // count):
-        model = timed("people", lambda: sample_hand(PEOPLE.population, rng=rng))
+        model = timed("people", lambda: sample_hands(PEOPLE.population, rng=rng)[0])
         glove = timed("gloves", lambda model=model: wear(layout, model, along=0.1, around=0.17, rng=rng))
         angles = timed("poses", lambda model=model: sample_valid_angles(model, count, rng=rng))
         qpos = join_qpos(
