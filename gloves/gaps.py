@@ -36,11 +36,16 @@ def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
     )
 
 
-def run_lengths(flags: Bool[np.ndarray, "T M"]) -> Int[np.ndarray, "G"]:
-    """Lengths of all unbroken stretches of True, column by column [frames]."""
+def run_lengths(flags: Bool[np.ndarray, "T M"], *, inside: bool = False) -> Int[np.ndarray, "G"]:
+    """Lengths of all unbroken stretches of True, column by column [frames].
+
+    Args:
+        flags: For instance, where markers are missing.
+        inside: Leave out stretches that touch the first or the last frame: nobody knows how long they are.
+    """
     padded = np.zeros((len(flags) + 2, flags.shape[1]), dtype=np.int8)
     padded[1:-1] = flags
     steps = np.diff(padded, axis=0).T
     begins, ends = np.nonzero(steps == 1)[1], np.nonzero(steps == -1)[1]
     lengths: np.ndarray = ends - begins
-    return lengths
+    return lengths[(begins > 0) & (ends < len(flags))] if inside else lengths

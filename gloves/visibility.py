@@ -80,12 +80,6 @@ def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
     return packed
 
 
-def seen_by_enough(packed: NDArray[np.uint32], min_cameras: int) -> Bool[np.ndarray, "*batch"]:
-    """Which packed markers exist for the system: those that at least `min_cameras` see."""
-    enough: NDArray[np.bool_] = np.bitwise_count(packed) >= min_cameras
-    return enough
-
-
 def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndarray, "*batch C"]:
     """Inverse of `pack_cameras`."""
     bits: NDArray[np.bool_] = (packed[..., None] >> np.arange(num_cameras, dtype=np.uint32)) & 1 == 1

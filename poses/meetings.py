@@ -13,7 +13,7 @@ from handsim.model import HandModel, join_qpos
 from handsim.transforms import rotation_quaternions
 from poses.bringing_together import NEAREST, close_fingers, first_contact, smooth_above
 from poses.interactions import Meeting, draw_meeting, draw_variant
-from poses.motions import minimum_jerk
+from poses.pace import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
 from poses.validity import is_valid, sample_valid_angles
 
 if TYPE_CHECKING:
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 
 MAX_OVERLAP: Final = 0.001
 """How deep two hands may press into each other [m]."""
-PEAK_SPEED: Final = 1.875
-"""Of the minimum-jerk profile, in distances per duration."""
-_PEAK_ACCELERATION: Final = 5.7735  # in distances per duration squared
 _TURNING: Final = 8.0  # fastest turn of one hand against the other [rad/s]
 _CONTACT_WINDOW: Final = 0.12  # over which backing off is smoothed [s]
 _FINGER_WINDOW: Final = 0.35  # over which closing fingers are smoothed [s]
@@ -253,7 +250,7 @@ def _straight(start: Passage, end: Passage, config: TwoHandConfig, rng: np.rando
     seconds = max(
         rng.uniform(*config.approach),
         PEAK_SPEED * bend / config.max_speed,
-        np.sqrt(_PEAK_ACCELERATION * bend / config.max_acceleration),
+        np.sqrt(PEAK_ACCELERATION * bend / config.max_acceleration),
         PEAK_SPEED * (turns[0].inv() * turns[1]).magnitude() / _TURNING,
         PEAK_SPEED * 0.5 * float(np.linalg.norm(end.position - start.position)) / config.wrist_speed,
     )

@@ -10,17 +10,16 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_array
 from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.motion import HandMotion
 from handsim.topology import NUM_JOINTS
-from handsim.transforms import random_quaternions
 from poses.detours import way_to_rest
 from poses.pace import MotionConfig, held, minimum_jerk, straight_way
 from poses.validity import MAX_PENETRATION, is_valid, resting_angles, sample_valid_angles
+from poses.wrists import free_wrist_path
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -144,30 +143,5 @@ def with_wrist(
     angles: Float[np.ndarray, "T 20"], config: MotionConfig, *, rng: np.random.Generator
 ) -> HandMotion:
     """The motion of these hinge angles [rad] by a hand whose wrist goes from place to place."""
-    position, quaternion = _wrist_path(len(angles), config, rng)
+    position, quaternion = free_wrist_path(len(angles), config, rng=rng)
     return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)
-
-
-def _wrist_path(
-    frames: int, config: MotionConfig, rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions (T, 3) and orientations (T, 4) of a wrist that goes from place to place."""
-    places, turns, shares = [_place(config, rng)], [random_quaternions(1, rng=rng)[0]], [np.zeros(1)]
-    while sum(map(len, shares)) < frames:
-        places.append(_place(config, rng))
-        turn = Rotation.from_rotvec(rng.normal(scale=0.6, size=3)).as_quat(scalar_first=True)
-        earlier = Rotation.from_quat(turns[-1], scalar_first=True)
-        turns.append((earlier * Rotation.from_quat(turn, scalar_first=True)).as_quat(scalar_first=True))
-        steps = int(rng.uniform(*config.wrist_time) * config.rate) + 1
-        shares.append(len(places) - 2 + minimum_jerk(steps))
-    progress = np.concatenate(shares)[:frames]
-    keys = np.arange(len(places))
-    position = np.stack([np.interp(progress, keys, axis) for axis in np.array(places).T], axis=1)
-    slerp = Slerp(keys, Rotation.from_quat(np.array(turns), scalar_first=True))
-    orientation: NDArray[np.float64] = slerp(progress).as_quat(scalar_first=True)
-    return position, orientation
-
-
-def _place(config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    centre: NDArray[np.float64] = np.array([0.0, 0.0, 1.1])
-    return centre + rng.uniform(-config.volume, config.volume, size=3)

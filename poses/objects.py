@@ -19,7 +19,8 @@ from poses.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_scene, o
 from poses.grasping import Hold, settle_hold, why_not_held
 from poses.held_poses import Held, between, is_held_valid, sample_held_poses, turn_between
 from poses.hold_library import HoldStyle, hold_names, hold_style
-from poses.motions import MotionConfig, _wrist_path, minimum_jerk
+from poses.pace import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, minimum_jerk
+from poses.wrists import free_wrist_path
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,8 +42,6 @@ _SHIFTS: Final = 0.15  # how often the thing shifts in the hand
 _LOOSEST: Final = 0.003  # [m] between the thing and the digits that hold it, while it shifts
 _SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the thing in the hand [m/s], [rad/s]
 _MARGIN: Final = 0.9  # of the fastest and of the largest acceleration, for the steps between frames
-_PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
-_PEAK_ACCELERATION: Final = 5.7735  # in distances per duration squared
 
 
 def sample_object_motion(
@@ -80,7 +79,7 @@ def sample_object_motion(
         parts.append(part)
         count += len(part.angles)
     angles, held = (np.concatenate(rows)[:frames] for rows in zip(*parts, strict=True))
-    position, quaternion = _wrist_path(frames, config, rng)
+    position, quaternion = free_wrist_path(frames, config, rng=rng)
     position = position + _scribble(frames, player.style.scribble, config.rate, rng=rng)
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
     return HandMotion(qpos, config.rate), BodyMotion(wrist_poses(qpos) @ held, config.rate)
@@ -120,10 +119,10 @@ class _Player:
         config = self.config
         distance = np.abs(target.angles - start.angles).max()
         quickest = max(
-            _PEAK_SPEED * distance / (_MARGIN * config.max_speed),
-            np.sqrt(_PEAK_ACCELERATION * distance / (_MARGIN * config.max_acceleration)),
-            _PEAK_SPEED * float(np.linalg.norm((target.poses - start.poses)[0, :3, 3])) / _SLIDING,
-            _PEAK_SPEED * float(np.linalg.norm(turn_between(start, target)[0])) / _ROLLING,
+            PEAK_SPEED * distance / (_MARGIN * config.max_speed),
+            np.sqrt(PEAK_ACCELERATION * distance / (_MARGIN * config.max_acceleration)),
+            PEAK_SPEED * float(np.linalg.norm((target.poses - start.poses)[0, :3, 3])) / _SLIDING,
+            PEAK_SPEED * float(np.linalg.norm(turn_between(start, target)[0])) / _ROLLING,
         )
         frames = int(np.ceil(max(quickest, self.rng.uniform(*config.durations)) * config.rate)) + 1
         return between(start, target, minimum_jerk(frames))

@@ -11,8 +11,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
-_PEAK_ACCELERATION: Final = 5.7735  # in distances per duration squared
+PEAK_SPEED: Final = 1.875
+"""Of the minimum-jerk profile, in distances per duration."""
+PEAK_ACCELERATION: Final = 5.7735
+"""The same, in distances per duration squared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +50,8 @@ def straight_way(
     """Frames from one pose (left out) to another, as quick as drawn and no quicker than the limits allow."""
     distance = np.abs(target - start).max()
     quickest = max(
-        _PEAK_SPEED * distance / config.max_speed,
-        np.sqrt(_PEAK_ACCELERATION * distance / config.max_acceleration),
+        PEAK_SPEED * distance / config.max_speed,
+        np.sqrt(PEAK_ACCELERATION * distance / config.max_acceleration),
     )
     frames = int(np.ceil(max(quickest, rng.uniform(*config.durations)) * config.rate)) + 1
     return start + minimum_jerk(frames)[:, None] * (target - start)

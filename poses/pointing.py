@@ -15,7 +15,7 @@ from handsim.motion import BodyMotion, HandMotion
 from handsim.objects import RigidObject
 from handsim.transforms import axis_angle_matrix
 from poses.grasp_scene import object_penetration, pose_to_qpos, wrist_poses
-from poses.motions import minimum_jerk
+from poses.pace import PEAK_SPEED, minimum_jerk
 from poses.validity import MAX_PENETRATION
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ _ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
 _CONE: Final = 1.2  # farthest that the pen leans from upright [rad]
 _MOST_LEAN: Final = 1.0  # as a tangent
 _BEHIND: Final = -0.2  # places that look away from the pen by more, as a cosine, are not pointed at
-_PEAK_SPEED: Final = 1.875  # of the minimum-jerk profile, in distances per duration
 _MOST_RETREATS: Final = 12
 _STEADY: Final = 0.15  # [s] over which the pen follows what its places look at, standard deviation
 _RETREAT_STEP: Final = 0.003  # [m] beyond what is asked for
@@ -123,8 +122,8 @@ def _plan(
         turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
         seconds = max(
             rng.uniform(*config.way),
-            _PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / config.speed,
-            _PEAK_SPEED * turn / config.turning,
+            PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / config.speed,
+            PEAK_SPEED * turn / config.turning,
         )
         stay = np.zeros(max(1, round(rng.uniform(*config.stay) * rate)))
         share = np.concatenate([stay, minimum_jerk(max(2, int(np.ceil(seconds * rate))))])

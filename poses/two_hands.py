@@ -20,7 +20,6 @@ from handsim.motion import HandMotion
 from handsim.transforms import random_quaternions, rotation_quaternions
 from poses.interactions import INTERACTIONS, check_names
 from poses.meetings import (
-    PEAK_SPEED,
     Passage,
     TwoHandConfig,
     draw_poses,
@@ -28,7 +27,7 @@ from poses.meetings import (
     play_meeting,
     way_between,
 )
-from poses.motions import minimum_jerk
+from poses.pace import PEAK_SPEED, minimum_jerk
 
 if TYPE_CHECKING:
     from jaxtyping import Float

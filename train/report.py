@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from gloves.gaps import run_lengths
 from handsim._page import Section, write_page
 from handsim.cameras import load_rig
 from handsim.errors import DatasetError
@@ -84,7 +85,7 @@ def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
         )
     if not 0.0 < rate < np.inf:
         raise DatasetError(f"rate is {rate:g} Hz, wanted a positive number")
-    lengths = gap_lengths(present)
+    lengths = run_lengths(~present, inside=True)
     frames, markers = present.shape
     text = (
         f"A continuous take of {frames:,} frames at {rate:g} Hz. Of its {markers} markers "
@@ -155,18 +156,6 @@ def neighbour_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M
         apart[:, range(markers.shape[1]), range(markers.shape[1])] = np.inf
         parts.append(apart.min(axis=-1))
     return np.concatenate(parts).astype(np.float64)
-
-
-def gap_lengths(present: Bool[np.ndarray, "T M"]) -> Int[np.ndarray, "G"]:
-    """Lengths of the runs of frames without a marker, marker by marker [frames].
-
-    Runs at the take's ends are left out: nobody knows how long they are.
-    """
-    absent = np.pad(~present.T, ((0, 0), (1, 1))).astype(np.int8)
-    change = np.diff(absent, axis=1)
-    start, end = np.nonzero(change == 1)[1], np.nonzero(change == -1)[1]
-    lengths: NDArray[np.int64] = (end - start)[(start > 0) & (end < len(present))]
-    return lengths
 
 
 def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section:

@@ -16,7 +16,7 @@ from gloves.optics import OpticsConfig, reconstruct
 from gloves.strays import StrayConfig, sample_strays
 from gloves.take import GlovedHand, HeldBody, Take
 from gloves.visibility import facing_cameras, free_rays
-from handsim.cameras import CameraRig
+from handsim.cameras import CameraRig, check_outside
 from handsim.model import HandModel
 from handsim.motion import BodyMotion, HandMotion
 from handsim.objects import RigidObject
@@ -136,8 +136,13 @@ class Room:
         return Take(self.rate, points, ids, truth, hands, body, settings)
 
     def sources(self, *, rng: np.random.Generator) -> Sources:
-        """All that shines, and which cameras have a free view of it."""
+        """All that shines, and which cameras have a free view of it.
+
+        Raises:
+            ShapeError: A camera stands in the hands.
+        """
         markers, _ = self.markers
+        check_outside(self.rig, markers)
         labels = np.arange(markers.shape[1])
         if self.prop is not None and len(self.prop.thing.markers) < _FEWEST_OF_A_BODY:
             labels[len(labels) - len(self.prop.thing.markers) :] = -1  # points like any other: ghosts

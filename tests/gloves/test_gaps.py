@@ -25,3 +25,10 @@ def test_a_capture_without_gaps() -> None:
 def test_all_missing_is_one_gap() -> None:
     counts = count_gaps(np.zeros((5, 2), dtype=bool))
     assert (counts.gaps, counts.average_length, counts.average_missing) == (1, 5.0, 2.0)
+
+
+def test_gaps_that_begin_and_end_inside_are_measured():
+    columns = ["1111111111", "0110010111", "1000110100", "1010101011", "0000000000"]
+    present = np.array([[letter == "1" for letter in column] for column in columns]).T
+    assert run_lengths(~present, inside=True).tolist() == [2, 1] + [3, 1] + [1, 1, 1, 1]
+    assert run_lengths(np.zeros((5, 2), bool), inside=True).tolist() == []

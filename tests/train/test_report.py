@@ -78,13 +78,6 @@ def test_nearest_neighbours(rows, monkeypatch):
     np.testing.assert_allclose(apart, [[0.03, 0.03, 0.04]] * 3 + [[0.01, 0.01, 0.06]], rtol=1e-6)
 
 
-def test_gaps_that_begin_and_end_inside_are_measured():
-    columns = ["1111111111", "0110010111", "1000110100", "1010101011", "0000000000"]
-    present = np.array([[letter == "1" for letter in column] for column in columns]).T
-    assert report.gap_lengths(present).tolist() == [2, 1] + [3, 1] + [1, 1, 1, 1]
-    assert report.gap_lengths(np.ones((5, 2), bool)).tolist() == []
-
-
 def test_a_take_with_gaps_is_drawn_beside_the_published_figures(dataset, tmp_path):
     present = np.ones((1000, 2), bool)
     present[100:103, 0] = present[200:240, 1] = present[:7, 1] = False

@@ -15,7 +15,8 @@ from gloves.layout import load_layout
 from gloves.optics import OpticsConfig
 from gloves.strays import StrayConfig
 from gloves.visibility import MAX_FACING
-from handsim.cameras import named_rig
+from handsim.cameras import CameraRig, look_at, named_rig
+from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.motion import BodyMotion, HandMotion
 from handsim.objects import RigidObject, named_object
@@ -198,3 +199,12 @@ def test_losses_cost_markers(rng):
         kept.append(np.isfinite(take.observed(range(38))[..., 0]).mean())
     assert kept[0] > kept[1] + 0.01
     assert kept[0] > kept[2] + 0.05
+
+
+def test_a_camera_in_the_hands_is_refused(rng):
+    room = two_hands()
+    middle = room.markers[0][0, 0]
+    poses = np.stack([look_at(middle + [0.0, 0.0, 0.01], middle), look_at(middle + [0.0, 1.5, 0.5], middle)])
+    near = Room(room.actors, None, CameraRig("near", poses, field_of_view=1.0), room.config)
+    with pytest.raises(ShapeError, match="camera 1 of rig 'near' is 0.01 m from the hand"):
+        near.take({}, rng=rng)
