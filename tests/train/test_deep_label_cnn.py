@@ -119,20 +119,23 @@ def test_matching_counts_distances_not_their_squares():
 
 
 def test_network_learns_a_few_clouds_by_heart(rng):
-    """Random clouds share nothing but their mean, so a loss this low is read off the images."""
-    points = rng.uniform(-0.1, 0.1, size=(32, 19, 3))
-    present = np.ones((32, 19), dtype=bool)
+    """Random clouds share nothing but their mean, so a loss this low is read off the images.
+
+    One answer to all of them would take an eighth off the first loss at best.
+    """
+    points = rng.uniform(-0.1, 0.1, size=(8, 19, 3))
+    present = np.ones((8, 19), dtype=bool)
     images, frames = depth_images(points, present, view_rotations(points, present, policy="random", rng=rng))
     inputs = torch.from_numpy(images)[:, None]
     targets = torch.from_numpy(frames.normalise(points)).float()
     torch.manual_seed(0)
     network = DeepLabelCNN(19)
-    optimizer = torch.optim.Adam(network.parameters(), lr=1e-4)
+    optimizer = torch.optim.Adam(network.parameters(), lr=5e-5)
     losses = []
-    for _ in range(8):
+    for _ in range(12):
         loss = position_loss(network(inputs), targets, torch.from_numpy(present))
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    assert losses[-1] < losses[0] / 2
+    assert losses[-1] < losses[0] / 5
