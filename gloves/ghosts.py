@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 MAX_GHOSTS: Final = 4
 """Ghosts kept a frame; what is more is dropped at random."""
+GHOST_REACH: Final = 0.1
+"""A ghost farther from every marker of a hand [m] is not in its cloud; the paper clusters at 200 mm."""
 
 
 @dataclass(frozen=True, slots=True)

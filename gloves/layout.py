@@ -10,14 +10,13 @@ from __future__ import annotations
 import json
 import math
 import textwrap
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from handsim.errors import LayoutError, choices
-from handsim.io import atomic_write
+from handsim.io import atomic_write, read_toml
 from handsim.topology import BONE_NAMES, BONES, DIGITS, PALM
 
 FEWEST_MARKERS: Final = 5
@@ -147,16 +146,9 @@ def load_layout(name_or_path: str | Path) -> MarkerLayout:
     elif path.suffix.lower() != ".toml":
         unknown = choices(str(name_or_path), list_layouts(), noun="glove")
         raise LayoutError(f"{unknown}, or the path of a .toml file")
+    table = read_toml(path, error=LayoutError)
     try:
-        return _parse_layout(tomllib.loads(path.read_text("utf-8")))
-    except OSError as error:
-        raise LayoutError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise LayoutError(f"{path}: not a TOML file: it is not UTF-8 text") from error
-    except ValueError as error:
-        raise LayoutError(f"{path}: not a TOML file: {error}") from error
-    except RecursionError as error:
-        raise LayoutError(f"{path}: not a TOML file: brackets are nested too deep") from error
+        return _parse_layout(table)
     except LayoutError as error:
         raise LayoutError(f"{path}: {error}") from error
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from handsim.errors import HandSimError
 
 
 @contextmanager
@@ -49,3 +53,22 @@ def _flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Args:
+        path: The file.
+        error: What to raise, in one sentence, when it cannot be read or is no TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+    except UnicodeDecodeError as cause:
+        raise error(f"{path}: not a TOML file: it is not UTF-8 text") from cause
+    except ValueError as cause:
+        raise error(f"{path}: not a TOML file: {cause}") from cause
+    except RecursionError as cause:
+        raise error(f"{path}: not a TOML file: brackets are nested too deep") from cause

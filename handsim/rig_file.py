@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from handsim.errors import ShapeError, choices
+from handsim.io import read_toml
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -38,16 +38,9 @@ def read_rig_file(path: Path) -> RigTable:
     Raises:
         ShapeError: It cannot be read, is damaged, or a key is missing, unknown or of another kind.
     """
+    table = read_toml(path, error=ShapeError)
     try:
-        return _parse(tomllib.loads(path.read_text("utf-8")))
-    except OSError as error:
-        raise ShapeError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise ShapeError(f"{path}: not a TOML file: it is not UTF-8 text") from error
-    except ValueError as error:
-        raise ShapeError(f"{path}: not a TOML file: {error}") from error
-    except RecursionError as error:
-        raise ShapeError(f"{path}: not a TOML file: brackets are nested too deep") from error
+        return _parse(table)
     except ShapeError as error:
         raise ShapeError(f"{path}: {error}") from error
 

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
+from handsim.cameras import ROOM_CENTRE
 from handsim.contact import overlap_between
 from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
@@ -28,6 +29,7 @@ from poses.meetings import (
     way_between,
 )
 from poses.pace import PEAK_SPEED, minimum_jerk
+from poses.wrists import along
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -41,7 +43,6 @@ __all__ = [
     "two_hands_penetration",
 ]
 
-_CENTRE: Final = np.array([0.0, 0.0, 1.1])  # [m], z upwards
 _TRAVEL_TIME: Final = (0.8, 2.5)  # between two places of the pair [s]
 _TURN: Final = 0.5  # spread of the turn between two places [rad]
 _MOST_DRAWS: Final = 60
@@ -139,7 +140,7 @@ def sample_two_hand_poses(
             whole = join_passages(passages)
             whole = whole.at(rng.permutation(len(whole))[:count])
             volume = TwoHandConfig().volume
-            places = _CENTRE + rng.uniform(-volume, volume, size=(count, 3))
+            places = ROOM_CENTRE + rng.uniform(-volume, volume, size=(count, 3))
             return _in_world(whole, places, Rotation.from_quat(random_quaternions(count, rng=rng)))
     raise ShapeError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
 
@@ -172,18 +173,15 @@ def _travel(
     frames: int, config: TwoHandConfig, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], Rotation]:
     """Positions (T, 3) and orientations of a pair of hands that goes from place to place."""
-    places = [_CENTRE + rng.uniform(-config.volume, config.volume, size=3)]
+    places = [ROOM_CENTRE + rng.uniform(-config.volume, config.volume, size=3)]
     turns, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
     while sum(map(len, shares)) < frames:
-        places.append(_CENTRE + rng.uniform(-config.volume, config.volume, size=3))
+        places.append(ROOM_CENTRE + rng.uniform(-config.volume, config.volume, size=3))
         turns.append(turns[-1] * Rotation.from_rotvec(rng.normal(scale=_TURN, size=3)))
         distance = float(np.linalg.norm(places[-1] - places[-2]))
         seconds = max(rng.uniform(*_TRAVEL_TIME), PEAK_SPEED * distance / config.wrist_speed)
         shares.append(len(places) - 2 + minimum_jerk(int(np.ceil(seconds * config.rate))))
-    progress = np.concatenate(shares)[:frames]
-    keys = np.arange(len(places))
-    position = np.stack([np.interp(progress, keys, axis) for axis in np.array(places).T], axis=1)
-    return position, Slerp(keys, Rotation.concatenate(turns))(progress)
+    return along(np.array(places), Rotation.concatenate(turns), np.concatenate(shares)[:frames])
 
 
 def _in_world(

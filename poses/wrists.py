@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from handsim.cameras import ROOM_CENTRE
 from handsim.transforms import random_quaternions
 from poses.pace import MotionConfig, minimum_jerk
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_CENTRE: Final = np.array([0.0, 0.0, 1.1])
 _FREE_TURN: Final = 0.6  # from place to place, standard deviation about each axis [rad]
 _FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """Fingers along +y, back of the hand up."""
@@ -25,7 +25,7 @@ _FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 class WristConfig:
     """Where the wrist of somebody at a table goes and how it turns."""
 
-    centre: tuple[float, float, float] = (0.0, 0.0, 1.1)
+    centre: tuple[float, float, float] = ROOM_CENTRE
     """Middle of the cube it moves in [m]."""
     volume: float = 0.3
     """Half side of that cube [m]."""
@@ -48,7 +48,7 @@ def free_wrist_path(
         steps = int(rng.uniform(*config.wrist_time) * config.rate) + 1
         shares.append(len(places) - 2 + minimum_jerk(steps))
     turned = Rotation.from_quat(np.array(turns), scalar_first=True)
-    return _along(np.array(places), turned, np.concatenate(shares)[:frames])
+    return _quaternions(along(np.array(places), turned, np.concatenate(shares)[:frames]))
 
 
 def wrist_path(
@@ -62,19 +62,26 @@ def wrist_path(
     count = len(shares)
     places = config.centre + rng.uniform(-config.volume, config.volume, size=(count, 3))
     away = Rotation.from_rotvec(rng.normal(scale=config.turning, size=(count, 3)))
-    return _along(places, away * Rotation.from_matrix(_FORWARD), np.concatenate(shares)[:frames])
+    turns = away * Rotation.from_matrix(_FORWARD)
+    return _quaternions(along(places, turns, np.concatenate(shares)[:frames]))
 
 
-def _along(
-    places: NDArray[np.float64], turns: Rotation, progress: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def along(
+    places: Float[np.ndarray, "K 3"], turns: Rotation, progress: Float[np.ndarray, "T"]
+) -> tuple[Float[np.ndarray, "T 3"], Rotation]:
     """Between places and turns, `progress` counting the places left behind."""
     keys = np.arange(len(places))
     position = np.stack([np.interp(progress, keys, axis) for axis in places.T], axis=1)
-    orientation: NDArray[np.float64] = Slerp(keys, turns)(progress).as_quat(scalar_first=True)
-    return position, orientation
+    return position, Slerp(keys, turns)(progress)
+
+
+def _quaternions(
+    path: tuple[NDArray[np.float64], Rotation],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    position, turns = path
+    return position, turns.as_quat(scalar_first=True)
 
 
 def _place(config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    place: NDArray[np.float64] = _CENTRE + rng.uniform(-config.volume, config.volume, size=3)
+    place: NDArray[np.float64] = ROOM_CENTRE + rng.uniform(-config.volume, config.volume, size=3)
     return place

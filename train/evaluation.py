@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gloves.ghosts import GHOST_REACH
 from gloves.take import Take
 from handsim.errors import CaptureError
 from train.augmentation import Corruption, corrupt
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _CHUNK: Final = 4096
-GHOST_REACH: Final = 0.1
-"""A ghost farther from every marker of a hand [m] is not in its cloud; the paper clusters at 200 mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from gloves.attach import Attachment
-from gloves.ghosts import GhostConfig, keep_some, sample_ghosts
+from gloves.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
 from gloves.mesh_sight import MeshTree, clear_of_body
 from gloves.optics import OpticsConfig, reconstruct
 from gloves.visibility import pack_cameras, visible_cameras
@@ -18,7 +18,8 @@ from handsim.cameras import ROOM_CENTRE, CameraRig
 from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.objects import RigidObject, named_object, object_names
-from handsim.transforms import quaternion_matrix, random_quaternions
+from handsim.transforms import random_quaternions
+from poses.grasp_scene import wrist_poses
 from poses.objects import sample_held_poses, settle_hold
 from poses.samplers import PoseMix
 from poses.two_hands import sample_two_hand_poses
@@ -26,8 +27,6 @@ from poses.validity import sample_valid_angles
 
 if TYPE_CHECKING:
     from jaxtyping import Float
-
-_REACH: Final = 0.1  # a false point farther from every marker of a hand [m] is none of its ghosts
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +92,8 @@ def holding(hand: HandModel, count: int, volume: float, *, rng: np.random.Genera
     angles, T_wrist_thing = sample_held_poses(hand, thing, settle_hold(hand, thing, rng=rng), count, rng=rng)
     position = ROOM_CENTRE + rng.uniform(-volume, volume, size=(count, 3))
     quaternion = random_quaternions(count, rng=rng)
-    T_world_wrist = np.tile(np.eye(4), (count, 1, 1))
-    T_world_wrist[:, :3, :3], T_world_wrist[:, :3, 3] = quaternion_matrix(quaternion), position
     qpos = join_qpos(angles, position=position, quaternion=quaternion)
-    return Scene((hand,), (qpos,), thing, T_world_wrist @ T_wrist_thing)
+    return Scene((hand,), (qpos,), thing, wrist_poses(qpos) @ T_wrist_thing)
 
 
 def watch(
@@ -124,7 +121,7 @@ def watch(
         mine = slice(number * centres.shape[1], (number + 1) * centres.shape[1])
         strays = sample_ghosts(centres, rig, segments, radii, ghosts, min_cameras=optics.min_rays, rng=rng)
         off = np.linalg.norm(found.false_points[:, :, None] - centres[:, None], axis=-1).min(axis=2)
-        near = np.where((off < _REACH)[..., None], found.false_points, np.nan)
+        near = np.where((off < GHOST_REACH)[..., None], found.false_points, np.nan)
         chosen = keep_some(np.concatenate([strays, near], axis=1), rng=rng)
         sights.append(Sight(centres, cameras[:, mine], found.positions[:, mine], chosen))
     return tuple(sights)
