@@ -48,20 +48,21 @@ class SetLabeler(nn.Module):
 
     def forward(self, points: Float[Tensor, "B N 3"], present: Bool[Tensor, "B N"]) -> LabelScores:
         """Score clouds [m], padded where not `present`."""
+        batch, count, _ = points.shape
         distances = (points[:, :, None] - points[:, None]).square().sum(-1).add(1e-12).sqrt()  # (B, N, N)
         spacing = self.config.reach / (self.config.num_distances - 1)
-        bumps = torch.exp(-0.5 * ((distances[..., None] - self.centres) / spacing).square())  # (B, N, N, K)
-        pairs = (present[:, :, None] & present[:, None]).to(points.dtype)
-        count = present.sum(1).to(points.dtype)[:, None, None] / 20.0  # (B, 1, 1), about 1
-        profile = (bumps * pairs[..., None]).sum(2)
-        features = self.embed(
-            torch.cat([profile, count.expand(-1, profile.shape[1], 1)], dim=-1)
-        )  # (B, N, W)
+        offsets = distances[:, None] - self.centres[:, None, None]
+        bumps = torch.exp(offsets.square() * (-0.5 / spacing**2))  # (B, K, N, N)
+        there = present[..., None].to(points.dtype)  # (B, N, 1)
+        profile = (bumps @ there[:, None])[..., 0].transpose(1, 2)  # (B, N, K)
+        about_one = there.sum(1, keepdim=True) / 20.0
+        features = self.embed(torch.cat([profile, about_one.expand(-1, count, 1)], dim=-1))  # (B, N, W)
+        bumps = bumps.reshape(batch, self.config.num_distances, count * count)
         for message_round in self.rounds:
-            features = message_round(features, bumps, pairs)
+            features = message_round(features, bumps, there)
         features = self.norm(features)
         scores = self.to_scores(features)
-        pooled = (features * present[..., None]).sum(1) / 20.0
+        pooled = (features * there).sum(1) / 20.0
         by_label = scores[..., :-1].masked_fill(~present[..., None], -1e4).transpose(1, 2)  # (B, M, N)
         occluded = self.to_occluded(pooled)[..., None]
         return LabelScores(
@@ -88,16 +89,18 @@ class MessageRound(nn.Module):
     def forward(
         self,
         features: Float[Tensor, "B N W"],
-        bumps: Float[Tensor, "B N N K"],
-        pairs: Float[Tensor, "B N N"],
+        bumps: Float[Tensor, "B K N*N"],
+        there: Float[Tensor, "B N 1"],
     ) -> Float[Tensor, "B N W"]:
-        """Features after one exchange; `pairs` is 0 where either point is padding."""
+        """Features after one exchange; `there` is 0 for padding, which sends nothing."""
         batch, count, width = features.shape
         normed = self.norm(features)
-        receiver, sender = self.ends(normed).chunk(2, dim=-1)  # (B, N, G) each
-        gate = torch.sigmoid(self.distance_gate(bumps) + receiver[:, :, None] + sender[:, None])
-        gate = (gate * pairs[..., None]).permute(0, 3, 1, 2)  # (B, G, N, N)
-        values = self.values(normed).view(batch, count, self.gates, -1).transpose(1, 2)  # (B, G, N, W/G)
+        receiver, sender = self.ends(normed).transpose(1, 2).chunk(2, dim=1)  # (B, G, N) each
+        # Gates before points: all that is as large as the pairs then lies in memory as bmm wants it.
+        near = torch.bmm(self.distance_gate.weight.expand(batch, -1, -1), bumps).view(batch, -1, count, count)
+        biased = receiver + self.distance_gate.bias[:, None]
+        gate = torch.sigmoid(near + biased[..., None] + sender[:, :, None])  # (B, G, N, N)
+        values = (self.values(normed) * there).view(batch, count, self.gates, -1).transpose(1, 2)
         gathered = (gate @ values).transpose(1, 2).reshape(batch, count, width) / 5.0
         features = features + self.mix(gathered)
         thought: Tensor = self.think(features)
