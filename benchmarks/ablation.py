@@ -21,7 +21,8 @@ from gloves.captures import read_capture
 from gloves.captures.markers import select_markers
 from train.augmentation import Corruption
 from train.evaluation import Report, evaluate_labeler, evaluate_takes
-from train.labeler import TrainedSetLabeler, load_labeler
+from train.labeler import load_labeler
+from train.labeling import Labeler
 from train.twins import KINDS, TwinConfig, simulate_twin
 
 FIGURES = {
@@ -60,7 +61,7 @@ def main(runs: tuple[str, ...], captures: Path | None = None) -> None:
             )
 
 
-def real_markers(folder: Path, labeler: TrainedSetLabeler) -> np.ndarray:
+def real_markers(folder: Path, labeler: Labeler) -> np.ndarray:
     """All labelled frames of a folder [m]."""
     files = sorted(folder.rglob("*.trc"))
     return np.concatenate([select_markers(read_capture(file), labeler.marker_names) for file in files])

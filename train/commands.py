@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -16,17 +16,14 @@ from rich.table import Table
 from gloves.captures import READABLE, WRITABLE, read_capture, write_capture
 from gloves.captures.capture import check_suffix
 from gloves.captures.markers import labelled_capture, select_markers, unlabelled_frames
-from gloves.layout import load_layout
 from gloves.take import load_take
-from handsim.errors import CaptureError, HandSimError, WeightsError
-from train.config import TrainConfig
+from handsim.errors import CaptureError, HandSimError
+from train.config import Preset, TrainConfig, with_preset
+from train.labeler import labeler_for_glove
 from train.report import write_report
 from train.shards import Dataset, save_json
 from train.synthesis import DatasetConfig, generate_dataset
 from train.twins import TwinConfig, simulate_twin
-
-if TYPE_CHECKING:
-    from train.labeler import TrainedSetLabeler
 
 _TAKE = 1200  # frames of the continuous take that the report's gaps are from
 
@@ -62,7 +59,7 @@ def train(
     dataset: Annotated[Path, tyro.conf.Positional],
     out: Path,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")],
-    labeler: Literal["set"] = "set",
+    preset: Preset | None = None,
 ) -> None:
     """Train a labeler on a training set; run it again to go on where it was stopped.
 
@@ -70,17 +67,19 @@ def train(
         dataset: Folder that `handsim generate` wrote.
         out: Folder for the weights, the model card and the checkpoint.
         config: How to train.
-        labeler: Kind of network.
+        preset: A published recipe; options given beside it hold all the same.
     """
     from train.loop import train_labeler
 
-    del labeler  # one kind so far; the name is part of the command line's contract
+    rows = Dataset(dataset)
+    if preset is not None:
+        config = with_preset(preset, config, rows.manifest.num_frames)
     with progress_bar("samples") as (bar, task):
 
         def report(done: int, total: int, loss: float) -> None:
             bar.update(task, completed=done, total=total, description=f"loss {loss:.3f}")
 
-        card = train_labeler(Dataset(dataset), config, out, progress=report)
+        card = train_labeler(rows, config, out, progress=report)
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
     Console().print(f"weights and model card in {out}")
 
@@ -97,10 +96,10 @@ def label(
         capture: A .trc, .c3d or Motive .csv file.
         out: Labelled .trc or .c3d file; points that are no markers become columns Unlabeled1, Unlabeled2, ...
         glove: Marker layout: a shipped name or the path of a .toml file.
-        labeler: Folder of a trained labeler; the glove's shipped one when not given.
+        labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
     """
     check_suffix(out, WRITABLE)  # before the work, not after it
-    network = labeler_of(glove, labeler)
+    network = labeler_for_glove(glove, labeler)
     source = read_capture(capture)
     frames = unlabelled_frames(source)
     with progress_bar("frames") as (bar, task):
@@ -134,7 +133,7 @@ def evaluate(
     Args:
         captures: Labelled .trc, .c3d or .csv files, folders searched for them, or the .truth.npz of takes.
         glove: Marker layout: a shipped name or the path of a .toml file.
-        labeler: Folder of a trained labeler; the glove's shipped one when not given.
+        labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
         occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).
         ghosts: Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2).
         seed: Seed of the corruption.
@@ -145,7 +144,7 @@ def evaluate(
 
     if occlude < 0 or ghosts < 0:
         raise HandSimError(f"occlude is {occlude} and ghosts {ghosts}, wanted 0 or more of each")
-    network = labeler_of(glove, labeler)
+    network = labeler_for_glove(glove, labeler)
     if all(path.suffix == ".npz" for path in captures):
         if occlude or ghosts:
             raise HandSimError(
@@ -174,25 +173,6 @@ def evaluate(
         # JSON knows no NaN, which stands where there was nothing to count.
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
         save_json(json, {**settings, "figures": figures, "slot_accuracy_by_marker": by_marker})
-
-
-def labeler_of(glove: str, labeler: str | None) -> TrainedSetLabeler:
-    """The labeler asked for, checked against the glove's markers."""
-    from train.labeler import load_labeler, shipped_labelers
-
-    layout = load_layout(glove)
-    if labeler is None and glove not in shipped_labelers():
-        raise WeightsError(
-            f"no labeler comes with glove '{glove}' (shipped: {', '.join(shipped_labelers())}); train one "
-            f"with handsim generate and handsim train, and give its folder as --labeler"
-        )
-    network = load_labeler(glove if labeler is None else Path(labeler))
-    if network.marker_names != layout.names:
-        raise WeightsError(
-            f"the labeler knows markers {', '.join(network.marker_names)}, but glove '{glove}' has "
-            f"{', '.join(layout.names)}"
-        )
-    return network
 
 
 @contextmanager

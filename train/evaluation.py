@@ -13,7 +13,7 @@ from gloves.ghosts import GHOST_REACH
 from gloves.take import Take
 from handsim.errors import CaptureError
 from train.augmentation import Corruption, corrupt
-from train.labeler import Labeler
+from train.labeling import Labeler
 from train.metrics import LabelCounts
 
 if TYPE_CHECKING:

@@ -1,25 +1,31 @@
-"""The training loop, top to bottom: rows, corruption, network, two cores, resume."""
+"""The training loop, top to bottom: rows, corruption, network, resume, weights."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import pickle
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
+from lightning_fabric import Fabric
+from lightning_fabric.loggers.tensorboard import TensorBoardLogger
+from torch import nn
 
 from handsim._version import __version__
 from handsim.errors import DatasetError, WeightsError
 from handsim.io import atomic_write
-from train.augmentation import Cloud, Corruption, corrupt
+from train.augmentation import Corruption
+from train.batches import Batch, draw_batch, paper_corruption
 from train.config import TrainConfig
 from train.evaluation import evaluate_labeler
-from train.labeler import TrainedSetLabeler, save_labeler
-from train.set_labeler import SetLabeler, labeling_loss
+from train.kinds import batch_loss, labeler_of, new_network
+from train.labeler import save_network
 from train.shards import Dataset, claim
 
 if TYPE_CHECKING:
@@ -28,8 +34,8 @@ if TYPE_CHECKING:
 CHECKPOINT: Final = "checkpoint.pt"
 _CONFIG: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
-PAPER: Final = Corruption()
-
+_MOST_HELD_OUT: Final = 8192
+_CURVE: Final = 200  # points of the loss curve
 
 Progress = Callable[[int, int, float], None]
 """Called with samples done, samples wanted, and the loss."""
@@ -43,7 +49,7 @@ def train_labeler(
     progress: Progress | None = None,
     save_every: float = 60.0,
 ) -> dict[str, Any]:
-    """Train the set labeler and leave weights and model card in `out`; goes on from a checkpoint there.
+    """Train a labeler and leave weights, model card and curves in `out`; goes on from a checkpoint there.
 
     Raises:
         DatasetError: The set is too small to train on.
@@ -52,24 +58,26 @@ def train_labeler(
     torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
     names = dataset.marker_names
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, num_labels=len(names)))
-    settings = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
-    claim(out / _CONFIG, settings, noun="training run", error=WeightsError)
     rows = dataset.rows()
-    held_out = max(1, int(_HELD_OUT * len(rows)))
+    held_out = min(_MOST_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
     if len(rows) - held_out < config.batch:
         raise DatasetError(
             f"{dataset.path} has {len(rows)} frames, wanted at least {config.batch + held_out + 1}"
         )
+    fabric = _fabric(config, out)
+    settings = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
+    with fabric.rank_zero_first():
+        claim(out / _CONFIG, settings, noun="training run", error=WeightsError)
     torch.manual_seed(config.seed)
-    state = _State(config)
+    state = _State(config, fabric)
     state.restore(out / CHECKPOINT)
     saved = time.monotonic()
     while state.done < config.samples:
         # One generator a step, so that a resumed run draws what it would have.
-        rng = np.random.default_rng((config.seed, state.done))
-        cloud = draw_batch(rows[:-held_out], config, rng=rng)
-        loss = state.step(cloud)
-        if progress is not None:
+        rng = np.random.default_rng((config.seed, state.done, fabric.global_rank))
+        share = dataclasses.replace(config, batch=config.batch // fabric.world_size)
+        loss = state.step(draw_batch(rows[:-held_out], share, rng=rng), rng=rng)
+        if progress is not None and fabric.is_global_zero:
             progress(min(state.done, config.samples), config.samples, loss)
         if time.monotonic() - saved > save_every:
             state.save(out / CHECKPOINT)
@@ -77,47 +85,79 @@ def train_labeler(
     state.save(out / CHECKPOINT)
     network = state.averaged()
     card = _card(network, rows[-held_out:], config, dataset)
-    save_labeler(out, network, card)
+    if fabric.is_global_zero:
+        save_network(out, config.labeler, network, config.network, card)
     return card
+
+
+def _fabric(config: TrainConfig, out: Path) -> Fabric:
+    """Where the numbers are crunched: on GPUs where there are any, and what the curves are written with."""
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its greetings are not about this run
+    warnings.filterwarnings("ignore", module="lightning_fabric")
+    fabric = Fabric(
+        accelerator="cuda" if torch.cuda.is_available() else "cpu",
+        devices=config.devices,
+        precision="bf16-mixed" if config.precision == "bf16" else "32-true",
+        loggers=TensorBoardLogger(out, name="tensorboard", version=""),
+    )
+    fabric.launch()
+    return fabric
 
 
 class _State:
     """What a run carries from step to step, and a checkpoint from run to run."""
 
-    def __init__(self, config: TrainConfig) -> None:
+    def __init__(self, config: TrainConfig, fabric: Fabric) -> None:
         self.config = config
-        self.network = SetLabeler(config.network)
-        self.optimizer = torch.optim.AdamW(
-            self.network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
-        )
+        self.fabric = fabric
+        network = new_network(config.labeler, config.network)
+        self.network, self.optimizer = fabric.setup(network, _optimizer(config, network))
         self.mean = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
         self.done = 0
+        self.began = time.monotonic(), 0
 
-    def step(self, cloud: Cloud) -> float:
+    def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
         """One gradient step; the loss before it."""
-        progress = self.done / self.config.samples
-        rate = min(1.0, progress / 0.01 + 1e-3) * 0.5 * (1.0 + np.cos(np.pi * min(1.0, progress)))
+        rate = self.config.learning_rate * _rate(self.config, self.done / self.config.samples)
         for group in self.optimizer.param_groups:
-            group["lr"] = float(self.config.learning_rate * rate)
-        points = torch.from_numpy(cloud.points.astype(np.float32))
-        present, truth = torch.from_numpy(cloud.present), torch.from_numpy(cloud.truth)
-        loss = labeling_loss(self.network(points, present), truth, present)
+            group["lr"] = rate
+        loss = batch_loss(self.config.labeler, self.network, batch, self.fabric.device, rng=rng)
         self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.fabric.backward(loss)
+        if self.config.optimizer == "adamw":
+            self.fabric.clip_gradients(self.network, self.optimizer, max_norm=1.0)
         self.optimizer.step()
-        self.done += len(cloud.points)
+        before, self.done = self.done, self.done + self.config.batch
+        self._average()
+        value = float(loss.detach())
+        interval = max(self.config.batch, self.config.samples // _CURVE)
+        if before // interval != self.done // interval:
+            self._log(value, rate)
+        return value
+
+    def _average(self) -> None:
         decay = min(self.config.average, self.done / (self.done + 20.0 * self.config.batch))
         with torch.no_grad():
             for name, tensor in self.network.state_dict().items():
-                self.mean[name].lerp_(tensor, 1.0 - decay)
-        return float(loss.detach())
+                if tensor.is_floating_point():
+                    self.mean[name].lerp_(tensor, 1.0 - decay)
+                else:
+                    self.mean[name].copy_(tensor)
 
-    def averaged(self) -> SetLabeler:
+    def _log(self, loss: float, rate: float) -> None:
+        since, done = self.began
+        now = time.monotonic()
+        speed = (self.done - done) / (now - since)
+        self.began = now, self.done
+        self.fabric.log_dict(
+            {"loss": loss, "learning_rate": rate, "samples_per_second": speed}, step=self.done
+        )
+
+    def averaged(self) -> nn.Module:
         """The network with the mean weights."""
-        network = SetLabeler(self.config.network)
-        network.load_state_dict(self.mean)
-        return network
+        network = new_network(self.config.labeler, self.config.network)
+        network.load_state_dict({name: tensor.cpu() for name, tensor in self.mean.items()})
+        return network.eval()
 
     def save(self, path: Path) -> None:
         """Write a checkpoint."""
@@ -127,54 +167,52 @@ class _State:
             "mean": self.mean,
             "done": self.done,
         }
-        with atomic_write(path) as temporary:
-            torch.save(content, temporary)
+        if self.fabric.is_global_zero:
+            with atomic_write(path) as temporary:
+                torch.save(content, temporary)
 
     def restore(self, path: Path) -> None:
         """Go on from a checkpoint, if there is one."""
         if not path.is_file():
             return
         try:
-            content = torch.load(path, weights_only=True)
+            content = torch.load(path, weights_only=True, map_location=self.fabric.device)
             self.network.load_state_dict(content["network"])
             self.optimizer.load_state_dict(content["optimizer"])
             self.mean, self.done = content["mean"], content["done"]
         except (RuntimeError, KeyError, EOFError, ValueError, pickle.UnpicklingError) as error:
             raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
+        self.began = time.monotonic(), self.done
 
 
-def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Generator) -> Cloud:
-    """Random rows as corrupted clouds, centred."""
-    chosen = rows[rng.integers(len(rows), size=config.batch)]
-    markers = chosen["markers"].astype(np.float64)
-    centre = markers.mean(axis=1, keepdims=True)
-    stretch = _stretches(len(markers), config.anisotropy, rng)
-    markers = (markers - centre) @ stretch
-    jitter = config.jitter * rng.uniform()
-    if rng.random() < config.rig_share:
-        observed = (chosen["observed"].astype(np.float64) - centre) @ stretch
-        ghosts = (chosen["ghosts"].astype(np.float64) - centre) @ stretch
-        return corrupt(observed, Corruption(occlude=0, ghosts=0, jitter=jitter), ghosts=ghosts, rng=rng)
-    return corrupt(markers, dataclasses.replace(PAPER, jitter=jitter), rng=rng)
+def _optimizer(config: TrainConfig, network: nn.Module) -> torch.optim.Optimizer:
+    if config.optimizer == "sgd":
+        return torch.optim.SGD(
+            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+    return torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
 
 
-def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Symmetric matrices (B, 3, 3) that stretch along random orthogonal directions."""
-    axes, _ = np.linalg.qr(rng.standard_normal((count, 3, 3)))
-    factors = np.exp(anisotropy * rng.standard_normal((count, 1, 3)))
-    stretches: NDArray[np.float64] = (axes * factors) @ axes.transpose(0, 2, 1)
-    return stretches
+def _rate(config: TrainConfig, progress: float) -> float:
+    """Share of the peak learning rate at a share of the run."""
+    if config.schedule == "steps":
+        return float(0.1 ** ((progress >= 50 / 75) + (progress >= 70 / 75)))
+    return float(min(1.0, progress / 0.01 + 1e-3) * 0.5 * (1.0 + np.cos(np.pi * min(1.0, progress))))
 
 
 def _card(
-    network: SetLabeler, rows: NDArray[np.void], config: TrainConfig, dataset: Dataset
+    network: nn.Module, rows: NDArray[np.void], config: TrainConfig, dataset: Dataset
 ) -> dict[str, Any]:
     """Model card: where the weights come from and what they reach on held-out simulated frames."""
     markers = rows["markers"].astype(np.float64)
-    labeler = TrainedSetLabeler(network, dataset.marker_names)
+    labeler = labeler_of(network, dataset.marker_names)
+    paper = paper_corruption(markers.shape[1])
     figures = {
         name: evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0)).figures
-        for name, corruption in (("clean", Corruption(0, 0)), ("occlude 5, ghosts 2", PAPER))
+        for name, corruption in (
+            ("clean", Corruption(0, 0)),
+            (f"occlude {paper.occlude}, ghosts {paper.ghosts}", paper),
+        )
     }
     return {
         "marker_names": list(dataset.marker_names),

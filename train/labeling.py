@@ -1,0 +1,124 @@
+"""What every labeler promises: points of a frame in, a label and a confidence a point out. Free of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from handsim.errors import ShapeError
+from train.matching import match_scores
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Float32, Int
+    from numpy.typing import NDArray
+
+MOST_POINTS: Final = 512
+FARTHEST: Final = 30.0
+"""Median span of clouds that are in metres, at most [m]; a hand in millimetres would span more."""
+_ENOUGH: Final = 5  # points that tell the unit; fewer may all be strays
+_BATCH: Final = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Labelling:
+    """Labels of one frame's points."""
+
+    labels: Int[np.ndarray, "N"]
+    """Place of each point's marker in the layout, -1 for a ghost; no marker twice."""
+    confidence: Float[np.ndarray, "N"]
+    """How sure each label is, 0 to 1."""
+
+
+class Labeler(Protocol):
+    """Names the points of a frame, each frame on its own."""
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers that it knows, in label order."""
+        ...
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labelling]:
+        """Label the points [m] of every frame; a frame may be empty.
+
+        Raises:
+            ShapeError: A frame is not (N, 3), not finite, not in metres, or holds more than 512 points.
+        """
+        ...
+
+
+def label_in_batches(
+    frames: Sequence[Float[np.ndarray, "N 3"]],
+    label: Callable[[list[NDArray[np.float64]]], list[Labelling]],
+) -> list[Labelling]:
+    """Check frames and have them labelled, those of like size together, so that padding stays small.
+
+    Args:
+        frames: Points of each frame [m].
+        label: Labels a batch of frames of which the last holds the most points, and at least one.
+
+    Returns:
+        Labellings in the order of the frames.
+
+    Raises:
+        ShapeError: A frame is not (N, 3), not finite, not in metres, or holds more than 512 points.
+    """
+    clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
+    _check_unit(clouds)
+    order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
+    results = [Labelling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
+    for first in range(0, len(order), _BATCH):
+        chosen = order[first : first + _BATCH]
+        if len(clouds[chosen[-1]]):
+            labellings = label([clouds[number] for number in chosen])
+            for number, labelling in zip(chosen, labellings, strict=True):
+                results[number] = labelling
+    return results
+
+
+def pad_clouds(
+    clouds: Sequence[NDArray[np.float64]],
+) -> tuple[Float32[np.ndarray, "B N 3"], Bool[np.ndarray, "B N"]]:
+    """Clouds moved to their centres and padded to one length, and which points are there."""
+    longest = max(len(cloud) for cloud in clouds)
+    points = np.zeros((len(clouds), longest, 3), dtype=np.float32)
+    present = np.zeros((len(clouds), longest), dtype=bool)
+    for row, cloud in enumerate(clouds):
+        if len(cloud):
+            points[row, : len(cloud)] = cloud - cloud.mean(axis=0)  # before float32 cuts far-off places
+        present[row, : len(cloud)] = True
+    return points, present
+
+
+def label_by_scores(
+    clouds: Sequence[NDArray[np.float64]],
+    point_scores: Float[np.ndarray, "B N M+1"],
+    label_scores: Float[np.ndarray, "B M N+1"],
+) -> list[Labelling]:
+    """Match the scores of padded clouds, see `train.matching.match_scores`."""
+    longest = point_scores.shape[1]
+    labellings = []
+    for cloud, by_point, by_label in zip(clouds, point_scores, label_scores, strict=True):
+        count = len(cloud)
+        labellings.append(Labelling(*match_scores(by_point[:count], by_label[:, [*range(count), longest]])))
+    return labellings
+
+
+def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.float64]:
+    cloud = np.asarray(points, dtype=np.float64)
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise ShapeError(f"frame {frame} has shape {cloud.shape}, wanted (N, 3)")
+    if not np.isfinite(cloud).all():
+        raise ShapeError(f"frame {frame} holds NaN or infinite points; leave missing points out")
+    if len(cloud) > MOST_POINTS:
+        raise ShapeError(f"frame {frame} holds {len(cloud)} points, wanted at most {MOST_POINTS}")
+    return cloud
+
+
+def _check_unit(clouds: list[NDArray[np.float64]]) -> None:
+    """Millimetres are told, not guessed at; the median, because strays of a real system lie anywhere."""
+    spans = [np.ptp(cloud, axis=0).max() for cloud in clouds if len(cloud) >= _ENOUGH]
+    if spans and (span := float(np.median(spans))) > FARTHEST:
+        raise ShapeError(f"the points of a frame span {span:.0f} m, wanted a hand in metres; millimetres?")
