@@ -24,6 +24,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "generate": ("train.commands:generate", "Make a training set; goes on where it was stopped."),
     "train": ("train.commands:train", "Train a labeler on a training set; goes on where it was stopped."),
     "label": ("train.commands:label", "Label every frame of a marker capture."),
+    "export": ("train.commands:export", "Write a trained labeler as an ONNX file, which needs no torch."),
     "evaluate": ("train.commands:evaluate", "Measure a labeler on a labelled capture."),
     "simulate": ("train.take_commands:simulate", "Simulate a capture of two hands, with its truth."),
     "reproduce": ("train.take_commands:reproduce", "Print a table of the paper with our figures beside."),

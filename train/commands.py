@@ -118,6 +118,23 @@ def label(
     )
 
 
+def export(labeler: Annotated[str, tyro.conf.Positional], out: Path) -> None:
+    """Write a trained set labeler as one .onnx file, which labels without torch.
+
+    Args:
+        labeler: A glove with a shipped labeler, or the folder of a trained one.
+        out: The .onnx file.
+    """
+    from train.labeler import load_network
+    from train.onnx_labeler import export_onnx
+
+    if out.suffix.lower() != ".onnx":
+        raise HandSimError(f"cannot write '{out}', wanted a name that ends in .onnx")
+    network, card = load_network(labeler)
+    export_onnx(network, card["marker_names"], out)
+    Console().print(f"{out}: {len(card['marker_names'])} markers", highlight=False, soft_wrap=True)
+
+
 def evaluate(
     captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
     *,

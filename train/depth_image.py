@@ -76,9 +76,10 @@ def view_rotations(
     Args:
         points: Clouds [m]; what padding holds does not matter.
         present: Which points are there.
-        policy: `random`, any view (training); `random10`, the one of ten on which the projected cloud spreads
-            best (labelling): the smaller eigenvalue of its covariance is largest. Of equals the larger
-            eigenvalue counts, which is the order of determinants but tells views of a straight line apart.
+        policy: `random`, any view (training); `random10`, the one of ten, the same ten for all clouds, on
+            which the projected cloud spreads best (labelling): the smaller eigenvalue of its covariance is
+            largest. Of equals the larger eigenvalue counts, which is the order of determinants but tells
+            views of a straight line apart.
         rng: Source of all randomness.
 
     Raises:
@@ -89,16 +90,15 @@ def view_rotations(
     batch = len(points)
     if policy == "random":
         return quaternion_matrix(random_quaternions(batch, rng=rng))
-    candidates = quaternion_matrix(random_quaternions(batch * NUM_CANDIDATES, rng=rng))
-    candidates = candidates.reshape(batch, NUM_CANDIDATES, 3, 3)
+    candidates = quaternion_matrix(random_quaternions(NUM_CANDIDATES, rng=rng))  # (V, 3, 3)
     _, offsets = _centre(points, present)
     covariance = offsets.swapaxes(1, 2) @ offsets / np.maximum(present.sum(1), 1)[:, None, None]  # (B, 3, 3)
-    image_axes = candidates[:, :, :2]  # (B, V, 2, 3)
-    spreads = np.linalg.eigvalsh(image_axes @ covariance[:, None] @ image_axes.swapaxes(2, 3))  # ascending
+    image_axes = candidates[:, :2]  # (V, 2, 3)
+    spreads = np.linalg.eigvalsh(image_axes @ covariance[:, None] @ image_axes.swapaxes(1, 2))  # ascending
     rounding = 1e-12 * np.trace(covariance, axis1=1, axis2=2)[:, None]
     smaller = np.where(spreads[..., 0] > rounding, spreads[..., 0], 0.0)
     best = np.lexsort((spreads[..., 1], smaller), axis=-1)[:, -1]
-    return candidates[np.arange(batch), best]
+    return candidates[best]
 
 
 def depth_images(

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 
     from jaxtyping import Float
     from numpy.typing import NDArray
-
-    from train.set_labeler import SetLabeler
+    from torch import nn
 
 _NAMES: Final = "handsim.marker_names"  # key of the file's own words
 _INPUTS: Final = "points", "present"
@@ -70,13 +69,18 @@ class OnnxLabeler:
         return label_by_scores(clouds, *scores)
 
 
-def export_onnx(network: SetLabeler, marker_names: Sequence[str], path: Path) -> None:
+def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
     """Write a trained set labeler as an ONNX file for clouds of any number and size.
 
     Raises:
-        HandSimError: onnx is not installed.
+        HandSimError: onnx is not installed, or the network is of another kind.
     """
     import torch
+
+    from train.set_labeler import SetLabeler
+
+    if not isinstance(network, SetLabeler):
+        raise HandSimError("only labelers of kind 'set' can be exported, this one is of kind 'cnn'")
 
     try:
         import onnx
