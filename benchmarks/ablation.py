@@ -17,12 +17,10 @@ import numpy as np
 import tyro
 from machine import describe
 
-from gloves.captures import read_capture
-from gloves.captures.markers import select_markers
+from gloves.captures.collection import find_captures, read_markers
 from train.augmentation import Corruption
 from train.evaluation import Report, evaluate_labeler, evaluate_takes
 from train.labeler import load_labeler
-from train.labeling import Labeler
 from train.twins import KINDS, TwinConfig, simulate_twin
 
 FIGURES = {
@@ -42,7 +40,7 @@ def main(runs: tuple[str, ...], captures: Path | None = None) -> None:
         take = simulate_twin(TwinConfig(kind=kind))
         tests[kind] = {run: evaluate_takes(labeler, [take]) for run, labeler in labelers.items()}
     if captures is not None:
-        markers = real_markers(captures, next(iter(labelers.values())))
+        markers = read_markers(find_captures([captures]), next(iter(labelers.values())).marker_names)
         for name, corruption in (
             ("real, clean", Corruption(0, 0)),
             ("real, 5 drops, 2 ghosts", Corruption()),
@@ -59,12 +57,6 @@ def main(runs: tuple[str, ...], captures: Path | None = None) -> None:
             print(
                 f"| {test} | " + " | ".join(f"{100 * reports[run].figures[key]:.2f}" for run in runs) + " |"
             )
-
-
-def real_markers(folder: Path, labeler: Labeler) -> np.ndarray:
-    """All labelled frames of a folder [m]."""
-    files = sorted(folder.rglob("*.trc"))
-    return np.concatenate([select_markers(read_capture(file), labeler.marker_names) for file in files])
 
 
 if __name__ == "__main__":

@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from gloves.captures import READABLE, WRITABLE, read_capture, write_capture
+from gloves.captures import WRITABLE, read_capture, write_capture
 from gloves.captures.capture import check_suffix
-from gloves.captures.markers import labelled_capture, select_markers, unlabelled_frames
+from gloves.captures.collection import find_captures, read_markers
+from gloves.captures.markers import labelled_capture, unlabelled_frames
 from gloves.take import load_take
-from handsim.errors import CaptureError, HandSimError
+from handsim.errors import HandSimError
 from train.config import Preset, TrainConfig, with_preset
 from train.labeler import labeler_for_glove
 from train.report import write_report
@@ -170,8 +171,8 @@ def evaluate(
         report = evaluate_takes(network, [load_take(path) for path in captures])
         title = f"{len(captures)} takes, {report.num_frames} frames of one hand"
     else:
-        files = _capture_files(captures)
-        markers = np.concatenate([_known_markers(file, network.marker_names) for file in files])
+        files = find_captures(captures)
+        markers = read_markers(files, network.marker_names)
         corruption = Corruption(occlude, ghosts)
         report = evaluate_labeler(network, markers, corruption, rng=np.random.default_rng(seed))
         title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
@@ -222,27 +223,3 @@ def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
 
 def _percent(share: float) -> str:
     return "-" if np.isnan(share) else f"{100 * share:.2f}"
-
-
-def _capture_files(paths: tuple[Path, ...]) -> list[Path]:
-    files = []
-    for path in paths:
-        inside = (
-            sorted(file for file in path.rglob("*") if file.suffix.lower() in READABLE)
-            if path.is_dir()
-            else [path]
-        )
-        if not inside:
-            raise CaptureError(f"{path} holds no capture; wanted files {', '.join(READABLE)}")
-        files += inside
-    if not files:
-        raise CaptureError("no capture was given; wanted files or folders")
-    return files
-
-
-def _known_markers(file: Path, names: tuple[str, ...]) -> np.ndarray:
-    try:
-        return select_markers(read_capture(file), names)
-    except CaptureError as error:
-        text = str(error)
-        raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error

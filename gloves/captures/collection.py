@@ -1,0 +1,55 @@
+"""Many captures as one stack of labelled frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gloves.captures import READABLE, read_capture
+from gloves.captures.markers import select_markers
+from handsim.errors import CaptureError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jaxtyping import Float
+
+
+def find_captures(paths: Sequence[Path]) -> list[Path]:
+    """The capture files among paths, folders searched through.
+
+    Raises:
+        CaptureError: There is none, or a folder holds none.
+    """
+    files = []
+    for path in paths:
+        inside = (
+            sorted(file for file in path.rglob("*") if file.suffix.lower() in READABLE)
+            if path.is_dir()
+            else [path]
+        )
+        if not inside:
+            raise CaptureError(f"{path} holds no capture; wanted files {', '.join(READABLE)}")
+        files += inside
+    if not files:
+        raise CaptureError("no capture was given; wanted files or folders")
+    return files
+
+
+def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
+    """The named markers of all frames of labelled captures [m], NaN where missing.
+
+    Raises:
+        CaptureError: A file cannot be read or lacks a marker; the file is named.
+    """
+    return np.concatenate([_markers_of(file, names) for file in files])
+
+
+def _markers_of(file: Path, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
+    try:
+        return select_markers(read_capture(file), names)
+    except CaptureError as error:
+        text = str(error)
+        raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error
