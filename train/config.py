@@ -79,7 +79,8 @@ def with_preset(preset: Preset, config: TrainConfig, num_frames: int) -> TrainCo
     """The settings of a published recipe for a training set of `num_frames`; what `config` changes holds.
 
     `han2018` is section 3.3 of Han et al. 2018: plain SGD from 0.6, batches of 256, 75 epochs, random drops
-    and ghosts; the jitter, which the paper does not tell, is that of its published data (±3 mm).
+    and ghosts; the jitter, which the paper does not tell, is that of its published data (±3 mm). Its numbers
+    are of 16 bits, which is three times as quick on a CPU that has them, and not the paper's.
     """
     del preset  # one so far
     recipe = TrainConfig(
@@ -90,6 +91,7 @@ def with_preset(preset: Preset, config: TrainConfig, num_frames: int) -> TrainCo
         schedule="steps",
         weight_decay=0.0,
         average=0.0,
+        precision="bf16",
         jitter=0.003,
         rig_share=0.0,
         anisotropy=0.0,
