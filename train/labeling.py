@@ -119,6 +119,8 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
 
 def _check_unit(clouds: list[NDArray[np.float64]]) -> None:
     """Millimetres are told, not guessed at; the median, because strays of a real system lie anywhere."""
-    spans = [np.ptp(cloud, axis=0).max() for cloud in clouds if len(cloud) >= _ENOUGH]
-    if spans and (span := float(np.median(spans))) > FARTHEST:
+    spans = [
+        float((cloud.max(axis=0) - cloud.min(axis=0)).max()) for cloud in clouds if len(cloud) >= _ENOUGH
+    ]
+    if max(spans, default=0.0) > FARTHEST and (span := float(np.median(spans))) > FARTHEST:
         raise ShapeError(f"the points of a frame span {span:.0f} m, wanted a hand in metres; millimetres?")

@@ -18,6 +18,7 @@ _WEIGHT: Final = 0.65
 """What each reading counts: 0.5 if both said the same thing twice, 1 if they knew of different things."""
 _ROUNDS: Final = 20
 _NEVER: Final = 1e-30  # a probability whose logarithm is still a number
+_IMPOSSIBLE: Final = 1e6
 
 
 def match_scores(
@@ -63,18 +64,15 @@ def pair_probabilities(
 
 def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:
     """The one-to-one labelling with the greatest product of probabilities; `GHOST` where a point has none."""
-    count, num_labels = (size - 1 for size in probabilities.shape)
-    cost = -np.log(np.maximum(probabilities, _NEVER))
-    ghost, occluded = cost[:count, -1], cost[-1, :num_labels]
-    size = count + num_labels
-    square = np.full((size, size), 1e6)
-    square[:count, :num_labels] = 2.0 * cost[:count, :num_labels]  # a pair settles a point and a label
-    square[np.arange(count), num_labels + np.arange(count)] = ghost
-    square[count + np.arange(num_labels), np.arange(num_labels)] = occluded
-    square[count:, num_labels:] = 0.0
-    rows, columns = linear_sum_assignment(square)
-    labels: NDArray[np.int64] = columns[rows.argsort()][:count]
-    return np.where(labels < num_labels, labels, GHOST)
+    count, num_labels = len(probabilities) - 1, probabilities.shape[1] - 1
+    costs = -np.log(np.maximum(probabilities, _NEVER))
+    # A pair settles a point and a label, which then is not occluded; each point has a way out of its own.
+    table = np.full((count, num_labels + count), _IMPOSSIBLE)
+    table[:, :num_labels] = 2.0 * costs[:count, :num_labels] - costs[count, :num_labels]
+    table.ravel()[num_labels :: num_labels + count + 1] = costs[:count, num_labels]
+    _, columns = linear_sum_assignment(table)
+    labels: NDArray[np.int64] = np.where(columns < num_labels, columns, GHOST)
+    return labels
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
