@@ -1,0 +1,50 @@
+"""From a glove of ten markers, nothing but a TOML file, to a labeler: three commands, timed and measured.
+
+python benchmarks/new_layout.py [--frames 170330] [--samples 600000]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+from machine import describe
+
+from handsim.cli import main as handsim
+
+GLOVE = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
+WANTED, LIMIT = 0.93, 15 * 60
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=170_330)
+    parser.add_argument("--samples", type=int, default=600_000)
+    options = parser.parse_args()
+    print(describe("torch", "mujoco"))
+    with tempfile.TemporaryDirectory() as folder:
+        data, run = Path(folder) / "data", Path(folder) / "run"
+        commands = (
+            ["glove", "check", str(GLOVE), "--out", str(Path(folder) / "glove.png")],
+            ["generate", "--glove", str(GLOVE), "--num-frames", str(options.frames), "--out", str(data)],
+            ["train", str(data), "--samples", str(options.samples), "--out", str(run)],
+        )
+        begin = time.perf_counter()
+        for command in commands:
+            start = time.perf_counter()
+            assert handsim(command) == 0
+            print(f"handsim {command[0]}: {time.perf_counter() - start:.0f} s")
+        total = time.perf_counter() - begin
+        figures = json.loads((run / "labeler.json").read_text())["held_out_simulated"]
+    for name, held_out in figures.items():
+        print(f"held-out frames, {name}: {100 * held_out['slot_accuracy']:.2f} % of slots right")
+    corrupted = list(figures.values())[-1]["slot_accuracy"]
+    met = corrupted >= WANTED and total <= LIMIT
+    print(f"{total / 60:.1f} minutes; wanted {100 * WANTED:.0f} % in 15: {'met' if met else 'missed'}")
+
+
+if __name__ == "__main__":
+    main()
