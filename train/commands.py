@@ -33,6 +33,7 @@ from train.config import Preset, TrainConfig, with_preset
 from train.labeler import labeler_for_glove
 from train.metrics import percent
 from train.report import write_report
+from train.run_page import PAGE
 from train.shards import Dataset, save_json
 from train.synthesis import DatasetConfig, generate_dataset
 from train.twins import TwinConfig, simulate_twin
@@ -73,11 +74,11 @@ def train(
     config: Annotated[TrainConfig, tyro.conf.arg(name="")],
     preset: Preset | None = None,
 ) -> None:
-    """Train a labeler on a training set; run it again to go on where it was stopped.
+    """Train a labeler on a training set and draw a page about it; run it again to go on where it was stopped.
 
     Args:
         dataset: Folder that `handsim generate` wrote.
-        out: Folder for the weights, the model card and the checkpoint.
+        out: Folder for the weights, the model card, the checkpoint and report.html.
         config: How to train.
         preset: A published recipe; options given beside it hold all the same.
     """
@@ -94,6 +95,7 @@ def train(
         card = train_labeler(rows, config, out, progress=report)
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
     Console().print(f"weights and model card in {out}")
+    Console().print(f"report in {out / PAGE}", soft_wrap=True, markup=False)
 
 
 def label(
