@@ -56,7 +56,7 @@ def _lead(card: dict[str, Any], layout: MarkerLayout) -> str:
         f"{_KINDS[train['labeler']]} for glove {layout.name} ({layout.num_markers} markers), trained on "
         f"{train['samples']:,} clouds of a set of {card['dataset']['num_frames']:,} simulated frames, in "
         f"batches of {train['batch']}: {100 * train['rig_share']:g} % of them as the simulated rig saw them, "
-        f"the others through random drops and ghosts. {train['optimizer']} from learning rate "
+        f"the others through random drops and ghosts. Optimizer {train['optimizer']}, learning rate from "
         f"{train['learning_rate']:g}, schedule {train['schedule']}{average}, seed {train['seed']}. On "
         f"held-out frames {percent(clean['slot_accuracy'])} % of the slots are right when every marker is "
         f"seen, and {percent(corrupted['slot_accuracy'])} % with the paper's recipe ({recipe})."
