@@ -126,9 +126,7 @@ def draw_hand(
     _draw_arrows(panel, dots, arrows)
     colors = LinearSegmentedColormap.from_list("right", [WARM, "#d9a441", PALE, BLUE])
     norm = Normalize(min(99.0, float(np.floor(100.0 * accuracy.min()))), 100.0)
-    for place, dot, below in zip(dots, colors(norm(100.0 * accuracy)), hand.below, strict=True):
-        panel.plot(*place, "o", markersize=2.0 * _DOT, zorder=5, markeredgecolor=dot if below else INK,
-                   markerfacecolor=CARD if below else dot, markeredgewidth=2.2 if below else 0.7)  # fmt: skip
+    _draw_dots(panel, dots, colors(norm(100.0 * accuracy)), hand.below)
     labels = [short(name) for name in names]
     for name, dot, place in zip(
         labels, dots, place_names(labels, dots, arrows, (width, height)), strict=True
@@ -180,6 +178,15 @@ def _extent(name: str) -> tuple[float, float]:
 
     width, _, _ = TextToPath().get_text_width_height_descent(name, FontProperties(size=_FONT), ismath=False)
     return float(width), 1.15 * _FONT
+
+
+def _draw_dots(
+    panel: Axes, dots: NDArray[np.float64], colors: NDArray[np.float64], below: NDArray[np.bool_]
+) -> None:
+    """Markers of the back as dots, those of the palm's side as rings."""
+    for place, color, ring in zip(dots, colors, below, strict=True):
+        panel.plot(*place, "o", markersize=2.0 * _DOT, zorder=5, markeredgecolor=color if ring else INK,
+                   markerfacecolor=CARD if ring else color, markeredgewidth=2.2 if ring else 0.7)  # fmt: skip
 
 
 def _draw_name(panel: Axes, name: str, dot: NDArray[np.float64], place: NDArray[np.float64]) -> None:
