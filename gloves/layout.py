@@ -13,7 +13,7 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from handsim.errors import LayoutError, choices
 from handsim.io import atomic_write, read_toml
@@ -167,6 +167,17 @@ def save_layout(path: str | Path, layout: MarkerLayout) -> None:
             temporary.write_text("\n".join(lines) + "\n", "utf-8")
     except OSError as error:
         raise LayoutError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:
+    """A layout from what `dataclasses.asdict` made of it, as takes and training sets keep it.
+
+    Raises:
+        LayoutError: The values are no layout's.
+        KeyError, TypeError: Keys are missing, or others are there.
+    """
+    markers = tuple(MarkerPlace(**place) for place in stored["markers"])
+    return MarkerLayout(**{**stored, "markers": markers})
 
 
 def starter_layout() -> str:

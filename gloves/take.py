@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gloves.layout import MarkerLayout, MarkerPlace
+from gloves.layout import MarkerLayout, stored_layout
 from handsim.errors import CaptureError, HandSimError
 from handsim.hand_records import HAND_DTYPE, pack_hand, unpack_hand
 from handsim.io import atomic_write
@@ -142,10 +142,7 @@ def load_take(path: Path) -> Take:
 
 
 def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
-    layouts = [
-        MarkerLayout(**{**stored, "markers": tuple(MarkerPlace(**place) for place in stored["markers"])})
-        for stored in header["layouts"]
-    ]
+    layouts = [stored_layout(stored) for stored in header["layouts"]]
     shapes = [unpack_hand(record) for record in arrays["hands"]]
     hands = tuple(GlovedHand(*parts) for parts in zip(shapes, layouts, arrays["qpos"], strict=True))
     body = header["body"] and HeldBody(

@@ -1,4 +1,7 @@
-"""The pictures of a training set's report. matplotlib is imported when one is drawn, and pyplot never."""
+"""The pictures of a training set's report, and the manner of all reports' pictures.
+
+matplotlib is imported when a picture is drawn, and pyplot never.
+"""
 
 from __future__ import annotations
 
@@ -17,24 +20,24 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_INK, _SOFT, _LINE, _BAND, _CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
-_BLUE, _PALE, _WARM = "#3f7396", "#a9c3d4", "#b8572b"
+INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
+BLUE, PALE, WARM = "#3f7396", "#a9c3d4", "#b8572b"
 _STYLE: Final[dict[str, Any]] = {
     "font.size": 9.0,
-    "text.color": _INK,
-    "axes.labelcolor": _SOFT,
+    "text.color": INK,
+    "axes.labelcolor": SOFT,
     "axes.labelsize": 9.0,
     "axes.titlesize": 9.5,
-    "axes.edgecolor": _LINE,
+    "axes.edgecolor": LINE,
     "axes.facecolor": "none",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "xtick.color": _LINE,
-    "ytick.color": _LINE,
-    "xtick.labelcolor": _SOFT,
-    "ytick.labelcolor": _SOFT,
-    "figure.facecolor": _CARD,  # the page's card, light on dark pages too, so that no frame shows
-    "savefig.facecolor": _CARD,
+    "xtick.color": LINE,
+    "ytick.color": LINE,
+    "xtick.labelcolor": SOFT,
+    "ytick.labelcolor": SOFT,
+    "figure.facecolor": CARD,  # the page's card, light on dark pages too, so that no frame shows
+    "savefig.facecolor": CARD,
     "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
 }
 PUBLISHED_MEDIAN: Final = (3, 4)
@@ -78,13 +81,13 @@ def draw_angles(
             panel.sharex(panels[place, 1])
             panel.sharey(panels[place, 1])
         density = 100.0 * shares[number] / np.diff(edges[number])
-        panel.axvspan(joint.low, joint.high, color=_BAND, linewidth=0)
-        panel.stairs(density, edges[number], fill=True, color=_BLUE)
-        panel.set_title(joint.name.split("_", 1)[1].replace("_", " "), loc="left", color=_SOFT, fontsize=8.5)
+        panel.axvspan(joint.low, joint.high, color=BAND, linewidth=0)
+        panel.stairs(density, edges[number], fill=True, color=BLUE)
+        panel.set_title(joint.name.split("_", 1)[1].replace("_", " "), loc="left", color=SOFT, fontsize=8.5)
         panel.margins(x=0.03, y=0.08)
-        panel.axhline(0.0, color=_LINE, linewidth=0.8)
+        panel.axhline(0.0, color=LINE, linewidth=0.8)
         low, high = middle[number]
-        panel.plot([low, high], [0.0, 0.0], color=_WARM, linewidth=2.6, solid_capstyle="butt", clip_on=False)
+        panel.plot([low, high], [0.0, 0.0], color=WARM, linewidth=2.6, solid_capstyle="butt", clip_on=False)
         panel.xaxis.set_major_formatter("{x:.0f}°")
         panel.locator_params(axis="x", nbins=5)
         panel.locator_params(axis="y", nbins=3)
@@ -95,7 +98,7 @@ def draw_angles(
         panels[0, digit].annotate(
             name, (0.0, 1.0), (0.0, 20.0), "axes fraction", "offset points", weight="bold", fontsize=10.5
         )
-    figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=_SOFT)
+    figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=SOFT)
 
 
 def draw_sight(
@@ -105,11 +108,11 @@ def draw_sight(
     """Bars of the share of frames without each marker; beside them how many cameras see it."""
     places = np.arange(len(names))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
-    left.barh(places, 100.0 * lost, color=_BLUE, height=0.62)
+    left.barh(places, 100.0 * lost, color=BLUE, height=0.62)
     for place, share in enumerate(lost):
         left.annotate(f"{100 * share:.1f}", (100 * share, place), (4, 0), textcoords="offset points",
-                      va="center", color=_SOFT, fontsize=8.0)  # fmt: skip
-    left.set_yticks(places, names, color=_INK)
+                      va="center", color=SOFT, fontsize=8.0)  # fmt: skip
+    left.set_yticks(places, names, color=INK, parse_math=False)
     left.set_ylim(len(names) - 0.4, -0.6)
     left.set_xlim(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0))))
     left.set_xlabel(f"frames in which fewer than {min_cameras} cameras see it [%]")
@@ -117,14 +120,14 @@ def draw_sight(
     most = int(np.flatnonzero(seen_by.sum(axis=0))[-1]) if seen_by.any() else 0
     shades = right.pcolormesh(
         np.arange(most + 2) - 0.5, np.arange(len(names) + 1) - 0.5, 100.0 * seen_by[:, : most + 1],
-        cmap="Blues", vmin=0.0, edgecolors=_CARD, linewidth=1.2,
+        cmap="Blues", vmin=0.0, edgecolors=CARD, linewidth=1.2,
     )  # fmt: skip
     means = seen_by @ np.arange(seen_by.shape[1])
-    right.plot(means, places, "o", color=_CARD, markeredgecolor=_INK, markersize=4.5, markeredgewidth=0.9)
+    right.plot(means, places, "o", color=CARD, markeredgecolor=INK, markersize=4.5, markeredgewidth=0.9)
     right.annotate("mean", (means[0], 0.0), (0, 13), textcoords="offset points", ha="center", fontsize=8.0)
-    right.axvline(min_cameras - 0.5, color=_WARM, linewidth=1.4)
+    right.axvline(min_cameras - 0.5, color=WARM, linewidth=1.4)
     right.annotate(f"at least {min_cameras}", (min_cameras - 0.5, -0.5), (3, 3), textcoords="offset points",
-                   color=_WARM, fontsize=8.0)  # fmt: skip
+                   color=WARM, fontsize=8.0)  # fmt: skip
     right.set_xlabel("cameras that see it")
     right.locator_params(axis="x", integer=True)
     right.tick_params(axis="y", length=0)
@@ -138,40 +141,40 @@ def draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Float
     """Ghosts a frame, and how far [m] each lies from the nearest marker."""
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
     shares = 100.0 * counts / max(1, counts.sum())
-    left.bar(np.arange(len(counts)), shares, color=_BLUE, width=0.62)
+    left.bar(np.arange(len(counts)), shares, color=BLUE, width=0.62)
     for count, share in enumerate(shares):
         left.annotate(f"{share:.1f}", (count, share), (0, 3), textcoords="offset points", ha="center",
-                      color=_SOFT, fontsize=8.0)  # fmt: skip
+                      color=SOFT, fontsize=8.0)  # fmt: skip
     left.set_xlabel("ghosts in a frame")
     left.set_ylabel("share of frames [%]")
     left.locator_params(axis="x", integer=True)
-    _millimetres(right, distances, _BLUE, "ghosts")
+    _millimetres(right, distances, BLUE, "ghosts")
     right.set_xlabel("from a ghost to the nearest marker [mm]")
     if len(distances):
-        _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", _INK)
+        _mark(right, 1e3 * float(np.median(distances)), "median {:.0f} mm", INK)
     else:
-        right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=_SOFT)
+        right.annotate("no ghosts", (0.5, 0.5), xycoords="axes fraction", ha="center", color=SOFT)
 
 
 def draw_neighbours(figure: Figure, distances: Float[np.ndarray, "T M"], diameter: float) -> None:
     """How near each marker's nearest neighbour is, and the nearest pair of each frame [m]."""
     panel = figure.subplots()
     nearest = distances.min(axis=1)
-    _millimetres(panel, distances.ravel(), _PALE, "")
+    _millimetres(panel, distances.ravel(), PALE, "")
     bins = _millimetre_bins(distances)
-    panel.stairs(*_shares(nearest, bins), color=_BLUE, linewidth=1.6)
+    panel.stairs(*_shares(nearest, bins), color=BLUE, linewidth=1.6)
     panel.set_ylabel("share [% per mm]")
     panel.set_xlabel("distance to the nearest other marker, centre to centre [mm]")
     for values, name, color in (
-        (nearest, "nearest pair\nof each frame", _BLUE),
-        (distances, "every marker", _SOFT),
+        (nearest, "nearest pair\nof each frame", BLUE),
+        (distances, "every marker", SOFT),
     ):
         shares, _ = _shares(values.ravel(), bins)
         peak = int(shares.argmax())
         panel.annotate(name, (bins[peak], shares[peak]), (10, 4), textcoords="offset points", color=color,
                        annotation_clip=False)  # fmt: skip
     panel.set_xlim(left=0.0)
-    _mark(panel, 1e3 * diameter, "marker diameter\n{:.1f} mm", _WARM)
+    _mark(panel, 1e3 * diameter, "marker diameter\n{:.1f} mm", WARM)
 
 
 def draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> None:
@@ -181,7 +184,7 @@ def draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> Non
     longest = int(max(ordered[-1], 1.3 * PUBLISHED_P90[1]))
     steps = np.arange(1, longest + 2)
     shares = 100.0 * np.searchsorted(ordered, steps, side="right") / len(ordered)
-    panel.step(steps, shares, where="post", color=_BLUE, linewidth=1.8)
+    panel.step(steps, shares, where="post", color=BLUE, linewidth=1.8)
     panel.set_xscale("log")
     panel.set_xlim(0.9, 1.15 * longest)
     panel.set_ylim(0.0, 103.0)
@@ -195,13 +198,13 @@ def draw_gaps(figure: Figure, lengths: Int[np.ndarray, "G"], rate: float) -> Non
     milliseconds.set_xlabel(f"[ms at {rate:g} Hz]")
     for height, name, published in ((50.0, "median", PUBLISHED_MEDIAN), (90.0, "p90", PUBLISHED_P90)):
         mine = int(np.percentile(ordered, height, method="inverted_cdf"))
-        panel.axhline(height, color=_BAND, linewidth=1.0, zorder=0)
-        panel.plot(published, (height, height), color=_WARM, linewidth=5.0, solid_capstyle="butt", alpha=0.85)
+        panel.axhline(height, color=BAND, linewidth=1.0, zorder=0)
+        panel.plot(published, (height, height), color=WARM, linewidth=5.0, solid_capstyle="butt", alpha=0.85)
         panel.annotate(f"real finger markers: {name} {published[0]} to {published[1]}",
-                       (published[1], height), (8, -11), textcoords="offset points", color=_WARM)  # fmt: skip
-        panel.plot(mine, height, "o", color=_BLUE, markersize=6.0, markeredgecolor=_CARD)
+                       (published[1], height), (8, -11), textcoords="offset points", color=WARM)  # fmt: skip
+        panel.plot(mine, height, "o", color=BLUE, markersize=6.0, markeredgecolor=CARD)
         panel.annotate(f"{name} {mine}", (mine, height), (-8, 5), textcoords="offset points",
-                       color=_BLUE, ha="right", weight="bold")  # fmt: skip
+                       color=BLUE, ha="right", weight="bold")  # fmt: skip
 
 
 def _millimetre_bins(distances: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "B"]:

@@ -10,8 +10,18 @@ from typing import Annotated
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
+from rich.text import Text
 
 from gloves.captures import WRITABLE, read_capture, write_capture
 from gloves.captures.capture import check_suffix
@@ -21,7 +31,9 @@ from gloves.take import load_take
 from handsim.errors import HandSimError
 from train.config import Preset, TrainConfig, with_preset
 from train.labeler import labeler_for_glove
+from train.metrics import percent
 from train.report import write_report
+from train.run_page import PAGE
 from train.shards import Dataset, save_json
 from train.synthesis import DatasetConfig, generate_dataset
 from train.twins import TwinConfig, simulate_twin
@@ -62,11 +74,11 @@ def train(
     config: Annotated[TrainConfig, tyro.conf.arg(name="")],
     preset: Preset | None = None,
 ) -> None:
-    """Train a labeler on a training set; run it again to go on where it was stopped.
+    """Train a labeler on a training set and draw a page about it; run it again to go on where it was stopped.
 
     Args:
         dataset: Folder that `handsim generate` wrote.
-        out: Folder for the weights, the model card and the checkpoint.
+        out: Folder for the weights, the model card, the checkpoint and report.html.
         config: How to train.
         preset: A published recipe; options given beside it hold all the same.
     """
@@ -83,6 +95,7 @@ def train(
         card = train_labeler(rows, config, out, progress=report)
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
     Console().print(f"weights and model card in {out}")
+    Console().print(f"report in {out / PAGE}", soft_wrap=True, markup=False)
 
 
 def label(
@@ -200,12 +213,28 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.completed:.0f}/{task.total:.0f} " + unit),
+        _Speed(unit),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield bar, bar.add_task("", total=1)
+
+
+class _Speed(ProgressColumn):
+    """How many a second of late; blank until there is something to measure."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self.unit = unit
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        if not speed:
+            return Text("")
+        number = f"{speed:,.0f}" if speed >= 10.0 else f"{speed:.2g}"
+        return Text(f"{number} {self.unit}/s", style="progress.data.speed")
 
 
 def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
@@ -216,10 +245,6 @@ def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:
         table.add_column(f"{name} [%]", justify="right")
     for figure in next(iter(columns.values())):
         table.add_row(
-            figure.replace("_", " "), *map(_percent, (column[figure] for column in columns.values()))
+            figure.replace("_", " "), *map(percent, (column[figure] for column in columns.values()))
         )
     Console().print(table)
-
-
-def _percent(share: float) -> str:
-    return "-" if np.isnan(share) else f"{100 * share:.2f}"

@@ -13,11 +13,13 @@ from gloves.ghosts import GHOST_REACH
 from gloves.take import Take
 from handsim.errors import CaptureError
 from train.augmentation import Corruption, corrupt
+from train.calibration import error_without, expected_calibration_error
 from train.labeling import Labeler
 from train.metrics import LabelCounts
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
+    from numpy.typing import NDArray
 
 _CHUNK: Final = 4096
 
@@ -27,9 +29,16 @@ class Report:
     """What an evaluation found."""
 
     figures: dict[str, float]
-    """Shares in [0, 1], see `train.metrics`."""
+    """Shares in [0, 1], see `train.metrics`; and from `train.calibration` the expected calibration error and
+    the share of points labelled wrongly without the 2 % least sure (with them, it is 1 - point accuracy)."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int
+    confusion: Int[np.ndarray, "M+1 M+1"]
+    """Points by what they are (rows) and were called (columns): markers in label order, then ghost."""
+    confidences: Float[np.ndarray, "N"]
+    """How sure the label of each point was: all frames' points, in order."""
+    right: Bool[np.ndarray, "N"]
+    """Whether it was the right one."""
 
 
 def evaluate_labeler(
@@ -112,13 +121,25 @@ class _Count:
     def __init__(self, labeler: Labeler) -> None:
         self.labeler = labeler
         self.num_labels = len(labeler.marker_names)
-        self.counts = LabelCounts()
+        classes = self.num_labels + 1
+        self.counts = LabelCounts(confusion=np.zeros((classes, classes), dtype=np.int64))
         self.right_by_marker = np.zeros(self.num_labels)
+        self.confidences: list[NDArray[np.float64]] = [np.zeros(0)]
+        self.right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
 
     def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
         for labelling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):
             self.right_by_marker += self.counts.add(labelling.labels, truth, self.num_labels)
+            self.confidences.append(labelling.confidence)
+            self.right.append(labelling.labels == truth)
 
     def report(self) -> Report:
         frames = self.counts.frames
-        return Report(self.counts.figures(), self.right_by_marker / max(1, frames), frames)
+        confidences, right = np.concatenate(self.confidences), np.concatenate(self.right)
+        figures = {
+            **self.counts.figures(),
+            "calibration_error": expected_calibration_error(confidences, right),
+            "error_without_least_sure": error_without(confidences, right),
+        }
+        by_marker = self.right_by_marker / max(1, frames)
+        return Report(figures, by_marker, frames, self.counts.confusion, confidences, right)

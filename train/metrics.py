@@ -2,12 +2,14 @@
 
 Slot accuracy: over frames and label slots, a slot is right when it holds the right point, or rightly none
 (Tables 2, 4 and 6 on synthetic data). Point accuracy: over the points that came in, ghosts among them.
-Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as what is to be found.
+Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as what is to be found. Macro F1 is
+over points too: the mean F1 of the markers and of "ghost", the null class, as SOMA (Ghorbani and Black 2021)
+counts it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +34,11 @@ class LabelCounts:
     ghosts: int = 0
     ghosts_said: int = 0
     ghosts_right: int = 0
+    confusion: Int[np.ndarray, "M+1 M+1"] = field(
+        default_factory=lambda: np.zeros((0, 0), dtype=np.int64), compare=False
+    )
+    """Points by what they are (rows) and were called (columns): markers in label order, then ghost.
+    Without rows until there was a frame."""
 
     def add(
         self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
@@ -56,6 +63,9 @@ class LabelCounts:
         self.ghosts += int((truth < 0).sum())
         self.ghosts_said += int((labels < 0).sum())
         self.ghosts_right += int(((labels < 0) & (truth < 0)).sum())
+        if not self.confusion.size:
+            self.confusion = np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64)
+        np.add.at(self.confusion, (truth, labels), 1)  # -1, a ghost, is the last place of either
         return right
 
     def figures(self) -> dict[str, float]:
@@ -70,7 +80,26 @@ class LabelCounts:
             "ghost_ratio": _share(self.ghosts, self.slots),
             "ghost_precision": _share(self.ghosts_right, self.ghosts_said),
             "ghost_recall": _share(self.ghosts_right, self.ghosts),
+            "macro_f1": macro_f1(self.confusion),
         }
+
+
+def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
+    """Mean F1 of the classes that occur, in truth or in what was said; NaN where none does.
+
+    Args:
+        confusion: Counts, rows the truth.
+    """
+    occurs = confusion.sum(axis=0) + confusion.sum(axis=1)
+    there = occurs > 0
+    if not there.any():
+        return float("nan")
+    return float((2.0 * confusion.diagonal()[there] / occurs[there]).mean())
+
+
+def percent(share: float) -> str:
+    """A share in percent with two decimals, a dash for NaN."""
+    return "-" if np.isnan(share) else f"{100 * share:.2f}"
 
 
 def _slots(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"]:

@@ -1,5 +1,7 @@
 """Layouts: the shipped ones, what a file may say, and a sentence for everything it may not."""
 
+import dataclasses
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.layout import MarkerLayout, MarkerPlace, list_layouts, load_layout, save_layout, starter_layout
+from gloves.layout import (
+    MarkerLayout,
+    MarkerPlace,
+    list_layouts,
+    load_layout,
+    save_layout,
+    starter_layout,
+    stored_layout,
+)
 from handsim.errors import LayoutError
 from handsim.topology import BONE_NAMES
 
@@ -82,6 +92,7 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, layout: MarkerLayo
         assert (other.along, other.around, other.across) == pytest.approx(
             (one.along, one.around, one.across), abs=1e-9
         )
+    assert stored_layout(json.loads(json.dumps(dataclasses.asdict(layout)))) == layout
 
 
 def text(*, head: str = 'name = "g"\nradius_mm = 3.2', count: int = 5, **keys: str) -> str:

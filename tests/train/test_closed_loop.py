@@ -54,7 +54,11 @@ def test_a_small_labeler_labels_most_of_a_capture(run):
     path = take(run, "take.trc")
     figures = run / "figures.json"
     assert main(["evaluate", str(path), "--labeler", str(run / "run"), "--json", str(figures)]) == 0
-    assert json.loads(figures.read_text())["figures"]["slot_accuracy"] > 0.85
+    found = json.loads(figures.read_text())["figures"]
+    assert found["slot_accuracy"] > 0.85
+    assert found["macro_f1"] > 0.85 and 0.0 < found["calibration_error"] < 0.5
+    assert 0.0 <= found["error_without_least_sure"] < 1.0 - found["point_accuracy"]
+    assert found["ghost_precision"] is None or found["ghost_precision"] == 0.0  # no ghost was there
 
 
 def test_labels_do_not_depend_on_the_columns(run, rng):

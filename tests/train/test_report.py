@@ -159,7 +159,7 @@ def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
 def test_only_drawing_loads_matplotlib_and_nothing_loads_pyplot():
     code = """
 import sys
-import train.commands, train.synthesis, train.report, train._plots
+import train.commands, train.synthesis, train.report, train.run_page, train._plots
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
 train._plots.picture((1, 1), lambda figure: figure.subplots())
 assert "matplotlib.figure" in sys.modules and "matplotlib.pyplot" not in sys.modules

@@ -1,0 +1,28 @@
+"""What the commands share: the progress bar's speed, and figures as a table."""
+
+from __future__ import annotations
+
+import pytest
+from rich.progress import Progress
+
+from train.commands import _Speed, print_figures
+
+
+@pytest.mark.parametrize(
+    ("steps", "text"), [([100, 2600], "1,250 frames/s"), ([1, 2], "0.5 frames/s"), ([7], ""), ([], "")]
+)
+def test_speed_is_of_this_run_alone(steps, text):
+    """What a resumed run had before it, told by the first step, is not what it did in that time."""
+    clock = [0.0]
+    bar = Progress(get_time=lambda: clock[0], disable=True)
+    task = bar.add_task("", total=1)
+    for done in steps:
+        clock[0] += 2.0
+        bar.update(task, completed=done, total=5000)
+    assert str(_Speed("frames").render(bar.tasks[0])) == text
+
+
+def test_figures_are_printed_in_percent(capsys):
+    print_figures({"clean": {"macro_f1": 0.98765, "ghost_recall": float("nan")}}, title="Figures")
+    said = capsys.readouterr().out
+    assert "macro f1" in said and "98.77" in said and "-" in said
