@@ -24,6 +24,7 @@ from train.metrics import macro_f1, percent
 from train.run_page import PAGE, write_run_page
 from train.shards import Dataset
 from train.synthesis import DatasetConfig, generate_dataset
+from train.training_state import TrainingState
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
 SMALL = TrainConfig(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
@@ -95,9 +96,7 @@ def test_the_last_look_agrees_with_the_card(run):
 
 
 def test_looking_at_held_out_frames_leaves_the_training_alone(dataset, run, tmp_path, monkeypatch):
-    from train.loop import _State
-
-    monkeypatch.setattr(_State, "look", lambda state, rows, names: None)
+    monkeypatch.setattr(TrainingState, "look", lambda state, rows, names: None)
     train_labeler(dataset, SMALL, tmp_path / "blind")
     one, other = (torch.load(path / CHECKPOINT, weights_only=True) for path in (run[0], tmp_path / "blind"))
     for name, values in one["network"].items():

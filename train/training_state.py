@@ -1,0 +1,149 @@
+"""What a training run carries from step to step, and how one step is made."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from torch import nn
+
+from handsim.errors import WeightsError
+from handsim.io import atomic_write
+from train.batches import Batch, paper_corruption
+from train.config import TrainConfig
+from train.evaluation import Report, evaluate_labeler
+from train.history import History
+from train.kinds import batch_loss, labeler_of, new_network
+from train.labeling import Labeler
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_CURVE: Final = 200  # points of the loss curve
+
+
+class TrainingState:
+    """What a run carries from step to step, and a checkpoint from run to run."""
+
+    def __init__(self, config: TrainConfig, fabric: Fabric) -> None:
+        self.config = config
+        self.fabric = fabric
+        network = new_network(config.labeler, config.network)
+        self.network, self.optimizer = fabric.setup(network, _optimizer(config, network))
+        self.mean = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
+        self.done = 0
+        self.history = History()
+        self.began = time.monotonic(), 0
+
+    def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
+        """One gradient step; the loss before it."""
+        rate = self.config.learning_rate * _rate(self.config, self.done / self.config.samples)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        loss = batch_loss(self.config.labeler, self.network, batch, self.fabric.device, rng=rng)
+        self.optimizer.zero_grad()
+        self.fabric.backward(loss)
+        if self.config.optimizer == "adamw":
+            self.fabric.clip_gradients(self.network, self.optimizer, max_norm=1.0)
+        self.optimizer.step()
+        self.done += self.config.batch
+        self._average()
+        value = float(loss.detach())
+        self.history.add(value)
+        if passed(self.done, self.config, _CURVE) or self.done >= self.config.samples:
+            self._log(rate)
+        return value
+
+    def _average(self) -> None:
+        decay = min(self.config.average, self.done / (self.done + 20.0 * self.config.batch))
+        with torch.no_grad():
+            for name, tensor in self.network.state_dict().items():
+                if tensor.is_floating_point():
+                    self.mean[name].lerp_(tensor, 1.0 - decay)
+                else:
+                    self.mean[name].copy_(tensor)
+
+    def _log(self, rate: float) -> None:
+        loss = self.history.close(self.done, rate)
+        since, done = self.began
+        now = time.monotonic()
+        speed = (self.done - done) / (now - since)
+        self.began = now, self.done
+        self.fabric.log_dict(
+            {"loss": loss, "learning_rate": rate, "samples_per_second": speed}, step=self.done
+        )
+
+    def look(self, rows: NDArray[np.void], names: tuple[str, ...]) -> None:
+        """Note how the mean weights do on a few held-out rows, the same each time."""
+        report = paper_report(labeler_of(self.averaged(), names), rows)
+        accuracy = report.figures["slot_accuracy"]
+        self.history.accuracies.append((self.done, accuracy))
+        self.fabric.log_dict({"held_out_slot_accuracy": accuracy}, step=self.done)
+
+    def averaged(self) -> nn.Module:
+        """The network with the mean weights."""
+        with torch.random.fork_rng(devices=[]):  # its first weights are drawn for nothing
+            network = new_network(self.config.labeler, self.config.network)
+        network.load_state_dict({name: tensor.cpu() for name, tensor in self.mean.items()})
+        return network.eval()
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        content = {
+            "network": self.network.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "mean": self.mean,
+            "done": self.done,
+            "history": dataclasses.asdict(self.history),
+        }
+        if self.fabric.is_global_zero:
+            with atomic_write(path) as temporary:
+                torch.save(content, temporary)
+
+    def restore(self, path: Path) -> None:
+        """Go on from a checkpoint, if there is one."""
+        if not path.is_file():
+            return
+        try:
+            content = torch.load(path, weights_only=True, map_location=self.fabric.device)
+            self.network.load_state_dict(content["network"])
+            self.optimizer.load_state_dict(content["optimizer"])
+            self.mean, self.done = content["mean"], content["done"]
+            self.history = History(**content.get("history", {}))  # older checkpoints have none
+        except (RuntimeError, KeyError, TypeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+            raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
+        self.began = time.monotonic(), self.done
+
+
+def _optimizer(config: TrainConfig, network: nn.Module) -> torch.optim.Optimizer:
+    if config.optimizer == "sgd":
+        return torch.optim.SGD(
+            network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
+        )
+    return torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+
+
+def _rate(config: TrainConfig, progress: float) -> float:
+    """Share of the peak learning rate at a share of the run."""
+    if config.schedule == "steps":
+        return float(0.1 ** ((progress >= 50 / 75) + (progress >= 70 / 75)))
+    return float(min(1.0, progress / 0.01 + 1e-3) * 0.5 * (1.0 + np.cos(np.pi * min(1.0, progress))))
+
+
+def passed(done: int, config: TrainConfig, parts: int) -> bool:
+    """Whether the last step ended one of so many parts of the run, each at least a step long."""
+    part = max(config.batch, config.samples // parts)
+    return (done - config.batch) // part != done // part
+
+
+def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
+    """What a labeler reaches on these rows with the paper's corruption, the same each time."""
+    markers = rows["markers"].astype(np.float64)
+    corruption = paper_corruption(markers.shape[1])
+    return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
