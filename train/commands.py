@@ -27,6 +27,7 @@ from gloves.captures import WRITABLE, read_capture, write_capture
 from gloves.captures.capture import check_suffix
 from gloves.captures.collection import find_captures, read_markers
 from gloves.captures.markers import labelled_capture, unlabelled_frames
+from gloves.layout import load_layout
 from gloves.take import load_take
 from handsim.errors import HandSimError
 from train.config import Preset, TrainConfig, with_preset
@@ -38,6 +39,7 @@ from train.shards import Dataset, save_json
 from train.synthesis import DatasetConfig, generate_dataset
 from train.twins import TwinConfig, simulate_twin
 
+_SIDE_FRAMES = 100
 _TAKE = 1200  # frames of the continuous take that the report's gaps are from
 
 
@@ -128,8 +130,19 @@ def label(
     sure = np.concatenate([labelling.confidence for labelling in labellings]) if points else np.ones(1)
     Console().print(
         f"{out}: {len(frames)} frames, {named} of {points} points labelled, "
-        f"median confidence {np.median(sure):.3f}"
+        f"median confidence {np.median(sure):.3f}{_side(glove, frames, labels)}"
     )
+
+
+def _side(glove: str, frames: list[np.ndarray], labels: list[np.ndarray]) -> str:
+    """Whose hand it looks like, from a few frames with the most markers."""
+    from train.side import SideTeller
+
+    best = sorted(range(len(frames)), key=lambda frame: -int((labels[frame] >= 0).sum()))[:_SIDE_FRAMES]
+    teller = SideTeller(load_layout(glove), rng=np.random.default_rng(0))
+    sides = [teller.tell(frames[frame], labels[frame]) for frame in best]
+    votes = sum(clear if side == "right" else -clear for side, clear in sides)
+    return "" if votes == 0.0 else f", a {'right' if votes > 0.0 else 'left'} hand"
 
 
 def export(labeler: Annotated[str, tyro.conf.Positional], out: Path) -> None:
