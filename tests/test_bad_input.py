@@ -52,6 +52,8 @@ def folder(tmp_path, monkeypatch):
         "at_the_hands.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.0, 0.65, 1.1]),
         "damaged.truth.npz": "PK",
         "furlongs.trc": text.replace("\tmm\t", "\tfurlongs\t"),
+        "millimetres.trc": text.replace("\tmm\t", "\tm\t"),
+        "damaged.onnx": "onnx",
         "empty.trc": "\n".join(text.split("\n")[:5]) + "\n",
         "nothing.trc": "",
         "truncated.trc": text[: int(0.9 * len(text))],
@@ -96,6 +98,13 @@ CASES = {
     "no such take": ["evaluate", "missing.truth.npz", "--json", "out.json"],
     "an unknown glove of a table": ["reproduce", "table3", "--glove", "dense91"],
     "a negative seed of a table": ["reproduce", "table3", "--seed", "-1"],
+    "millimetres said to be metres": ["label", "millimetres.trc", "--out", "out.trc"],
+    "millimetres said to be metres, as truth": ["evaluate", "millimetres.trc", "--json", "out.json"],
+    "a damaged ONNX file": ["label", "good.trc", "--labeler", "damaged.onnx", "--out", "out.trc"],
+    "an export to another kind of file": ["export", "dense19", "--out", "out.pt"],
+    "an export of an unknown labeler": ["export", "dense91", "--out", "out.onnx"],
+    "an unknown labeler of a table": ["reproduce", "table4", "--labelers", "dense91"],
+    "a table of another glove's labeler": ["reproduce", "table6", "--labelers", "dense19"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }
 
