@@ -56,7 +56,6 @@ def train_labeler(
         DatasetError: The set is too small to train on.
         WeightsError: `out` holds a run of other settings.
     """
-    torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
     names = dataset.marker_names
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, num_labels=len(names)))
     rows, held_out = _split(dataset, config.batch)
@@ -100,6 +99,7 @@ def _split(dataset: Dataset, batch: int) -> tuple[NDArray[np.void], NDArray[np.v
 
 def start_fabric(config: TrainConfig, out: Path) -> Fabric:
     """Where the numbers are crunched: on GPUs where there are any, and what the curves are written with."""
+    torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its greetings are not about this run
     warnings.filterwarnings("ignore", module="lightning_fabric")
     fabric = Fabric(

@@ -12,7 +12,8 @@ from train.calibration import BINS, error_without, expected_calibration_error, r
 
 points = st.integers(1, 60).flatmap(
     lambda count: st.tuples(
-        arrays.arrays(float, count, elements=st.floats(0.0, 1.0, allow_subnormal=False)), arrays.arrays(bool, count)
+        arrays.arrays(float, count, elements=st.floats(0.0, 1.0, allow_subnormal=False)),
+        arrays.arrays(bool, count),
     )
 )
 
