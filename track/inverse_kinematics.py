@@ -209,6 +209,7 @@ def _fit_frames(
         else:
             starts = lay_shapes(shapes, hand.digits, target)
         least = np.inf
+        qpos[frame] = starts[0]
         for number in range(len(starts)):
             pose[:] = starts[number]
             cost = np.inf

@@ -62,13 +62,17 @@ def lay_shapes(shapes: Any, digits: Any, target: Any) -> Any:
     that can be laid on the markers best.
     """
     count = len(shapes.angles)
-    poses = np.empty((count + 1, NUM_QPOS))
+    laid, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))
     squares = np.empty(count)
     for number in range(count):
-        poses[number + 1, 7:] = shapes.angles[number]
-        squares[number] = lay_rigidly(shapes.markers[number], target, shapes.steadiness, poses[number + 1])
-    order = np.argsort(squares)
-    poses[1:] = poses[1:][order]
+        laid[number, 7:] = shapes.angles[number]
+        squares[number] = lay_rigidly(shapes.markers[number], target, shapes.steadiness, laid[number])
+    for number in range(count):
+        better = 0
+        for other in range(count):
+            if squares[other] < squares[number] or (squares[other] == squares[number] and other < number):
+                better += 1
+        poses[1 + better] = laid[number]
     markers = np.empty_like(target)
     poses[0] = poses[1]
     for _ in range(_ROUNDS):

@@ -163,6 +163,47 @@ def test_a_prediction_is_not_heard_where_all_markers_are(rng):
     np.testing.assert_array_equal(told.qpos, solver.solve(markers, qpos).qpos)
 
 
+def test_a_sparse_glove_is_steadied_by_a_prediction(rng):
+    model, glove = gloved_hand("right", rng, "sparse13")
+    qpos = random_poses(model, 30, rng)
+    markers = markers_of(model, glove, qpos) + rng.normal(scale=0.0005, size=(30, 13, 3))
+    solver = PoseSolver(model, glove)
+    told = solver.solve(markers, qpos, prediction=Prediction(qpos[:, 7:], np.full(20, 0.05)))
+    error, told_error = (np.abs(fit.qpos - qpos)[:, 7:].mean() for fit in (solver.solve(markers, qpos), told))
+    assert told_error < 0.5 * error
+
+
+def test_frames_and_starts_know_nothing_of_each_other(rng):
+    model, glove = gloved_hand("left", rng)
+    qpos = random_poses(model, 8, rng)
+    markers = markers_of(model, glove, qpos)
+    markers[3, :4] = np.nan
+    solver = PoseSolver(model, glove)
+    for initial in (None, move(qpos, 0.05 * rng.standard_normal((8, 26)))):
+        together = solver.solve(markers, initial)
+        for frame in range(8):
+            rows = slice(frame, frame + 1)
+            alone = solver.solve(markers[rows], None if initial is None else initial[rows])
+            np.testing.assert_array_equal(alone.qpos[0], together.qpos[frame])
+            assert alone.iterations[0] == together.iterations[frame]
+
+
+@pytest.mark.parametrize("name", ["Index", "BackHand"])
+def test_markers_that_leave_the_wrist_free_do_no_harm(name, rng):
+    model, glove = gloved_hand("right", rng)
+    qpos = random_poses(model, 3, rng)
+    markers = markers_of(model, glove, qpos)
+    few = np.full_like(markers, np.nan)
+    kept = [n for n, marker in enumerate(glove.layout.names) if marker.startswith(name)]
+    few[:, kept], few[:, 0] = markers[:, kept], markers[:, 0]
+    few[2, kept] = few[2, :1]  # all in one place
+    fit = PoseSolver(model, glove).solve(few)
+    assert np.isfinite(fit.qpos).all()
+    assert fit.rms[:2].max() < 1e-3
+    np.testing.assert_allclose(np.linalg.norm(fit.qpos[:, 3:7], axis=1), 1.0)
+    assert np.abs(fit.qpos[:, 7:]).max() < np.pi
+
+
 def test_limits_are_kept(rng):
     model, glove = gloved_hand("right", rng)
     low, high = model.skeleton.ranges.T
