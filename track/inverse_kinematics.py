@@ -51,7 +51,7 @@ class PoseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Where hinges are thought to be; it counts for digits that lack a marker."""
+    """Where hinges are thought to be; it counts for digits that lack a marker or never had three."""
 
     angles: Float[np.ndarray, "*T 20"]
     """Angles [rad], for each frame or for all."""
@@ -95,13 +95,13 @@ class PoseSolver:
         Args:
             targets: Labelled markers in the glove's order [m]; NaN where missing.
             initial: Poses to start from; a hand put together from a few shapes when not given, and where that
-                does not end within 1 mm, further shapes.
+                does not end within 0.5 mm RMS, each of those shapes, of which the best is kept.
             prediction: Where the hinges are thought to be.
             iterations: Steps at most from each start.
 
         Raises:
-            ShapeError: `targets` or `initial` do not fit the glove or each other, or a frame has fewer than 4
-                markers.
+            ShapeError: `targets`, `initial` or `prediction` do not fit the glove or each other, or a frame
+                has fewer than 4 markers.
         """
         # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
         targets = np.array(targets, dtype=np.float64, order="C")
@@ -112,7 +112,7 @@ class PoseSolver:
         starts = np.empty((0, NUM_QPOS))
         if initial is not None:
             starts = np.array(check_array("initial", initial, (None, NUM_QPOS)), order="C")
-            if len(starts) != len(targets):
+            if starts.shape != (len(targets), NUM_QPOS):
                 raise ShapeError(f"initial has shape {starts.shape}, wanted ({len(targets)}, {NUM_QPOS})")
         angles, trust = _rows(prediction, len(targets))
         wrong, qpos, rms, residuals, steps = _fit_frames(

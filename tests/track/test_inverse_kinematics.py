@@ -262,6 +262,8 @@ def test_bad_starts_predictions_and_distances_are_told(rng):
     solver, targets, flat = PoseSolver(model, glove), glove.points[None], join_qpos(np.zeros((1, 20)))
     with pytest.raises(ShapeError, match=r"initial has shape \(2, 27\), wanted \(1, 27\)"):
         solver.solve(targets, np.repeat(flat, 2, axis=0))
+    with pytest.raises(ShapeError, match=r"initial has shape \(1, 1, 27\), wanted \(1, 27\)"):
+        solver.solve(targets, flat[None])
     with pytest.raises(ShapeError, match=r"initial has shape \(1, 26\)"):
         solver.solve(targets, np.zeros((1, 26)))
     with pytest.raises(ShapeError, match="initial has a quaternion of length zero in frame 0"):
