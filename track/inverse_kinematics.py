@@ -1,33 +1,39 @@
 """Pose from labelled markers: Levenberg-Marquardt on the paper's E_IK (Han et al. 2018, section 4.3).
 
-Many frames are solved at once; a missing marker is NaN. Two terms keep what the markers leave open near rest:
-a hinge beyond its range is pulled back, and a weak prior that only matters where markers are missing.
+Frames are solved one by one, each from its own start; a missing marker is NaN. Two terms decide what markers
+leave open: a hinge beyond its range is pulled back, and a digit that lacks a marker, or never had three, is
+drawn towards rest, weakly, and towards a predicted pose where one is given.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import numba
 import numpy as np
 
 from gloves.attach import Attachment
 from handsim._checks import check_array
 from handsim.errors import ShapeError
-from handsim.jacobian import NUM_VELOCITIES, skinned_jacobian
-from handsim.model import HandModel, join_qpos
-from handsim.topology import NUM_JOINTS, NUM_QPOS
-from handsim.transforms import multiply_quaternions, rigid_fit, rotation_quaternions, vector_quaternions
+from handsim.model import HandModel
+from handsim.topology import DIGITS, NUM_JOINTS, NUM_QPOS
+from handsim.transforms import multiply_quaternions, vector_quaternions
+from track.gloved_hand import GlovedHand, gloved_hand, workspace
+from track.pose_descent import MARKER_NOISE, descend, find_misses
+from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
+    from jaxtyping import Float, Int
+    from numpy.typing import ArrayLike, NDArray
 
-_MARKER_NOISE: Final = 0.001  # [m] one standard deviation, which the priors below are weighed against
-_RANGE_SLACK: Final = np.deg2rad(2.0)  # standard deviation of a hinge beyond its range
-_REST_SPREAD: Final = np.deg2rad(90.0)  # and of any hinge around rest
-_RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
+_REST_PULL: Final = np.deg2rad(90.0) ** -2  # [1/rad^2] of a hinge around rest
+_WHISPER: Final = 1e-4  # what is left of it for a digit whose markers are all there
+_FEWEST_ON_A_DIGIT: Final = 3  # that tell its four hinges also when it is straight
 _FEWEST_MARKERS: Final = 4
+_EASING: Final = (1 / 64, 1 / 8, 1.0)  # of the tightness of a robust loss, so that a start may be far off
+_EASY_STEPS: Final = 8
+_GOOD: Final = 0.0005  # [m] RMS, limits and prior included, from which on no further start is tried
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,20 +45,95 @@ class PoseFit:
     """3D RMS distance over the markers that are there [m]."""
     residuals: Float[np.ndarray, "T M 3"]
     """Model minus marker [m], NaN where a marker is missing."""
+    iterations: Int[np.ndarray, "T"]
+    """Steps tried, over all starts of a frame."""
 
 
-def first_guess(
-    model: HandModel, attachment: Attachment, targets: Float[np.ndarray, "T M 3"]
-) -> Float[np.ndarray, "T 27"]:
-    """Relaxed hands laid on the markers by a rigid fit, frame by frame."""
-    qpos = join_qpos(np.tile(_RESTING, (len(targets), 1)))
-    markers = attachment.centres(model, model.forward_kinematics(qpos[:1]))
-    for frame, target in enumerate(targets):
-        there = np.isfinite(target).all(axis=1)
-        rotation, translation = rigid_fit(markers[0, there], target[there])
-        qpos[frame, :3] = translation
-        qpos[frame, 3:7] = rotation_quaternions(rotation[None])[0]
-    return qpos
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Where hinges are thought to be; it counts for digits that lack a marker or never had three."""
+
+    angles: Float[np.ndarray, "*T 20"]
+    """Angles [rad], for each frame or for all."""
+    spread: ArrayLike
+    """Their standard deviation [rad]: one number, or an array that goes with the angles."""
+
+
+class PoseSolver:
+    """Solves poses of one hand in one glove; what can be prepared is.
+
+    Args:
+        model: The hand.
+        attachment: Its glove.
+        outlier_distance: Distance [m] from which a marker loses its say (Geman and McClure 1987), so that a
+            wrong label does not bend the hand; not given, every marker keeps its say. It wants a good start.
+
+    Raises:
+        ShapeError: `outlier_distance` is not positive.
+    """
+
+    def __init__(
+        self, model: HandModel, attachment: Attachment, *, outlier_distance: float | None = None
+    ) -> None:
+        if outlier_distance is not None and not outlier_distance > 0.0:
+            raise ShapeError(f"outlier_distance is {outlier_distance:g} m, wanted a positive distance")
+        self._hand: GlovedHand = gloved_hand(model, attachment)
+        self._shapes: StartingShapes = starting_shapes(model, attachment)
+        self._tightness = 0.0 if outlier_distance is None else outlier_distance**-2
+        self._on_digit = np.array([(self._hand.digits == number).sum() for number in range(len(DIGITS))])
+
+    def solve(
+        self,
+        targets: Float[np.ndarray, "T M 3"],
+        initial: Float[np.ndarray, "T 27"] | None = None,
+        *,
+        prediction: Prediction | None = None,
+        iterations: int = 30,
+    ) -> PoseFit:
+        """Poses whose markers come nearest to labelled ones, each frame by itself.
+
+        Args:
+            targets: Labelled markers in the glove's order [m]; NaN where missing.
+            initial: Poses to start from; a hand put together from a few shapes when not given, and where that
+                does not end within 0.5 mm RMS, each of those shapes, of which the best is kept.
+            prediction: Where the hinges are thought to be.
+            iterations: Steps at most from each start.
+
+        Raises:
+            ShapeError: `targets`, `initial` or `prediction` do not fit the glove or each other, or a frame
+                has fewer than 4 markers.
+        """
+        # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
+        targets = np.array(targets, dtype=np.float64, order="C")
+        if targets.ndim != 3 or targets.shape[1:] != self._shapes.markers.shape[1:]:
+            raise ShapeError(
+                f"targets have shape {targets.shape}, wanted (T, {self._shapes.markers.shape[1]}, 3)"
+            )
+        starts = np.empty((0, NUM_QPOS))
+        if initial is not None:
+            starts = np.array(check_array("initial", initial, (None, NUM_QPOS)), order="C")
+            if starts.shape != (len(targets), NUM_QPOS):
+                raise ShapeError(f"initial has shape {starts.shape}, wanted ({len(targets)}, {NUM_QPOS})")
+        angles, trust = _rows(prediction, len(targets))
+        wrong, qpos, rms, residuals, steps = _fit_frames(
+            self._hand,
+            self._shapes,
+            self._on_digit,
+            targets,
+            starts,
+            angles,
+            trust,
+            self._tightness,
+            iterations,
+        )
+        if wrong >= 0:
+            there = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
+            if there < _FEWEST_MARKERS:
+                raise ShapeError(f"frame {wrong} has {there} markers, wanted at least {_FEWEST_MARKERS}")
+            raise ShapeError(
+                f"initial has a quaternion of length zero in frame {wrong}, wanted an orientation"
+            )
+        return PoseFit(qpos, rms, residuals, steps)
 
 
 def solve_poses(
@@ -63,53 +144,8 @@ def solve_poses(
     initial: Float[np.ndarray, "T 27"] | None = None,
     iterations: int = 30,
 ) -> PoseFit:
-    """Poses whose markers come nearest to labelled ones, all frames at once.
-
-    Args:
-        model: The hand.
-        attachment: Its glove.
-        targets: Labelled markers in the glove's order [m]; NaN where missing.
-        initial: Poses to start from; a rigid fit of the relaxed hand when not given.
-        iterations: Steps at most; a frame stops counting when it no longer improves.
-
-    Raises:
-        ShapeError: `targets` do not fit the glove, or a frame has fewer than 4 markers.
-    """
-    targets = np.asarray(targets, dtype=np.float64)
-    if targets.ndim != 3 or targets.shape[1:] != attachment.points.shape:
-        raise ShapeError(f"targets have shape {targets.shape}, wanted (T, {len(attachment.points)}, 3)")
-    there = np.isfinite(targets).all(axis=-1)
-    if len(targets) and there.sum(axis=1).min() < _FEWEST_MARKERS:
-        frame = int(there.sum(axis=1).argmin())
-        raise ShapeError(
-            f"frame {frame} has {int(there[frame].sum())} markers, wanted at least {_FEWEST_MARKERS}"
-        )
-    qpos = first_guess(model, attachment, targets) if initial is None else initial.copy()
-    check_array("initial", qpos, (None, NUM_QPOS))
-    damping = np.full(len(targets), 1e-2)
-    cost, gradient, normal = _linearise(model, attachment, targets, there, qpos)
-    for _ in range(iterations):
-        diagonal = np.einsum("tii->ti", normal)
-        damped = normal + (damping[:, None] * diagonal)[..., None] * np.eye(NUM_VELOCITIES)
-        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
-        trial = move(qpos, step)
-        trial_cost, trial_gradient, trial_normal = _linearise(model, attachment, targets, there, trial)
-        better = trial_cost < cost
-        gain = np.where(better, cost - trial_cost, 0.0)
-        qpos[better], gradient[better], normal[better] = (
-            trial[better],
-            trial_gradient[better],
-            trial_normal[better],
-        )
-        settled = bool((gain <= 1e-6 * cost)[better].all() and (damping[~better] > 1e3).all())
-        cost = np.minimum(cost, trial_cost)
-        damping = np.clip(np.where(better, damping * 0.3, damping * 8.0), 1e-9, 1e6)
-        if settled:
-            break
-    markers = attachment.centres(model, model.forward_kinematics(qpos))
-    residuals = markers - targets
-    rms = np.sqrt(np.nanmean((residuals**2).sum(axis=-1), axis=1)) if len(targets) else np.zeros(0)
-    return PoseFit(qpos, rms, residuals)
+    """`PoseSolver.solve` for one use of a hand and its glove."""
+    return PoseSolver(model, attachment).solve(targets, initial, iterations=iterations)
 
 
 def move(qpos: Float[np.ndarray, "T 27"], step: Float[np.ndarray, "T 26"]) -> Float[np.ndarray, "T 27"]:
@@ -121,30 +157,119 @@ def move(qpos: Float[np.ndarray, "T 27"], step: Float[np.ndarray, "T 26"]) -> Fl
     return moved
 
 
-def _linearise(
-    model: HandModel,
-    attachment: Attachment,
-    targets: NDArray[np.float64],
-    there: NDArray[np.bool_],
-    qpos: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Cost (T,), gradient (T, 26) and normal matrix (T, 26, 26) of every frame."""
-    bones = model.forward_kinematics(qpos)
-    markers = attachment.centres(model, bones)
-    residual = np.where(there[..., None], markers - targets, 0.0).reshape(len(qpos), -1) / _MARKER_NOISE
-    jacobian = skinned_jacobian(
-        model, bones, attachment.points, attachment.bone_indices, attachment.bone_weights
-    )
-    jacobian = np.where(there[..., None, None], jacobian, 0.0).reshape(len(qpos), -1, NUM_VELOCITIES)
-    jacobian /= _MARKER_NOISE
-    low, high = model.skeleton.ranges.T
-    angles = qpos[:, 7:]
-    beyond = (np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)) / _RANGE_SLACK
-    off_rest = (angles - _RESTING) / _REST_SPREAD
-    cost = (residual**2).sum(1) + (beyond**2).sum(1) + (off_rest**2).sum(1)
-    gradient = np.einsum("tnv,tn->tv", jacobian, residual)
-    gradient[:, 6:] += beyond / _RANGE_SLACK + off_rest / _REST_SPREAD
-    normal = jacobian.transpose(0, 2, 1) @ jacobian
-    hinges = np.arange(6, 6 + NUM_JOINTS)
-    normal[:, hinges, hinges] += (beyond != 0.0) / _RANGE_SLACK**2 + 1.0 / _REST_SPREAD**2
-    return cost, gradient, normal
+def _rows(prediction: Prediction | None, frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Predicted angles and the pull towards them, a row a frame or none."""
+    if prediction is None:
+        return np.empty((0, NUM_JOINTS)), np.empty((0, NUM_JOINTS))
+    spread = np.asarray(prediction.spread, dtype=np.float64)
+    if not (spread > 0.0).all():
+        raise ShapeError(f"prediction.spread is {spread.min():g} rad, wanted positive angles")
+    angles = check_array("prediction.angles", prediction.angles, (NUM_JOINTS,))
+    try:
+        return (
+            np.array(np.broadcast_to(angles, (frames, NUM_JOINTS)), order="C"),
+            np.array(np.broadcast_to(spread**-2, (frames, NUM_JOINTS)), order="C"),
+        )
+    except ValueError:
+        raise ShapeError(
+            f"prediction has angles of shape {angles.shape} and spread of shape {spread.shape}, "
+            f"wanted what goes with ({frames}, {NUM_JOINTS})"
+        ) from None
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _fit_frames(
+    hand: Any,
+    shapes: Any,
+    on_digit: Any,
+    targets: Any,
+    initial: Any,
+    predicted: Any,
+    trust: Any,
+    tightness: Any,
+    iterations: Any,
+) -> Any:
+    """First frame that cannot be solved (or -1), poses, RMS, residuals, steps."""
+    frames, count = targets.shape[:2]
+    qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
+    rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
+    centre, pull, seen = np.empty(NUM_JOINTS), np.empty(NUM_JOINTS), np.empty(len(on_digit), dtype=np.int64)
+    work, pose, target = workspace(count), np.empty(NUM_QPOS), np.empty((count, 3))
+    for frame in range(frames):
+        there = _read_markers(hand.digits, targets[frame], target, seen)
+        if there < _FEWEST_MARKERS:
+            return frame, qpos, rms, residuals, steps
+        _set_prior(seen, on_digit, predicted[frame:], trust[frame:], centre, pull)
+        if len(initial) > 0:
+            starts = initial[frame : frame + 1].copy()
+            length = np.sqrt((starts[0, 3:7] ** 2).sum())
+            if not length > 0.0:
+                return frame, qpos, rms, residuals, steps
+            starts[0, 3:7] /= length
+        else:
+            starts = lay_shapes(shapes, hand.digits, target)
+        least = np.inf
+        qpos[frame] = starts[0]
+        for number in range(len(starts)):
+            pose[:] = starts[number]
+            cost = np.inf
+            for part in _EASING:
+                if tightness == 0.0 and part < 1.0:
+                    continue
+                most = iterations if part == 1.0 else min(iterations, _EASY_STEPS)
+                cost, tried = descend(hand, target, pose, centre, pull, part * tightness, most, work)
+                steps[frame] += tried
+            if cost < least:
+                least = cost
+                qpos[frame] = pose
+            if least < there * (_GOOD / MARKER_NOISE) ** 2:
+                break
+        rms[frame] = _write_residuals(hand, target, qpos[frame], work, residuals[frame])
+    return -1, qpos, rms, residuals, steps
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _read_markers(digits: Any, given: Any, target: Any, seen: Any) -> Any:
+    """Copy one frame's markers, each whole or NaN; count them, and those on each digit."""
+    seen[:] = 0
+    there = 0
+    for marker in range(len(given)):
+        if np.isfinite(given[marker, 0] + given[marker, 1] + given[marker, 2]):
+            target[marker] = given[marker]
+            there += 1
+            if digits[marker] >= 0:
+                seen[digits[marker]] += 1
+        else:
+            target[marker] = np.nan
+    return there
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _set_prior(seen: Any, on_digit: Any, predicted: Any, trust: Any, centre: Any, pull: Any) -> None:
+    """Where this frame's hinges are drawn to and how strongly; `predicted` and `trust` begin with its row."""
+    for hinge in range(NUM_JOINTS):
+        digit = hinge // 4
+        whole = seen[digit] == on_digit[digit] and seen[digit] >= _FEWEST_ON_A_DIGIT
+        centre[hinge], pull[hinge] = RESTING[hinge], _REST_PULL * (_WHISPER if whole else 1.0)
+        if len(predicted) > 0 and not whole:
+            both = pull[hinge] + trust[0, hinge]
+            centre[hinge] += (predicted[0, hinge] - RESTING[hinge]) * trust[0, hinge] / both
+            pull[hinge] = both
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _write_residuals(hand: Any, target: Any, pose: Any, work: Any, residuals: Any) -> Any:
+    """Misses as the world sees them; returns their RMS."""
+    find_misses(hand, target, pose, work)
+    w, x, y, z = pose[3:7]
+    total, there = 0.0, 0
+    for marker in range(len(target)):
+        a, b, c = work.misses[marker]
+        i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
+        residuals[marker, 0] = a + 2.0 * (w * i + y * k - z * j)
+        residuals[marker, 1] = b + 2.0 * (w * j + z * i - x * k)
+        residuals[marker, 2] = c + 2.0 * (w * k + x * j - y * i)
+        if not np.isnan(a):
+            there += 1
+            total += a * a + b * b + c * c
+    return np.sqrt(total / there)

@@ -1,0 +1,168 @@
+"""Levenberg-Marquardt on one hand's pose, compiled: E_IK with limits, a prior and a robust loss."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numba
+import numpy as np
+
+from handsim.topology import NUM_JOINTS
+from track.gloved_hand import FAST, NUM_UNKNOWNS, gather, place_markers
+
+MARKER_NOISE: Final = 0.001  # [m] one standard deviation, which everything else is weighed against
+_MARKER_WEIGHT: Final = MARKER_NOISE**-2
+_LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2  # of a hinge beyond its range
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-10, 1e8
+_SMALL_GAIN = (1e-6 / MARKER_NOISE) ** 2  # markers nearer by a micron; what is left after that is far less
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def descend(
+    hand: Any, target: Any, qpos: Any, centre: Any, pull: Any, tightness: Any, most_steps: Any, work: Any
+) -> Any:
+    """Bring a pose to a minimum of its cost; returns the cost and how many steps were tried.
+
+    Args:
+        hand: The hand and its glove.
+        target: Markers (M, 3) [m]; NaN where missing.
+        qpos: Pose (27,) to start from, overwritten.
+        centre: Angles (20,) [rad] that the prior draws the hinges to.
+        pull: How strongly it does (20,) [1/rad^2].
+        tightness: Squared inverse of the distance from which a marker loses its say [1/m^2]; zero for never.
+        most_steps: Steps at most.
+        work: Room for the arithmetic.
+    """
+    trial = qpos.copy()
+    weights = np.zeros(len(target))
+    cost = _find_cost(hand, target, qpos, centre, pull, tightness, work)
+    _linearise(hand, qpos, centre, pull, tightness, weights, work)
+    damping, steps = _FIRST_DAMPING, 0
+    while steps < most_steps and damping < _MOST_DAMPING:
+        steps += 1
+        gain = _solve(hand.starts, damping, work)
+        if gain < 0.0:
+            damping *= 10.0
+            continue
+        move_wrist(qpos, work.step, trial)
+        for hinge in range(NUM_JOINTS):
+            trial[7 + hinge] = qpos[7 + hinge] + work.step[hinge]
+        trial_cost = _find_cost(hand, target, trial, centre, pull, tightness, work)
+        better = trial_cost < cost
+        if better:
+            qpos[:] = trial
+            cost = trial_cost
+        if gain < _SMALL_GAIN:
+            break
+        if better:
+            _linearise(hand, qpos, centre, pull, tightness, weights, work)
+        damping = max(damping * 0.1, _LEAST_DAMPING) if better else damping * 10.0
+    return cost, steps
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def find_misses(hand: Any, target: Any, qpos: Any, work: Any) -> None:
+    """Place the hand's markers and carry those looked for into the wrist's frame."""
+    place_markers(hand, qpos[7:], work)
+    w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
+    for marker in range(len(target)):
+        a, b, c = (
+            target[marker, 0] - qpos[0],
+            target[marker, 1] - qpos[1],
+            target[marker, 2] - qpos[2],
+        )
+        # The inverse turn: v + 2 w (v x u) + 2 (v x u) x u, with u the quaternion's vector.
+        i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
+        place, miss = work.markers[marker], work.misses[marker]
+        miss[0] = place[0] - a - 2.0 * (w * i + j * z - k * y)
+        miss[1] = place[1] - b - 2.0 * (w * j + k * x - i * z)
+        miss[2] = place[2] - c - 2.0 * (w * k + i * y - j * x)
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _find_cost(hand: Any, target: Any, qpos: Any, centre: Any, pull: Any, tightness: Any, work: Any) -> Any:
+    find_misses(hand, target, qpos, work)
+    cost = 0.0
+    for marker in range(len(target)):
+        miss = work.misses[marker]
+        square = miss[0] * miss[0] + miss[1] * miss[1] + miss[2] * miss[2]
+        if not np.isnan(square):
+            cost += _MARKER_WEIGHT * square / (1.0 + tightness * square)  # Geman and McClure 1987
+    for hinge in range(NUM_JOINTS):
+        angle = qpos[7 + hinge]
+        off = angle - centre[hinge]
+        beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
+        cost += pull[hinge] * off * off + _LIMIT_WEIGHT * beyond * beyond
+    return cost
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _linearise(hand: Any, qpos: Any, centre: Any, pull: Any, tightness: Any, weights: Any, work: Any) -> None:
+    """Normal matrix and half the gradient where `find_misses` was last called."""
+    for marker in range(len(weights)):
+        miss = work.misses[marker]
+        square = miss[0] * miss[0] + miss[1] * miss[1] + miss[2] * miss[2]
+        weights[marker] = 0.0 if np.isnan(square) else _MARKER_WEIGHT / (1.0 + tightness * square) ** 2
+    gather(hand, weights, work)
+    for hinge in range(NUM_JOINTS):
+        angle = qpos[7 + hinge]
+        work.gradient[hinge] += pull[hinge] * (angle - centre[hinge])
+        work.normal[hinge, hinge] += pull[hinge]
+        beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
+        if beyond != 0.0:
+            work.gradient[hinge] += _LIMIT_WEIGHT * beyond
+            work.normal[hinge, hinge] += _LIMIT_WEIGHT
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _solve(starts: Any, damping: Any, work: Any) -> Any:
+    """Step down the damped normal equations by a skyline Cholesky factor.
+
+    Returns by how much the cost should fall; a negative number when there is no factor.
+    """
+    factor, step, gain = work.factor, work.step, 0.0
+    for row in range(NUM_UNKNOWNS):
+        start, own = starts[row], factor[row]
+        rest = -work.gradient[row]
+        pivot = work.normal[row, row] * (1.0 + damping)
+        for column in range(start, row):
+            other = factor[column]
+            entry = work.normal[column, row]
+            for k in range(max(start, starts[column]), column):
+                entry -= own[k] * other[k]
+            entry *= other[column]
+            own[column] = entry
+            pivot -= entry * entry
+            rest -= entry * step[column]
+        if not pivot > 0.0:
+            return -1.0
+        own[row] = 1.0 / np.sqrt(pivot)
+        step[row] = rest * own[row]
+        gain += step[row] * step[row]
+    for row in range(NUM_UNKNOWNS - 1, -1, -1):
+        step[row] *= factor[row, row]
+        for column in range(starts[row], row):
+            step[column] -= factor[row, column] * step[row]
+    return gain
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def move_wrist(qpos: Any, step: Any, moved: Any) -> None:
+    """Shift and turn the wrist along its own axes, which are the last six of a step."""
+    w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
+    a, b, c = step[NUM_JOINTS], step[NUM_JOINTS + 1], step[NUM_JOINTS + 2]
+    i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
+    moved[0] = qpos[0] + a + 2.0 * (w * i + y * k - z * j)
+    moved[1] = qpos[1] + b + 2.0 * (w * j + z * i - x * k)
+    moved[2] = qpos[2] + c + 2.0 * (w * k + x * j - y * i)
+    a, b, c = step[NUM_JOINTS + 3], step[NUM_JOINTS + 4], step[NUM_JOINTS + 5]
+    angle = np.sqrt(a * a + b * b + c * c)
+    share = 0.5 if angle < 1e-8 else np.sin(0.5 * angle) / angle
+    e, a, b, c = np.cos(0.5 * angle), share * a, share * b, share * c
+    moved[3] = w * e - x * a - y * b - z * c
+    moved[4] = w * a + x * e + y * c - z * b
+    moved[5] = w * b - x * c + y * e + z * a
+    moved[6] = w * c + x * b - y * a + z * e
+    scale = 1.0 / np.sqrt(moved[3] ** 2 + moved[4] ** 2 + moved[5] ** 2 + moved[6] ** 2)
+    for n in range(3, 7):
+        moved[n] *= scale
