@@ -202,21 +202,20 @@ def evaluate(
         corruption = Corruption(occlude, ghosts)
         report = evaluate_labeler(network, markers, corruption, rng=np.random.default_rng(seed))
         title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
-    print_figures({"share": report.figures}, title=title)
     by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
-    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
-    Console().print("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
+    _print_report(report.figures, by_marker, title)
     if json is not None:
-        settings = {
-            "glove": glove,
-            "occlude": occlude,
-            "ghosts": ghosts,
-            "seed": seed,
-            "frames": report.num_frames,
-        }
+        drawn = {"glove": glove, "occlude": occlude, "ghosts": ghosts, "seed": seed}
         # JSON knows no NaN, which stands where there was nothing to count.
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
-        save_json(json, {**settings, "figures": figures, "slot_accuracy_by_marker": by_marker})
+        found = {"frames": report.num_frames, "figures": figures, "slot_accuracy_by_marker": by_marker}
+        save_json(json, {**drawn, **found})
+
+
+def _print_report(figures: dict[str, float], by_marker: dict[str, float], title: str) -> None:
+    print_figures({"share": figures}, title=title)
+    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
+    Console().print("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
 
 
 @contextmanager
