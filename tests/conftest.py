@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,3 +25,11 @@ def sig18() -> Path:
     if not folder.is_dir():
         pytest.skip("the Mocap_SIG18_Data captures are not here; HANDSIM_SIG18 may name their folder")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def denormals() -> Iterator[None]:
+    """Training flushes denormal numbers in the whole process; hypothesis then refuses to draw any."""
+    yield
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_flush_denormal(False)
