@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _SPREAD: Final = 0.002
-"""How fast confidence falls with distance: by e in this much [m]; half of the held-out errors are less."""
+"""How fast confidence falls with distance: by e in this much [m]; chosen, not calibrated."""
 
 
 class TrainedCNNLabeler:
