@@ -8,8 +8,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from gloves.captures import read_capture
-from gloves.captures.markers import select_markers
+from gloves.captures.collection import read_markers
 from gloves.layout import load_layout
 from handsim.errors import ShapeError, WeightsError
 from train.augmentation import Corruption
@@ -32,9 +31,7 @@ def test_real_people_are_labelled(sig18, corruption, least, rng):
     labeler = load_labeler("dense19")
     files = sorted(sig18.rglob("*.trc"))
     chosen = rng.choice(len(files), size=40, replace=False)
-    markers = np.concatenate(
-        [select_markers(read_capture(files[number]), labeler.marker_names) for number in chosen]
-    )
+    markers = read_markers([files[number] for number in chosen], labeler.marker_names)
     frames = markers[rng.choice(len(markers), size=min(2000, len(markers)), replace=False)]
     assert evaluate_labeler(labeler, frames, corruption, rng=rng).figures["slot_accuracy"] >= least
 
