@@ -19,9 +19,9 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.topology import DIGITS, NUM_JOINTS, NUM_QPOS
 from handsim.transforms import multiply_quaternions, vector_quaternions
-from track.gloved_hand import GlovedHand, gloved_hand, workspace
+from track.gloved_hand import GlovedHand, gloved_hand, place_markers, workspace
 from track.pose_descent import MARKER_NOISE, descend, find_misses
-from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes
+from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes, write_rotation
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -134,6 +134,14 @@ class PoseSolver:
                 f"initial has a quaternion of length zero in frame {wrong}, wanted an orientation"
             )
         return PoseFit(qpos, rms, residuals, steps)
+
+    def place(
+        self, qpos: Float[np.ndarray, "27"]
+    ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 3 3"]]:
+        """Where a pose has its markers [m], and how the bones that carry them are turned, in the world."""
+        places, turns = np.empty((len(self._hand.digits), 3)), np.empty((len(self._hand.digits), 3, 3))
+        _place_in_world(self._hand, np.array(qpos, dtype=np.float64), places, turns)
+        return places, turns
 
 
 def solve_poses(
@@ -255,6 +263,23 @@ def _set_prior(seen: Any, on_digit: Any, predicted: Any, trust: Any, centre: Any
             both = pull[hinge] + trust[0, hinge]
             centre[hinge] += (predicted[0, hinge] - RESTING[hinge]) * trust[0, hinge] / both
             pull[hinge] = both
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _place_in_world(hand: Any, pose: Any, places: Any, turns: Any) -> None:
+    """Markers and their strongest bones' rotations of one pose."""
+    work, wrist = workspace(len(hand.digits)), np.empty((3, 3))
+    place_markers(hand, pose[7:], work)
+    write_rotation(pose[3:7], wrist)
+    for marker in range(len(places)):
+        own = work.rotations[hand.bones[marker, 0]]
+        for i in range(3):
+            places[marker, i] = pose[i]
+            for j in range(3):
+                places[marker, i] += wrist[i, j] * work.markers[marker, j]
+                turns[marker, i, j] = 0.0
+                for k in range(3):
+                    turns[marker, i, j] += wrist[i, k] * own[k, j]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
