@@ -13,6 +13,8 @@ import numpy as np
 
 from handsim.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.transforms import multiply_quaternions, quaternion_vectors
+from track.digit_search import digit_ranges
+from track.gloved_hand import gloved_hand
 from track.inverse_kinematics import PoseFit, PoseSolver, Prediction, move
 from track.user import UserHand
 
@@ -23,10 +25,11 @@ if TYPE_CHECKING:
 _FIRST_SPREAD: Final = 0.003  # [m] of a marker around where a hand not yet known has it
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
-_DRIFT: Final = 0.08  # [m/s] that a marker nobody sees may stray from where it is expected
-_MOST_DRIFT: Final = 0.012  # [m]
-_SWAY: Final = (np.deg2rad(2.0), np.deg2rad(300.0), np.deg2rad(40.0))  # spread of a hinge nobody sees: at
-# once [rad], by the time [rad/s], at most [rad]
+_NOISE: Final = 0.001  # [m] of markers around a fitted pose
+_SWAY: Final = (np.deg2rad(1.0), 150.0, np.deg2rad(40.0))
+"""Spread of a hinge nobody sees: at once [rad], by an unforeseen acceleration [rad/s^2], at most [rad]."""
+_ARC: Final = 0.04  # [m] radius of the arcs that markers move on
+_FADING: Final = 0.7  # of the speed of a digit that lacks markers, from frame to frame
 _SMOOTHING: Final = 0.6  # share of the newest speed
 _LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
 
@@ -43,15 +46,19 @@ class HandMemory:
         self.solver = PoseSolver(hand.model, hand.attachment)
         self.qpos: NDArray[np.float64] | None = None
         self.time = 0.0
-        count = hand.attachment.layout.num_markers
+        count = self.num_markers = hand.attachment.layout.num_markers
         bones = hand.attachment.bone_indices[np.arange(count), hand.attachment.bone_weights.argmax(axis=1)]
-        self._digits = np.array([BONES[bone].digit for bone in bones])
+        self.digits = np.array([BONES[bone].digit for bone in bones])
         self._speed = np.zeros(6 + NUM_JOINTS)
         self._habit = np.zeros((count, 3))
-        self._variance = np.full(count, _FIRST_SPREAD**2)
+        self.variance = np.full(count, _FIRST_SPREAD**2)
         self._learned = np.zeros(count)
-        self._seen = np.zeros(count)
         self._whole = np.zeros(len(DIGITS))
+        self.adapted = gloved_hand(hand.model, hand.attachment)
+        self._designed = self.adapted.places[:, 0].copy()
+        self.ranges = digit_ranges(self.adapted)
+        self._turns = np.zeros((count, 3, 3))
+        self.places = np.full((count, 3), np.nan)
 
     def predict(self, time: float) -> Float[np.ndarray, "27"]:
         """The pose that is coming, if the hand moves on as it did.
@@ -64,20 +71,26 @@ class HandMemory:
         return moved
 
     def expect(
-        self, qpos: Float[np.ndarray, "27"], time: float
-    ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M"]]:
-        """Where a pose and the markers' habits have them, and how far they may be from there [m]."""
-        places, turns = self.solver.place(qpos)
-        places -= np.einsum("mij,mj->mi", turns, self._habit)
-        unseen = np.where(self._digits >= 0, np.minimum(_DRIFT * (time - self._seen), _MOST_DRIFT), 0.0)
-        return places, np.sqrt(self._variance + unseen**2)
+        self, qpos: Float[np.ndarray, "27"], there: Bool[np.ndarray, "M"], time: float
+    ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 3 3"]]:
+        """Where a pose fitted to some markers and the markers' habits have them [m], with covariances."""
+        seen = self.solver.expect(qpos, there, spread=np.repeat(self.sway(time), 4), noise=_NOISE)
+        self._turns = seen.turns
+        places = seen.places - np.einsum("mij,mj->mi", seen.turns, self._habit)
+        # An arc leaves its tangent: open along it means open across it, by the square over twice its radius.
+        bend = np.trace(seen.covariances, axis1=1, axis2=2) / (2.0 * _ARC)
+        return places, seen.covariances + (self.variance + bend**2)[:, None, None] * np.eye(3)
 
     def fit(self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], time: float) -> PoseFit:
         """Solve the pose; digits that lack markers are drawn to the start."""
-        at_once, by_time, most = _SWAY
-        sway = np.minimum(at_once + by_time * (time - self._whole), most)
-        prediction = Prediction(start[7:], np.repeat(sway, 4))
+        prediction = Prediction(start[7:], np.repeat(self.sway(time), 4))
         return self.solver.solve(targets[None], start[None], prediction=prediction)
+
+    def sway(self, time: float) -> NDArray[np.float64]:
+        """How far the hinges of each digit may be from where they were coming to."""
+        at_once, gain, most = _SWAY
+        sway: NDArray[np.float64] = np.minimum(at_once + 0.5 * gain * (time - self._whole) ** 2, most)
+        return sway
 
     def begin(self, fit: PoseFit, time: float) -> None:
         """Take up a hand that has just been found."""
@@ -99,20 +112,19 @@ class HandMemory:
         self.qpos, self.time = fit.qpos[0], time
         misses = fit.residuals[0]
         there = np.isfinite(misses[:, 0])
-        self._seen[there] = time
-        missing = np.bincount(self._digits[~there & (self._digits >= 0)], minlength=len(DIGITS))
+        self.places, _ = self.expect(fit.qpos[0], there, time)
+        missing = np.bincount(self.digits[~there & (self.digits >= 0)], minlength=len(DIGITS))
         self._whole[missing == 0] = time
-        self._learn(fit.qpos[0], misses, there)
+        self._speed[6:].reshape(len(DIGITS), -1)[missing > 0] *= _FADING
+        self._learn(misses, there)
 
-    def _learn(
-        self, qpos: Float[np.ndarray, "27"], misses: Float[np.ndarray, "M 3"], there: Bool[np.ndarray, "M"]
-    ) -> None:
-        _, turns = self.solver.place(qpos)
-        local = np.einsum("mji,mj->mi", turns, np.where(there[:, None], misses, 0.0))
+    def _learn(self, misses: Float[np.ndarray, "M 3"], there: Bool[np.ndarray, "M"]) -> None:
+        local = np.einsum("mji,mj->mi", self._turns, np.where(there[:, None], misses, 0.0))
         self._learned[there] = np.minimum(self._learned[there] + 1.0, _MEMORY)
         rate = np.where(there, 1.0 / np.maximum(self._learned, 1.0), 0.0)
         off = local - self._habit
         self._habit += rate[:, None] * off
         known = np.maximum(rate, 1.0 / _MEMORY) * there * (self._learned > 1.0)
-        self._variance += known * ((off**2).sum(axis=1) - self._variance)
-        np.maximum(self._variance, _LEAST_SPREAD**2, out=self._variance)
+        self.variance += known * ((off**2).sum(axis=1) - self.variance)
+        np.maximum(self.variance, _LEAST_SPREAD**2, out=self.variance)
+        self.adapted.places[:, 0] = self._designed - self._habit

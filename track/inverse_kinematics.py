@@ -19,12 +19,13 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.topology import DIGITS, NUM_JOINTS, NUM_QPOS
 from handsim.transforms import multiply_quaternions, vector_quaternions
-from track.gloved_hand import GlovedHand, gloved_hand, place_markers, workspace
+from track.expectation import Expectation, expect_markers
+from track.gloved_hand import GlovedHand, gloved_hand, workspace
 from track.pose_descent import MARKER_NOISE, descend, find_misses
-from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes, write_rotation
+from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
     from numpy.typing import ArrayLike, NDArray
 
 _REST_PULL: Final = np.deg2rad(90.0) ** -2  # [1/rad^2] of a hinge around rest
@@ -135,13 +136,40 @@ class PoseSolver:
             )
         return PoseFit(qpos, rms, residuals, steps)
 
-    def place(
-        self, qpos: Float[np.ndarray, "27"]
-    ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 3 3"]]:
-        """Where a pose has its markers [m], and how the bones that carry them are turned, in the world."""
-        places, turns = np.empty((len(self._hand.digits), 3)), np.empty((len(self._hand.digits), 3, 3))
-        _place_in_world(self._hand, np.array(qpos, dtype=np.float64), places, turns)
-        return places, turns
+    def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
+        """Where a pose has its markers [m]."""
+        nowhere = np.zeros(len(self._hand.digits), dtype=bool)
+        return self.expect(qpos, nowhere, spread=np.ones(NUM_JOINTS), noise=MARKER_NOISE).places
+
+    def expect(
+        self,
+        qpos: Float[np.ndarray, "27"],
+        there: Bool[np.ndarray, "M"],
+        *,
+        spread: Float[np.ndarray, "20"],
+        noise: float,
+    ) -> Expectation:
+        """Where a fitted pose has its markers, and how far they may be from there.
+
+        Args:
+            qpos: The pose.
+            there: The markers that it was fitted to.
+            spread: Standard deviations of its hinges [rad] as they were thought to be before the fit; they
+                count as in `solve`.
+            noise: Standard deviation of those markers around the pose's [m].
+        """
+        count = len(self._hand.digits)
+        expectation = Expectation(np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3)))
+        expect_markers(
+            self._hand,
+            self._on_digit,
+            np.array(qpos, dtype=np.float64),
+            np.array(there),
+            np.array(spread, dtype=np.float64) ** -2,
+            noise**-2,
+            *expectation,
+        )
+        return expectation
 
 
 def solve_poses(
@@ -263,23 +291,6 @@ def _set_prior(seen: Any, on_digit: Any, predicted: Any, trust: Any, centre: Any
             both = pull[hinge] + trust[0, hinge]
             centre[hinge] += (predicted[0, hinge] - RESTING[hinge]) * trust[0, hinge] / both
             pull[hinge] = both
-
-
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _place_in_world(hand: Any, pose: Any, places: Any, turns: Any) -> None:
-    """Markers and their strongest bones' rotations of one pose."""
-    work, wrist = workspace(len(hand.digits)), np.empty((3, 3))
-    place_markers(hand, pose[7:], work)
-    write_rotation(pose[3:7], wrist)
-    for marker in range(len(places)):
-        own = work.rotations[hand.bones[marker, 0]]
-        for i in range(3):
-            places[marker, i] = pose[i]
-            for j in range(3):
-                places[marker, i] += wrist[i, j] * work.markers[marker, j]
-                turns[marker, i, j] = 0.0
-                for k in range(3):
-                    turns[marker, i, j] += wrist[i, k] * own[k, j]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

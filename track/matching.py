@@ -16,18 +16,28 @@ _NOTHING: Final = np.log(_STRAYS * (2.0 * np.pi) ** 1.5)
 
 
 def gains(
-    points: Float[np.ndarray, "P 3"], places: Float[np.ndarray, "K 3"], spreads: Float[np.ndarray, "K"]
+    points: Float[np.ndarray, "P 3"],
+    places: Float[np.ndarray, "K 3"],
+    covariances: Float[np.ndarray, "K 3 3"],
 ) -> Float[np.ndarray, "P K"]:
     """Log odds that a point is a marker rather than a stray.
 
     Args:
         points: Points [m].
-        places: Where markers are expected [m]; NaN for none.
-        spreads: How far they may be from there in each direction, one standard deviation [m].
+        places: Where markers are expected [m].
+        covariances: How far they may be from there [m^2].
     """
-    square = ((points[:, None] - places[None]) ** 2).sum(axis=-1)
-    odds: np.ndarray = -0.5 * square / spreads**2 - 3.0 * np.log(spreads) - _NOTHING
-    return np.where(np.isnan(odds), -np.inf, odds)
+    off = points[:, None] - places
+    precision = np.linalg.inv(covariances)
+    square = np.einsum("pki,kij,pkj->pk", off, precision, off)
+    odds: np.ndarray = 0.5 * np.log(np.linalg.det(precision)) - 0.5 * square - _NOTHING
+    return odds
+
+
+def worth_of(variances: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+    """Log odds of a point that lies where a marker with this variance [m^2] in each direction is expected."""
+    worth: np.ndarray = -1.5 * np.log(variances) - _NOTHING
+    return worth
 
 
 def match(
@@ -38,9 +48,9 @@ def match(
     Returns:
         Marker of each point, -1 for none, and how sure that is [0, 1], the rivals of both being weighed.
     """
-    labels, confidence = np.full(len(odds), -1), np.ones(len(odds))
+    labels = np.full(len(odds), -1)
     if 0 in odds.shape:
-        return labels, confidence
+        return labels, np.ones(len(odds))
     gain = np.maximum(odds, 0.0)
     rows, columns = linear_sum_assignment(-gain)
     weights = np.exp(np.minimum(odds, 50.0))

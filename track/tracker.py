@@ -1,120 +1,167 @@
-"""The online tracker: points of a frame in, hands out."""
+"""The online tracker: points of a frame in, hands in motion out.
+
+Section 4 of Han et al. 2018, with more memory: names go along with IDs while they fit, new points are named
+by what the hand that is coming explains (`track.naming`), and a hand of which nothing is known is looked for
+with the labeler (`track.finding`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from handsim.topology import NUM_QPOS
+from track.finding import MOST_RMS, HandFinder
 from track.hand_memory import HandMemory
 from track.inverse_kinematics import PoseFit
-from track.matching import gains, match
+from track.naming import fit_names, forget_surprises, name_new
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.user import UserHand
+from train.labeling import Labeler
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
     from numpy.typing import NDArray
 
-MOST_RMS: Final = 0.008
-"""RMS distance [m] beyond which a pose is thrown away; Han et al. 2018, section 4.4."""
-_FEWEST: Final = 6
-_LONGEST_COAST: Final = 0.1  # [s] without enough markers
-_SURPRISE: Final = 0.006  # [m] by which the coming pose may be wrong where a label is carried over by its ID
-_FIT: Final = 0.0015  # [m] by which a fitted pose may be
+_FEWEST: Final = 6  # named points that a pose can be relied on for
+_LONGEST_COAST: Final = 0.1  # [s] that a pose is carried on without them
+_MOST_CREDIT: Final = 12.0
+_INCOME: Final = 2.0  # credit of a name in each frame, less half the squared deviations it is off
 
 
 class Tracker:
-    def __init__(self, hands: Sequence[UserHand], finder) -> None:
-        self.memories = [HandMemory(hand) for hand in hands]
-        self._finder = finder
-        sizes = [hand.attachment.layout.num_markers for hand in hands]
+    """Follows the user's hands from frame to frame.
+
+    Args:
+        hands: The user's hands, each side at most once.
+        labeler: Knows the markers of the hands' glove.
+    """
+
+    def __init__(self, hands: Sequence[UserHand], labeler: Labeler) -> None:
+        self._memories = [HandMemory(hand) for hand in hands]
+        self._finder = HandFinder(self._memories, labeler)
+        sizes = [memory.num_markers for memory in self._memories]
         self._first = np.cumsum([0, *sizes])
-        self._labels: dict[int, int] = {}
-        self._attempt = 0
+        self._labels: dict[int, tuple[int, float]] = {}
 
-    def step(self, points, ids, time: float) -> TrackedFrame:
-        count = len(points)
-        labels = np.array([self._labels.get(i, -1) for i in ids.tolist()], dtype=np.int64) if count else np.zeros(0, dtype=np.int64)
-        confidence = np.ones(count)
-        fits: list[PoseFit | None] = [None] * len(self.memories)
-        starts = [m.predict(time) if m.qpos is not None else None for m in self.memories]
-        places = np.full((self._first[-1], 3), np.nan)
-        spreads = np.full(self._first[-1], 1.0)
-        for h, memory in enumerate(self.memories):
-            part = slice(self._first[h], self._first[h + 1])
-            if starts[h] is None:
-                labels[(labels >= part.start) & (labels < part.stop)] = -1
-                continue
-            places[part], spreads[part] = memory.expect(starts[h], time)
-        self._drop(labels, points, places, spreads, _SURPRISE)
-        for h, memory in enumerate(self.memories):
-            if starts[h] is None: continue
-            part = slice(self._first[h], self._first[h + 1])
-            fits[h] = self._fit(h, labels, points, starts[h], time)
-            if fits[h] is not None:
-                places[part], spreads[part] = memory.expect(fits[h].qpos[0], time)
-        known = self._drop(labels, points, places, spreads, _FIT)
-        free = np.flatnonzero(labels < 0)
-        missing = np.setdiff1d(np.flatnonzero(np.isfinite(places[:, 0])), labels)
-        new = np.zeros(len(self.memories), dtype=bool)
-        if len(free) and len(missing):
-            found, sure = match(gains(points[free], places[missing], spreads[missing]))
-            labels[free[found >= 0]] = missing[found[found >= 0]]
-            confidence[free] = sure
-            for h in range(len(new)):
-                new[h] = ((missing[found[found >= 0]] >= self._first[h]) & (missing[found[found >= 0]] < self._first[h + 1])).any()
-        for h, memory in enumerate(self.memories):
-            if starts[h] is not None and (new[h] or h in known):
-                fits[h] = self._fit(h, labels, points, starts[h], time)
-        hands = []
-        for h, memory in enumerate(self.memories):
-            part = slice(self._first[h], self._first[h + 1])
-            mine = (labels >= part.start) & (labels < part.stop)
-            fit = fits[h]
-            if fit is not None and mine.sum() >= _FEWEST and fit.rms[0] <= MOST_RMS:
-                memory.carry_on(fit, time)
-                hands.append(self._hand(h, Status.TRACKED, fit, time))
-                continue
-            if memory.qpos is not None and time - memory.time > _LONGEST_COAST:
-                memory.qpos = None
-            if memory.qpos is None:
-                labels[mine] = -1
-            hands.append(self._hand(h, Status.LOST if memory.qpos is None else Status.COASTING, None, time))
-        lost = [h for h, m in enumerate(self.memories) if m.qpos is None]
-        if lost:
-            free = np.flatnonzero(labels < 0)
-            for h, fit, own in self._finder.find(points[free], lost, free):
-                part = slice(self._first[h], self._first[h + 1])
-                labels[free[own >= 0]] = own[own >= 0] + part.start
-                self.memories[h].begin(fit, time)
-                hands[h] = self._hand(h, Status.FOUND, fit, time)
-        self._labels = {i: int(l) for i, l in zip(ids.tolist(), labels.tolist()) if l >= 0 and i >= 0}
-        return TrackedFrame(time, tuple(hands), labels, confidence)
+    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
+        """Take in the next frame.
 
-    def _drop(self, labels, points, places, spreads, slack):
-        """Take labels away from points too far from where their marker is expected."""
-        named = np.flatnonzero(labels >= 0)
-        if not len(named):
-            return set()
-        mine = labels[named]
-        off = ((points[named] - places[mine]) ** 2).sum(axis=1)
-        wrong = ~(off < 16.0 * (spreads[mine] ** 2 + slack**2))
-        hit = {int(np.searchsorted(self._first, label, side="right")) - 1 for label in mine[wrong]}
-        labels[named[wrong]] = -1
-        return hit
+        Args:
+            points: Points [m], none of them missing.
+            ids: The system's IDs: a point keeps its own for as long as it is seen; -1 where there is none.
+            time: Time of the frame [s].
+        """
+        names, credit = self._carry_over(ids)
+        sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
+        hands: list[TrackedHand] = []
+        for number, memory in enumerate(self._memories):
+            mine = names[number]
+            fit = None
+            if memory.qpos is not None:
+                free = np.logical_not((names >= 0).any(axis=0))
+                fit = self._follow(memory, points, mine, free, credit, sure, time)
+            hands.append(self._judge(memory, points, mine, credit, fit, time))
+        self._find_lost(points, names, hands, time)
+        labels = np.where(names >= 0, names + self._first[:-1, None], -1).max(axis=0, initial=-1)
+        self._labels = {
+            point: (label, worth)
+            for point, label, worth in zip(ids.tolist(), labels.tolist(), credit.tolist(), strict=True)
+            if label >= 0 and point >= 0
+        }
+        return TrackedFrame(time, tuple(hands), labels, sure)
 
-    def _fit(self, h, labels, points, start, time):
-        targets = np.full((self._first[h + 1] - self._first[h], 3), np.nan)
-        mine = (labels >= self._first[h]) & (labels < self._first[h + 1])
-        if mine.sum() < 4:
+    def _carry_over(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Names (H, N) that the IDs carry, and what they are worth (N,)."""
+        known = [self._labels.get(point, (-1, 0.0)) for point in ids.tolist()]
+        labels = np.array([label for label, _ in known], dtype=np.int64)
+        names = labels - self._first[:-1, None]
+        names[(names < 0) | (labels >= self._first[1:, None])] = -1
+        return names, np.array([worth for _, worth in known])
+
+    def _follow(
+        self,
+        memory: HandMemory,
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        free: Bool[np.ndarray, "N"],
+        credit: NDArray[np.float64],
+        sure: NDArray[np.float64],
+        time: float,
+    ) -> PoseFit | None:
+        """The pose of a hand that was there before; its names and credits are overwritten."""
+        coming = memory.predict(time)
+        forget_surprises(memory, points, names, coming, time)
+        fit = fit_names(memory, points, names, coming, time)
+        if fit is None:
             return None
-        targets[labels[mine] - self._first[h]] = points[mine]
-        return self.memories[h].fit(targets, start, time)
+        how_sure = name_new(memory, points, names, free, credit, fit.qpos[0], coming, time)
+        changed = np.isfinite(how_sure)
+        if changed.any():
+            credit[changed], sure[changed] = 0.0, how_sure[changed]
+            fit = fit_names(memory, points, names, coming, time)
+        return fit
 
-    def _hand(self, h, status, fit, time):
-        memory = self.memories[h]
-        M = self._first[h + 1] - self._first[h]
-        qpos = np.full(27, np.nan) if memory.qpos is None else memory.qpos
-        return TrackedHand(memory.hand.side, status, qpos, float(fit.rms[0]) if fit else np.nan, np.full((M, 3), np.nan), np.zeros(0, dtype=int))
+    def _judge(
+        self,
+        memory: HandMemory,
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        credit: NDArray[np.float64],
+        fit: PoseFit | None,
+        time: float,
+    ) -> TrackedHand:
+        """Take a pose over or throw it away."""
+        mine = np.flatnonzero(names >= 0)
+        if fit is not None and len(mine) >= _FEWEST and fit.rms[0] <= MOST_RMS:
+            memory.carry_on(fit, time)
+            off = ((points[mine] - memory.places[names[mine]]) ** 2).sum(axis=1)
+            income = _INCOME - 0.5 * off / memory.variance[names[mine]]
+            credit[mine] = np.clip(credit[mine] + income, 0.0, _MOST_CREDIT)
+            return _tracked(memory, Status.TRACKED, points, names, fit)
+        if memory.qpos is not None and time - memory.time > _LONGEST_COAST:
+            memory.qpos = None
+        if memory.qpos is None:
+            names[:] = -1
+            return _tracked(memory, Status.LOST, points, names, None)
+        return _tracked(memory, Status.COASTING, points, names, None)
+
+    def _find_lost(
+        self,
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        hands: list[TrackedHand],
+        time: float,
+    ) -> None:
+        """Look for the hands that have no pose among the points without a name."""
+        lost = [n for n, hand in enumerate(hands) if hand.status in (Status.LOST, Status.COASTING)]
+        if not lost:
+            return
+        others = np.delete(names, lost, axis=0)
+        free = np.flatnonzero((others < 0).all(axis=0))
+        for found in self._finder.find(points[free], lost):
+            memory = self._memories[found.number]
+            names[found.number] = -1
+            names[found.number, free] = found.names
+            memory.begin(found.fit, time)
+            hands[found.number] = _tracked(memory, Status.FOUND, points, names[found.number], found.fit)
+
+
+def _tracked(
+    memory: HandMemory,
+    status: Status,
+    points: NDArray[np.float64],
+    names: NDArray[np.int64],
+    fit: PoseFit | None,
+) -> TrackedHand:
+    count = memory.num_markers
+    if memory.qpos is None:
+        nothing = np.full((count, 3), np.nan)
+        return TrackedHand(memory.hand.side, status, np.full(NUM_QPOS, np.nan), np.nan, nothing, np.arange(0))
+    markers, mine = memory.places.copy(), names >= 0
+    markers[names[mine]] = points[mine]
+    filled = np.setdiff1d(np.arange(count), names[mine])
+    rms = np.nan if fit is None else float(fit.rms[0])
+    return TrackedHand(memory.hand.side, status, memory.qpos, rms, markers, filled)
