@@ -22,7 +22,7 @@ from track.user import UserHand
 from train.labeling import Labeler
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
 _FEWEST: Final = 6  # named points that a pose can be relied on for
@@ -61,8 +61,7 @@ class Tracker:
             mine = names[number]
             fit = None
             if memory.qpos is not None:
-                free = np.logical_not((names >= 0).any(axis=0))
-                fit = self._follow(memory, points, mine, free, credit, sure, time)
+                fit = self._follow(number, points, names, credit, sure, time)
             hands.append(self._judge(memory, points, mine, credit, fit, time))
         self._find_lost(points, names, hands, time)
         labels = np.where(names >= 0, names + self._first[:-1, None], -1).max(axis=0, initial=-1)
@@ -83,25 +82,26 @@ class Tracker:
 
     def _follow(
         self,
-        memory: HandMemory,
+        number: int,
         points: NDArray[np.float64],
         names: NDArray[np.int64],
-        free: Bool[np.ndarray, "N"],
         credit: NDArray[np.float64],
         sure: NDArray[np.float64],
         time: float,
     ) -> PoseFit | None:
-        """The pose of a hand that was there before; its names and credits are overwritten."""
+        """The pose of a hand that was there before; its names (a row of H, N) and credits are overwritten."""
+        memory, mine = self._memories[number], names[number]
         coming = memory.predict(time)
-        forget_surprises(memory, points, names, coming, time)
-        fit = fit_names(memory, points, names, coming, time)
+        forget_surprises(memory, points, mine, coming, time)
+        fit = fit_names(memory, points, mine, coming, time)
         if fit is None:
             return None
-        how_sure = name_new(memory, points, names, free, credit, fit.qpos[0], coming, time)
+        free = np.logical_not((names >= 0).any(axis=0))
+        how_sure = name_new(memory, points, mine, free, credit, fit.qpos[0], coming, time)
         changed = np.isfinite(how_sure)
         if changed.any():
             credit[changed], sure[changed] = 0.0, how_sure[changed]
-            fit = fit_names(memory, points, names, coming, time)
+            fit = fit_names(memory, points, mine, coming, time)
         return fit
 
     def _judge(
