@@ -47,7 +47,7 @@ _COASTING: Final = 0.026  # [s] without three markers, three frames at 120 Hz, b
 _FITS: Final = 5  # in a row that tell how fast it moves
 _EASE: Final = 0.4  # weight of the newest velocity: a fit to three markers wobbles
 _NEARBY: Final = 0.25  # [s] after which it may be anywhere
-_SPREAD, _PACE = 0.005, 1.5  # [m], [m/s]: how far off a prediction a marker may be, at first and with time
+_SPREAD, _PACE = 0.01, 0.8  # [m], [m/s]: how far off a prediction a marker may be, at first and with time
 _NEAR: Final = 0.05  # [m]: so near to where it was, three markers are believed at once
 _STILL: Final = 0.02  # [m] a frame that a candidate may move while it waits to be believed
 _MOST_POINTS: Final = 250  # among which it is looked for: some 30 ms, and it grows with their third power
@@ -161,7 +161,7 @@ class BodyTracker:
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
         self._places, self._sides = template.places, template.sides
-        self._pose, self._time = np.full(7, np.nan), -np.inf  # of the last fit
+        self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
         self._lose()
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
@@ -200,7 +200,6 @@ class BodyTracker:
 
     def _lose(self) -> None:
         self._status: Status = "lost"
-        self._velocity = np.zeros(6)
         self._known = np.full(len(self._places), -1)  # IDs of the last frame
         self._most, self._fits = 0, 0  # since it was found: markers that agreed at once, frames fitted
         self._candidate, self._waited = np.full(7, np.nan), 0
@@ -237,8 +236,8 @@ class BodyTracker:
         """The body where it was a moment ago, or anywhere."""
         pose, owners = np.empty(7), np.empty(len(self._places), dtype=np.int64)
         if 0.0 < elapsed <= _NEARBY:
-            reach = _SPREAD + _PACE * elapsed
-            count, rms = self._search(points, self._pose, reach, owners, pose)
+            reach, predicted = _SPREAD + _PACE * elapsed, advance(self._pose, self._velocity, elapsed)
+            count, rms = self._search(points, predicted, reach, owners, pose)
             if count > FEWEST or (count == FEWEST and reach <= _NEAR):
                 return self._keep("found", pose, rms, owners, ids, time)
         count, rms = self._search(points, None, np.inf, owners, pose)
