@@ -69,7 +69,7 @@ class RigidTemplate:
     """[m] in the body's frame."""
 
     def __post_init__(self) -> None:
-        places = np.ascontiguousarray(check_array("places", self.places, (len(self.marker_names), 3)))
+        places = np.array(check_array("places", self.places, (len(self.marker_names), 3)), order="C")
         object.__setattr__(self, "places", places)
         if places.ndim != 2 or len(places) < FEWEST:
             raise ShapeError(
@@ -161,8 +161,11 @@ class BodyTracker:
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
         self._places, self._sides = template.places, template.sides
-        self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
-        self._lose()
+        self._forget()
+        for number in range(18):  # so that no kernel is loaded while somebody waits for a frame
+            there = self._places if number < 17 else self._places[:0]
+            self.step(there, np.arange(len(there)), number / 120.0)
+        self._forget()
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
         """One frame; whatever a stream may bring ends in a status.
@@ -176,8 +179,8 @@ class BodyTracker:
         Raises:
             ShapeError: `points` and `ids` do not fit together.
         """
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        ids = np.ascontiguousarray(ids, dtype=np.int64)
+        # Copies, because a kernel is compiled anew for arrays that are read-only or not contiguous.
+        points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
         if points.shape != (len(ids), 3):
             raise ShapeError(f"points have shape {points.shape}, wanted ({len(ids)}, 3) for {len(ids)} IDs")
         with np.errstate(invalid="ignore"):
@@ -197,6 +200,10 @@ class BodyTracker:
                 return frame
             self._lose()
         return self._find(points, ids, time, elapsed)
+
+    def _forget(self) -> None:
+        self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
+        self._lose()
 
     def _lose(self) -> None:
         self._status: Status = "lost"
