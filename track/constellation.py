@@ -14,6 +14,7 @@ import numpy as np
 from track.starting_poses import lay_rigidly
 
 FEWEST: Final = 3  # markers that tell a pose
+_NEW: Final = 1.5  # how much farther than tight a point with a new ID may be off
 _FLAT: Final = 0.1  # height of a triangle over its longest side, below which it tells no turn
 
 
@@ -92,35 +93,73 @@ def _squared(first: Any, second: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def settle(places: Any, points: Any, owners: Any, pose: Any, gate: float) -> Any:
-    """Fit the pose to the owned points and drop the worst until all agree within the gate.
+def settle(places: Any, points: Any, owners: Any, pose: Any, tight: float, gate: float) -> Any:
+    """Fit the pose to the owned points that agree tightly, and keep those that are within the gate of it.
+
+    Points that are wrong together pull a fit until the right ones look wrong; so that point goes without
+    which the others agree best, until all do.
 
     Returns:
-        How many agree and their RMS distance [m]; fewer than three leave the pose as it came.
+        How many are kept and their RMS distance [m]; with fewer than three that agree none is, and the pose
+        stays as it came.
     """
-    target, weights, fitted = np.empty_like(places), np.ones(len(places)), np.empty(7)
-    while True:
-        count = 0
-        for marker in range(len(places)):
-            target[marker] = np.nan
-            if owners[marker] >= 0:
-                target[marker] = points[owners[marker]]
-                count += 1
-        if count < FEWEST:
-            return count, np.nan
-        lay_rigidly(places, target, weights, fitted)
-        there = put(places, fitted)
-        worst, most, total = -1, -1.0, 0.0
-        for marker in range(len(places)):
-            if owners[marker] >= 0:
-                square = _squared(there[marker], target[marker])
-                total += square
-                if square > most:
-                    worst, most = marker, square
-        if most <= gate * gate:
-            pose[:] = fitted
-            return count, np.sqrt(total / count)
-        owners[worst] = -1
+    core, fitted = owners.copy(), np.empty(7)
+    count, _, worst = _fit(places, points, core, fitted)
+    while count > FEWEST and worst > tight * tight:
+        marker, clear = _odd_one(places, points, core)
+        if count == FEWEST + 1 and not clear:
+            break  # three of four agree in more than one way: all four, if they do within the gate
+        core[marker] = -1
+        count, _, worst = _fit(places, points, core, fitted)
+    limit = tight if count == FEWEST else gate
+    if count < FEWEST or not worst <= limit * limit:
+        owners[:] = -1
+        return 0, np.nan
+    pose[:] = fitted
+    there, count, total = put(places, pose), 0, 0.0
+    for marker in range(len(places)):
+        if owners[marker] >= 0:
+            square = _squared(there[marker], points[owners[marker]])
+            if square > gate * gate:
+                owners[marker] = -1
+            else:
+                count, total = count + 1, total + square
+    return count, np.sqrt(total / count)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _fit(places: Any, points: Any, owners: Any, pose: Any) -> Any:
+    """Fit the pose to the owned points, three at least; their number, sum of squares and largest square."""
+    target, count = np.full_like(places, np.nan), 0
+    for marker in range(len(places)):
+        if owners[marker] >= 0:
+            target[marker] = points[owners[marker]]
+            count += 1
+    if count < FEWEST:
+        return count, np.nan, np.nan
+    lay_rigidly(places, target, np.ones(len(places)), pose)
+    there, total, worst = put(places, pose), 0.0, 0.0
+    for marker in range(len(places)):
+        if owners[marker] >= 0:
+            square = _squared(there[marker], target[marker])
+            total, worst = total + square, max(worst, square)
+    return count, total, worst
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _odd_one(places: Any, points: Any, owners: Any) -> Any:
+    """The marker without which the others agree best, and whether they do much better than without another."""
+    odd, least, second, pose = -1, np.inf, np.inf, np.empty(7)
+    for marker in range(len(places)):
+        if owners[marker] >= 0:
+            point, owners[marker] = owners[marker], -1
+            _, squares, _ = _fit(places, points, owners, pose)
+            owners[marker] = point
+            if squares < least:
+                odd, least, second = marker, squares, least
+            elif squares < second:
+                second = squares
+    return odd, least < 0.1 * second
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -140,13 +179,13 @@ def carry(points: Any, ids: Any, known: Any, owners: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def complete(places: Any, points: Any, owners: Any, pose: Any, gate: float) -> Any:
+def complete(places: Any, points: Any, owners: Any, pose: Any, tight: float, gate: float) -> Any:
     """Let a pose that is known take the points that lie where its other markers are, and settle again."""
     there = put(places, pose)
     for marker in range(len(places)):
         if owners[marker] < 0:
-            owners[marker] = _nearest_free(points, there[marker], gate, owners)
-    return settle(places, points, owners, pose, gate)
+            owners[marker] = _nearest_free(points, there[marker], _NEW * tight, owners)
+    return settle(places, points, owners, pose, tight, gate)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -260,7 +299,7 @@ def _weigh(places: Any, points: Any, gate: float, trial: Any, owners: Any, pose:
     that gives three points to the same markers is no other.
     """
     trial_pose = np.empty(7)
-    count, rms = settle(places, points, trial, trial_pose, gate)
+    count, rms = settle(places, points, trial, trial_pose, gate, gate)
     if count < max(score[0], FEWEST):
         return
     other = ((trial >= 0) & (trial == owners)).sum() < FEWEST
@@ -306,15 +345,20 @@ def _frame(first: Any, second: Any, third: Any, axes: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def follow(places: Any, points: Any, ids: Any, known: Any, pose: Any, gate: float, owners: Any) -> Any:
+def follow(
+    places: Any, points: Any, ids: Any, known: Any, pose: Any, tight: float, gate: float, owners: Any
+) -> Any:
     """Owners by last frame's IDs, and the rest from the pose that they agree on.
 
     Returns:
         How many markers agree and their RMS distance [m]; fewer than three leave the pose as it came.
     """
-    if carry(points, ids, known, owners) < FEWEST or settle(places, points, owners, pose, gate)[0] < FEWEST:
+    if carry(points, ids, known, owners) < FEWEST:
         return 0, np.nan
-    return complete(places, points, owners, pose, gate)
+    count, rms = settle(places, points, owners, pose, tight, gate)
+    if FEWEST <= count < len(places):
+        return complete(places, points, owners, pose, tight, gate)
+    return count, rms
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

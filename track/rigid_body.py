@@ -39,8 +39,8 @@ if TYPE_CHECKING:
 Status = Literal["found", "tracked", "coasting", "lost"]
 GATE: Final = 0.003
 """How far a labelled point may be from its marker [m], ten times the noise of a good system."""
-_TIGHT: Final = 0.001  # [m], the same for a body that is looked for, where chance is at work
-_TIGHTEST: Final = 0.0005  # and for three markers
+_TIGHT: Final = 0.001  # [m], the same for those that make the pose, and for a body that is looked for
+_TIGHTEST: Final = 0.0005  # and for three that are looked for, where chance is at work
 _THINNEST: Final = 0.005  # [m] RMS off the line that runs best through the markers
 _CLOSEST: Final = 2.0 * GATE  # markers nearer to each other than this change labels unseen
 _COASTING: Final = 0.026  # [s] without three markers, three frames at 120 Hz, before a body is lost
@@ -130,7 +130,7 @@ def _look_alike(places: NDArray[np.float64], sides: NDArray[np.float64]) -> tupl
         ]
     for order in orders:
         if order != tuple(range(count)):
-            agree, _ = settle(places, places, np.array(order), np.empty(7), _TIGHT)
+            agree, _ = settle(places, places, np.array(order), np.empty(7), _TIGHT, _TIGHT)
             if agree == count:  # turned, not mirrored
                 return order
     return None
@@ -214,7 +214,7 @@ class BodyTracker:
     def _follow(self, points: Any, ids: Any, time: float, elapsed: float) -> BodyFrame | None:
         """The body where IDs or its motion say that it is."""
         pose, owners = np.empty(7), np.empty(len(self._places), dtype=np.int64)
-        count, rms = follow(self._places, points, ids, self._known, pose, GATE, owners)
+        count, rms = follow(self._places, points, ids, self._known, pose, _TIGHT, GATE, owners)
         if count < FEWEST and 0.0 < elapsed <= _NEARBY:
             predicted = advance(self._pose, self._velocity, elapsed)
             count, rms = self._search(points, predicted, _SPREAD + _PACE * elapsed, owners, pose)
@@ -266,9 +266,9 @@ class BodyTracker:
         count, _, rival = search(self._places, self._sides, points, wanted, reach, _TIGHT, owners, pose)
         if count < FEWEST or rival >= count:
             return 0, np.nan
-        if count == FEWEST and settle(self._places, points, owners, pose, _TIGHTEST)[0] < FEWEST:
+        if count == FEWEST and settle(self._places, points, owners, pose, _TIGHTEST, _TIGHTEST)[0] < FEWEST:
             return 0, np.nan
-        fitted: tuple[int, float] = complete(self._places, points, owners, pose, GATE)
+        fitted: tuple[int, float] = complete(self._places, points, owners, pose, _TIGHT, GATE)
         return fitted
 
     def _keep(self, status: Status, pose: Any, rms: float, owners: Any, ids: Any, time: float) -> BodyFrame:
