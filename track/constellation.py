@@ -148,7 +148,7 @@ def _fit(places: Any, points: Any, owners: Any, pose: Any) -> Any:
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _odd_one(places: Any, points: Any, owners: Any) -> Any:
-    """The marker without which the others agree best, and whether they do much better than without another."""
+    """The marker without which the others agree best, and whether without any other they do far worse."""
     odd, least, second, pose = -1, np.inf, np.inf, np.empty(7)
     for marker in range(len(places)):
         if owners[marker] >= 0:

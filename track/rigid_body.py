@@ -47,7 +47,8 @@ _COASTING: Final = 0.026  # [s] without three markers, three frames at 120 Hz, b
 _FITS: Final = 5  # in a row that tell how fast it moves
 _EASE: Final = 0.4  # weight of the newest velocity: a fit to three markers wobbles
 _NEARBY: Final = 0.25  # [s] after which it may be anywhere
-_SPREAD, _PACE = 0.01, 0.8  # [m], [m/s]: how far off a prediction a marker may be, at first and with time
+_SPREAD, _PACE = 0.005, 1.5  # [m], [m/s]: how far off a marker may be when it is not known how fast it moves
+_ERROR, _HASTE = 0.002, 30.0  # [m], [m/s^2]: and when it is
 _NEAR: Final = 0.05  # [m]: so near to where it was, three markers are believed at once
 _STILL: Final = 0.02  # [m] a frame that a candidate may move while it waits to be believed
 _MOST_POINTS: Final = 250  # among which it is looked for: some 30 ms, and it grows with their third power
@@ -203,12 +204,12 @@ class BodyTracker:
 
     def _forget(self) -> None:
         self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
+        self._most, self._fits = 0, 0  # since it was found: markers that agreed at once, frames fitted
         self._lose()
 
     def _lose(self) -> None:
         self._status: Status = "lost"
         self._known = np.full(len(self._places), -1)  # IDs of the last frame
-        self._most, self._fits = 0, 0  # since it was found: markers that agreed at once, frames fitted
         self._candidate, self._waited = np.full(7, np.nan), 0
 
     def _follow(self, points: Any, ids: Any, time: float, elapsed: float) -> BodyFrame | None:
@@ -217,7 +218,7 @@ class BodyTracker:
         count, rms = follow(self._places, points, ids, self._known, pose, _TIGHT, GATE, owners)
         if count < FEWEST and 0.0 < elapsed <= _NEARBY:
             predicted = advance(self._pose, self._velocity, elapsed)
-            count, rms = self._search(points, predicted, _SPREAD + _PACE * elapsed, owners, pose)
+            count, rms = self._search(points, predicted, self._reach(elapsed), owners, pose)
         if count < FEWEST:
             return None
         if max(self._most, count) <= FEWEST < len(self._places):
@@ -243,7 +244,7 @@ class BodyTracker:
         """The body where it was a moment ago, or anywhere."""
         pose, owners = np.empty(7), np.empty(len(self._places), dtype=np.int64)
         if 0.0 < elapsed <= _NEARBY:
-            reach, predicted = _SPREAD + _PACE * elapsed, advance(self._pose, self._velocity, elapsed)
+            reach, predicted = self._reach(elapsed), advance(self._pose, self._velocity, elapsed)
             count, rms = self._search(points, predicted, reach, owners, pose)
             if count > FEWEST or (count == FEWEST and reach <= _NEAR):
                 return self._keep("found", pose, rms, owners, ids, time)
@@ -257,6 +258,12 @@ class BodyTracker:
         else:
             self._waited = 0
         return BodyFrame("lost", None, np.full(len(points), -1), np.nan)
+
+    def _reach(self, elapsed: float) -> float:
+        """How far a marker may be from where the last fit and its motion put it [m]."""
+        if self._fits < _FITS:
+            return _SPREAD + _PACE * elapsed
+        return _ERROR + 0.5 * _HASTE * elapsed**2
 
     def _search(self, points: Any, near: Any, reach: float, owners: Any, pose: Any) -> tuple[int, float]:
         """The one place where the markers fit, within reach of a pose; how many do and their RMS distance."""

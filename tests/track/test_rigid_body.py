@@ -191,6 +191,25 @@ def test_ids_that_change_places_or_are_used_again_do_not_mislead(rng):
         np.testing.assert_array_equal(frame.labels, labels)
 
 
+@pytest.mark.parametrize("gone", [(5,), (4, 5)])
+def test_ghosts_that_drift_off_where_markers_were_take_nothing_along(rng, gone):
+    body, pose = template("controller"), transform(rng)
+    tracker = BodyTracker(body)
+    for number in range(30):
+        points, labels = seen(body, pose, rng, without=gone if number >= 10 else ())
+        ids = labels.copy()
+        if number >= 10:  # one ghost a marker that is gone, one way all of them
+            away = pose[:3, :3] @ [0.0, 0.0012 + 0.002 * (number - 10), 0.0]
+            ghosts = body.places[list(gone)] @ pose[:3, :3].T + pose[:3, 3] + away
+            points, labels = np.vstack([points, ghosts]), np.append(labels, np.full(len(gone), -1))
+            ids = np.append(ids, 100 + np.arange(len(gone)))
+        frame = tracker.step(points, ids, number * STEP)
+        assert frame.status != "lost" and apart(frame.T_world_body, pose)[0] < 0.002
+        np.testing.assert_array_equal(frame.labels[labels >= 0], labels[labels >= 0])
+        if number >= 12:
+            assert (frame.labels[labels < 0] == -1).all()
+
+
 @pytest.mark.parametrize(
     ("places", "words"),
     [
