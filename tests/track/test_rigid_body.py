@@ -199,15 +199,34 @@ def test_ghosts_that_drift_off_where_markers_were_take_nothing_along(rng, gone):
         points, labels = seen(body, pose, rng, without=gone if number >= 10 else ())
         ids = labels.copy()
         if number >= 10:  # one ghost a marker that is gone, one way all of them
-            away = pose[:3, :3] @ [0.0, 0.0012 + 0.002 * (number - 10), 0.0]
+            away = pose[:3, :3] @ [0.0, 0.0005 + 0.0007 * (number - 10), 0.0]
             ghosts = body.places[list(gone)] @ pose[:3, :3].T + pose[:3, 3] + away
             points, labels = np.vstack([points, ghosts]), np.append(labels, np.full(len(gone), -1))
             ids = np.append(ids, 100 + np.arange(len(gone)))
         frame = tracker.step(points, ids, number * STEP)
         assert frame.status != "lost" and apart(frame.T_world_body, pose)[0] < 0.002
         np.testing.assert_array_equal(frame.labels[labels >= 0], labels[labels >= 0])
-        if number >= 12:
+        if number >= 15:
             assert (frame.labels[labels < 0] == -1).all()
+
+
+def test_two_markers_and_a_ghost_that_turns_about_them_are_no_body(rng):
+    body, pose = template("controller"), transform(rng)
+    tracker, places = BodyTracker(body), body.places
+    axis = (places[3] - places[0]) / np.linalg.norm(places[3] - places[0])
+    arm = places[4] - places[0]
+    arm -= (arm @ axis) * axis
+    angle = 0.012 / np.linalg.norm(arm)  # 12 mm beside marker 4, as far from the two as it is
+    ghost = places[4] + (np.cos(angle) - 1.0) * arm + np.sin(angle) * np.cross(axis, arm)
+    for number in range(13):
+        points, labels = seen(body, pose, rng, without=(1, 2, 4, 5) if number >= 10 else ())
+        ids = labels.copy()
+        if number >= 10:
+            points = np.vstack([points, pose[:3, :3] @ ghost + pose[:3, 3]])
+            labels, ids = np.append(labels, -1), np.append(ids, 100)
+        frame = tracker.step(points, ids, number * STEP)
+        assert not ((frame.labels >= 0) & (frame.labels != labels)).any()
+    assert frame.status == "coasting"
 
 
 @pytest.mark.parametrize(
