@@ -56,17 +56,17 @@ def expectation(num_markers: int) -> Expectation:
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def expect_markers(
-    hand: Any, on_digit: Any, pose: Any, target: Any, mean: Any, precision: Any, weight: Any, out: Any
+    hand: Any, on_part: Any, pose: Any, target: Any, mean: Any, precision: Any, weight: Any, out: Any
 ) -> None:
     """Fill an `Expectation`.
 
     Args:
         hand: The hand and its glove.
-        on_digit: Markers on each digit (5,).
+        on_part: Markers on each digit, and the palm (6,).
         pose: The fitted pose (27,).
         target: The markers it was fitted to (M, 3) [m]; NaN where missing.
         mean: Angles (20,) that the hinges were believed to have [rad].
-        precision: How surely (20, 20) [1/rad^2].
+        precision: How surely, and how surely the wrist was where the pose has it (26, 26).
         weight: Inverse variance of the markers [1/m^2].
         out: What is filled.
     """
@@ -75,14 +75,13 @@ def expect_markers(
     write_rotation(pose[3:7], wrist)
     out.qpos[:] = pose
     find_misses(hand, target, pose, work)
-    seen = np.zeros(len(on_digit), dtype=np.int64)
+    seen = np.zeros(len(on_part), dtype=np.int64)
     for marker in range(count):
         if not np.isnan(work.misses[marker, 0]):
             weights[marker] = weight
-            if hand.digits[marker] >= 0:
-                seen[hand.digits[marker]] += 1
+            seen[hand.digits[marker]] += 1
     gather(hand, weights, work)
-    if _settle(hand, seen, on_digit, mean, precision, work, out.qpos):
+    if _settle(hand, seen, on_part, mean, precision, work, out.qpos):
         find_misses(hand, target, out.qpos, work)
         gather(hand, weights, work)
     normal = work.normal
@@ -92,7 +91,7 @@ def expect_markers(
             normal[row, column] = normal[column, row]
     out.told[:] = normal[:NUM_JOINTS, :NUM_JOINTS]
     out.pull[:] = out.told @ out.qpos[7:] - work.gradient[:NUM_JOINTS]
-    normal[:NUM_JOINTS, :NUM_JOINTS] += precision
+    normal += precision
     inverse = np.linalg.inv(normal)
     out.hinges[:] = inverse[:NUM_JOINTS, :NUM_JOINTS]
     for marker in range(count):
@@ -103,7 +102,7 @@ def expect_markers(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _settle(hand: Any, seen: Any, on_digit: Any, mean: Any, precision: Any, work: Any, qpos: Any) -> Any:
+def _settle(hand: Any, seen: Any, on_part: Any, mean: Any, precision: Any, work: Any, qpos: Any) -> Any:
     """Move the hinges of digits that lack markers to where belief and markers balance; whether any did.
 
     The others' are given: what is seen of one finger tells of the next.
@@ -112,13 +111,13 @@ def _settle(hand: Any, seen: Any, on_digit: Any, mean: Any, precision: Any, work
     count = 0
     for hinge in range(NUM_JOINTS):
         digit = hinge // 4
-        if seen[digit] < max(on_digit[digit], _FEWEST_ON_A_DIGIT):
+        if seen[digit] < max(on_part[digit], _FEWEST_ON_A_DIGIT):
             weak[count] = hinge
             count += 1
     if count == 0:
         return False
     matrix, rest = np.empty((count, count)), np.empty(count)
-    away = precision @ (qpos[7:] - mean)
+    away = precision[:NUM_JOINTS, :NUM_JOINTS] @ (qpos[7:] - mean)
     for row in range(count):
         one = weak[row]
         rest[row] = -work.gradient[one] - away[one]

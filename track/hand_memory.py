@@ -17,7 +17,7 @@ from track.digit_search import digit_ranges
 from track.expectation import Expectation
 from track.gloved_hand import gloved_hand
 from track.hinge_belief import HingeBelief, foresee, resting_covariance
-from track.inverse_kinematics import PoseSolver, Prediction, move
+from track.inverse_kinematics import FEWEST_MARKERS, PoseSolver, Prediction, move
 from track.user import UserHand
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ _FIRST_SPREAD: Final = 0.003  # [m] of a marker around where a hand not yet know
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
+_WRIST: Final = ((0.001, 10.0), (np.deg2rad(1.5), 100.0))
+"""Of its place and its orientation: spread at once [m, rad], unforeseen acceleration [m/s^2, rad/s^2]."""
 _ARC: Final = 0.04  # [m] radius of the arcs that markers move on
 _FADING: Final = 0.7  # of the speed of a digit that lacks markers, from frame to frame
 _SMOOTHING: Final = 0.6  # share of the newest speed
@@ -42,6 +44,16 @@ class Coming(NamedTuple):
 
     qpos: Float[np.ndarray, "27"]
     hinges: HingeBelief
+    wrist_spread: tuple[float, float]
+    """Standard deviations of the wrist's place [m] and orientation [rad]."""
+
+    @property
+    def precision(self) -> Float[np.ndarray, "26 26"]:
+        """How surely the hinges and the wrist are there, as a step's unknowns go."""
+        precision = np.zeros((NUM_JOINTS + 6, NUM_JOINTS + 6))
+        precision[:NUM_JOINTS, :NUM_JOINTS] = self.hinges.precision
+        precision[NUM_JOINTS:, NUM_JOINTS:] = np.diag(np.repeat(self.wrist_spread, 3) ** -2.0)
+        return precision
 
 
 class Estimate(NamedTuple):
@@ -94,7 +106,8 @@ class HandMemory:
         assert self.qpos is not None
         span = time - self.time
         moved: NDArray[np.float64] = move(self.qpos[None], min(span, _LONGEST_GLIDE) * self._speed[None])[0]
-        return Coming(moved, foresee(moved[7:], self._hinges, span))
+        shift, turn = (at_once + 0.5 * gain * span**2 for at_once, gain in _WRIST)
+        return Coming(moved, foresee(moved[7:], self._hinges, span), (shift, turn))
 
     def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Where a pose and the markers' habits, as the bones last lay, have the markers [m]."""
@@ -104,21 +117,25 @@ class HandMemory:
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], coming: Coming
     ) -> Estimate:
-        """The pose of labelled markers [m]; what they leave open is as it was coming."""
-        prediction = Prediction(coming.hinges.angles, coming.hinges.spread)
-        fit = self.solver.solve(targets[None], start[None], prediction=prediction)
+        """The pose of labelled markers [m]; what they leave open is as it was coming.
+
+        With fewer than four of them it is the coming pose, and has no RMS.
+        """
+        qpos, rms, residuals = coming.qpos, np.nan, np.full_like(targets, np.nan)
+        if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
+            prediction = Prediction(
+                coming.hinges.angles, coming.hinges.spread, coming.qpos[:7], coming.wrist_spread
+            )
+            fit = self.solver.solve(targets[None], start[None], prediction=prediction)
+            qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
         expected = self.solver.expect(
-            fit.qpos[0],
-            targets,
-            angles=coming.hinges.angles,
-            precision=coming.hinges.precision,
-            noise=_NOISE,
+            qpos, targets, angles=coming.hinges.angles, precision=coming.precision, noise=_NOISE
         )
         # An arc leaves its tangent: open along it means open across it, by the square over twice its radius.
         bend = np.trace(expected.covariances, axis1=1, axis2=2) / (2.0 * _ARC)
         covariances = expected.covariances + (self.variance + bend**2)[:, None, None] * np.eye(3)
         places = expected.places - self._habit_in(expected.turns)
-        return Estimate(expected.qpos, float(fit.rms[0]), fit.residuals[0], places, covariances, expected)
+        return Estimate(expected.qpos, rms, residuals, places, covariances, expected)
 
     def _habit_in(self, turns: Float[np.ndarray, "M 3 3"]) -> Float[np.ndarray, "M 3"]:
         habit: NDArray[np.float64] = np.einsum("mij,mj->mi", turns, self._habit)
@@ -137,7 +154,8 @@ class HandMemory:
         """Take up a hand that has just been found."""
         self._speed[:] = 0.0
         self._seen[:] = time
-        estimate = self.fit(targets, qpos, Coming(qpos, foresee(qpos[7:], resting_covariance(), 0.0)))
+        nothing = Coming(qpos, foresee(qpos[7:], resting_covariance(), 0.0), (1.0, 1.0))
+        estimate = self.fit(targets, qpos, nothing)
         self._take(estimate, time)
         return estimate
 

@@ -19,7 +19,6 @@ _MOST_SURPRISES: Final = 0.3  # share of a hand's names that may be wrong at onc
 _FIT: Final = 0.0015  # [m] by which a fitted one may be
 _GATE: Final = 16.0  # squared standard deviations
 _BAD: Final = 0.004  # [m] RMS from which a pose may have been sought in the wrong place
-_FEWEST_TO_FIT: Final = 4
 
 
 def targets_of(
@@ -54,19 +53,15 @@ def fit_names(
     points: Float[np.ndarray, "N 3"],
     names: Int[np.ndarray, "N"],
     coming: Coming,
-) -> Estimate | None:
-    """The pose of the named points; names that do not go with the others are taken away, the worst first.
-
-    Returns:
-        None with fewer than four names.
-    """
+) -> Estimate:
+    """The pose of the named points; names that do not go with the others are taken away, the worst first."""
     start, sought_anew = coming.qpos, False
     while True:
         mine = np.flatnonzero(names >= 0)
-        if len(mine) < _FEWEST_TO_FIT:
-            return None
         targets = targets_of(points, names, memory.num_markers)
         estimate = memory.fit(targets, start, coming)
+        if len(mine) == 0:
+            return estimate
         off = ((points[mine] - estimate.places[names[mine]]) ** 2).sum(axis=1)
         off /= memory.variance[names[mine]] + _FIT**2
         if off.max() < _GATE:

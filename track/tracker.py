@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-_FEWEST: Final = 6  # named points that a pose can be relied on for
+_FEWEST: Final = 5  # named points that a pose can be relied on for
 _LONGEST_COAST: Final = 0.1  # [s] that a pose is carried on without them
 _MOST_CREDIT: Final = 12.0
 _INCOME: Final = 2.0  # credit of a name in each frame, less half the squared deviations it is off
@@ -102,8 +102,7 @@ class Tracker:
             coming = memory.predict(time)
             forget_surprises(memory, points, names[number], coming)
             estimate = fit_names(memory, points, names[number], coming)
-            if estimate is not None:
-                hands.append(Following(number, memory, coming, estimate))
+            hands.append(Following(number, memory, coming, estimate))
         before = names.copy()
         how_sure = name_new(hands, points, names, credit, born)
         changed = np.isfinite(how_sure)
@@ -113,8 +112,7 @@ class Tracker:
             mine, estimate = names[hand.number], hand.estimate
             if (mine != before[hand.number]).any():
                 estimate = fit_names(hand.memory, points, mine, hand.coming)
-            if estimate is not None:
-                fitted[hand.number] = estimate
+            fitted[hand.number] = estimate
         return fitted
 
     def _judge(
