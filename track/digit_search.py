@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _STEPS: Final = 10
 _LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
-_FREEDOM: Final = 4.0  # squared deviations of a prior from which on it loses its say
+_FREEDOM: Final = 20.0  # squared deviations of a prior from which on it loses its say
 _SLACK: Final = 0.006  # [m] that two markers may be nearer or farther than on any pose of the hand
 NEVER: Final = 1e9
 """Score below zero of what cannot be."""
