@@ -109,7 +109,9 @@ class NearestNeighbourTracker(_Baseline):
             self._when[:] = time
         self._remember(points, labels, time)
         self._labels = {
-            point: label for point, label in zip(known, labels.tolist(), strict=True) if min(point, label) >= 0
+            point: label
+            for point, label in zip(known, labels.tolist(), strict=True)
+            if min(point, label) >= 0
         }
         self._before = set(known) - {-1}
         return TrackedFrame(time, tuple(hands), labels, np.ones(len(points)))

@@ -2,22 +2,22 @@
 
 Where the paper is silent:
 
-- Its numbers are for 19 markers: clusters of at most 22 points, of which 14 to 21 are a hand. Another glove has
-  its number of markers plus 3, minus 5 and plus 2.
+- Its numbers are for 19 markers: clusters of at most 22 points, of which 14 to 21 are a hand. Another glove
+  has its number of markers plus 3, minus 5 and plus 2.
 - More clusters than hands, or fewer: hands and clusters are paired at random, the rest go without. A cluster
   is looked for among the points that no tracked hand has.
-- Markers are named anew in a frame in which a hand lacks a marker and a point without a name is there whose ID
-  was not there in the frame before.
+- Markers are named anew in a frame in which a hand lacks a marker and a point without a name is there whose
+  ID was not there in the frame before.
 - The expected location of a missing marker is where the pose of the frame before has it, without any speed.
   Pairs closer than 15 mm are made nearest first, over all hands at once.
 - The labeler is asked about the hand's points and the points without a name within 200 mm of their centre,
   the nearest first, 22 in all: the bounds of the clusters.
 - Of proposals with as many labelled markers the one with the least RMS distance wins.
-- A hand whose proposals all fail has no pose in this frame, its names are forgotten, and it is looked for from
-  the next frame on. Four named points make a pose.
-- The pose solver and the labeler are ours. The solver draws hinges that markers leave open weakly to rest, and
-  without a pose to start from tries several; the labeler does not tell left from right, so that only the RMS
-  distance does.
+- A hand whose proposals all fail has no pose in this frame, its names are forgotten, and it is looked for
+  from the next frame on. Four named points make a pose.
+- The pose solver and the labeler are ours. The solver draws hinges that markers leave open weakly to rest,
+  and without a pose to start from tries several; the labeler does not tell left from right, so that only the
+  RMS distance does.
 """
 
 from __future__ import annotations
@@ -84,7 +84,9 @@ class PaperTracker:
                 hands[number] = self._follow(number, points, labels, nearby)
         self._begin(lost, points, labels, hands)
         self._labels = {
-            point: label for point, label in zip(known, labels.tolist(), strict=True) if min(point, label) >= 0
+            point: label
+            for point, label in zip(known, labels.tolist(), strict=True)
+            if min(point, label) >= 0
         }
         self._before = set(known) - {-1}
         return TrackedFrame(time, tuple(hands), labels, np.ones(len(points)))

@@ -84,7 +84,7 @@ class PlainHand:
 def velocity_of(
     before: Float[np.ndarray, "27"], after: Float[np.ndarray, "27"], span: float
 ) -> Float[np.ndarray, "26"]:
-    """How fast a hand went from one pose to another in a time [s]: `move` by velocity times span undoes it."""
+    """How fast a hand went from one pose to another in a time [s], as `move` counts."""
     back = before[3:7] * np.array([1.0, -1.0, -1.0, -1.0])
     turn = quaternion_vectors(multiply_quaternions(back[None], after[None, 3:7]))[0]
     speed: NDArray[np.float64] = np.concatenate([after[:3] - before[:3], turn, after[7:] - before[7:]]) / span
