@@ -163,6 +163,8 @@ class PaperTracker:
         for (number, group), labelling in zip(pairs, labellings, strict=True):
             hand, names = self._hands[number], np.full(len(points), -1)
             names[group] = labelling.labels
+            if (names >= 0).sum() < self._fewest:
+                continue
             _, fit = hand.fit(points, [names])
             if fit is not None and fit.rms[0] <= MOST_RMS:
                 labels[names >= 0] = names[names >= 0] + self._first[number]
