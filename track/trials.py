@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 _LEAD: Final = 60  # frames that a tracker sees before all goes dark
+_DARK: Final = 120
 _PATIENCE: Final = 120  # frames that it may need
+FEWEST_FRAMES: Final = _LEAD + _DARK + _PATIENCE
+"""Frames of a take that trials are made with, at least."""
 
 
 def cut(take: Take, first: int, last: int) -> Take:
@@ -66,13 +69,13 @@ def first_locks(
     """Frames that pass before all points and poses are right, from random frames of a take.
 
     Args:
-        take: The take, longer than a second.
+        take: The take, of at least 120 frames.
         make: A new tracker for a part of the take.
         starts: How often to begin.
         rng: Decides where.
 
     Returns:
-        0 for the very first frame; NaN where a second was not enough.
+        0 for the very first frame; NaN where 120 were not enough.
     """
     locks = np.full(starts, np.nan)
     for number, first in enumerate(_places(take, _PATIENCE, starts, rng)):
@@ -84,12 +87,11 @@ def first_locks(
 def recoveries(
     take: Take, make: Callable[[Take], FrameTracker], trials: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "S"]:
-    """The same after half a second of the take and a second in which nothing is seen."""
-    dark = round(take.rate)
+    """The same after 60 frames of the take and 120 more in which nothing is seen: a second at 120 Hz."""
     waits = np.full(trials, np.nan)
-    for number, first in enumerate(_places(take, _LEAD + dark + _PATIENCE, trials, rng)):
-        part = darken(cut(take, first, first + _LEAD + dark + _PATIENCE), _LEAD, dark)
-        waits[number] = _wait(part, make(part), _LEAD + dark)
+    for number, first in enumerate(_places(take, FEWEST_FRAMES, trials, rng)):
+        part = darken(cut(take, first, first + FEWEST_FRAMES), _LEAD, _DARK)
+        waits[number] = _wait(part, make(part), _LEAD + _DARK)
     return waits
 
 
