@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-NEAR: Final = 0.02
+NEAR: Final = 0.01
 """Distance [m] of a new point from where a lost marker was coming to, less than this."""
 GATE: Final = 0.02
 """Distance [m] of a point from the marker it is assigned to, less than this."""
@@ -76,7 +76,7 @@ class NearestNeighbourTracker(_Baseline):
     """Names that go on by themselves, without a hand in the loop.
 
     A point keeps its name with its ID. A point whose ID is new takes the name of the lost marker that it is
-    nearest to: to where that was coming, in a straight line for 50 ms, and no farther than 20 mm off; nearest
+    nearest to: to where that was coming, in a straight line for 50 ms, and less than 10 mm off; nearest
     pairs first. Poses are solved from the labels afterwards and change nothing; a pose of more than 8 mm RMS
     is not given out. Markers that the first frame lacks begin where a pose fitted to it has them.
 
@@ -137,7 +137,7 @@ class HungarianTracker(_Baseline):
     """An optimal assignment in every frame (Maycock et al. 2015); IDs count for nothing.
 
     Every hand's pose goes on at its last speed; the model's markers there and all points are assigned to each
-    other at the least sum of distances, no pair farther apart than 20 mm, and the pose is solved anew. Where
+    other at the least sum of distances, every pair less than 20 mm apart, and the pose is solved anew. Where
     it fails (fewer than four points, or more than 8 mm RMS) a hand waits where it was, without a pose.
 
     Args:

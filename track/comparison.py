@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     MakeTracker = Callable[[Take, Sequence[UserHand]], FrameTracker]
 
 OURS: Final = "handsim"
-PAPERS_LOOP: Final = "the paper's loop"
-GIVEN_FIRST: Final = ("nearest neighbour", "Hungarian")
+PAPERS_LOOP: Final = "paper's loop"
+GIVEN_FIRST: Final = ("nearest point", "Hungarian")
 """Those that are given the labels of the first frame, and so do not begin by themselves."""
 USERS: Final[dict[str, Callable[[Take], list[UserHand]]]] = {
     "calibrated": true_users,
