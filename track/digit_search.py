@@ -115,7 +115,8 @@ def search_digit(
             angles[:] = coming if start == 0 else hinges
             if start == 1 and first == -_OVER:
                 break
-            reached = most - _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
+            misfit, open_ = _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
+            reached = most - misfit - open_
             if reached > score:
                 score = reached
                 if score > first:
@@ -199,7 +200,14 @@ def _fit(
             _gather(
                 hand, digit, markers, points, variance, naming, coming, trust, angles, work, normal, gradient
             )
-    return cost
+    for row in range(4):
+        for column in range(4):
+            factor[row, column] = normal[row, column]
+    _solve_four(factor, rest)
+    shrunk = 0.0
+    for row in range(4):
+        shrunk += 0.5 * np.log(factor[row, row] / trust[row])
+    return cost, shrunk
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
