@@ -110,18 +110,20 @@ def compare_trackers(
         trials: How often first lock and recovery are measured in each take that is long enough.
         done: Called after every frame of a take; trials are not counted.
     """
+    wearers = {
+        (users, capture): hands_of(take)
+        for users, hands_of in USERS.items()
+        for capture, take in takes.items()
+    }
     measured = []
     for name, make in trackers(labeler, seed).items():
-        for users, hands_of in USERS.items():
-            for capture, take in takes.items():
-                hands = hands_of(take)
-                evaluate_tracker(
-                    start := cut(take, 0, min(_WARM_UP, take.num_frames)), hands, make(start, hands)
-                )
-                report = evaluate_tracker(take, hands, make(take, hands), done=done)
-                measured.append(
-                    Measured(name, users, capture, report, *_try(take, hands, name, make, trials, seed))
-                )
+        for (users, capture), hands in wearers.items():
+            take = takes[capture]
+            start = cut(take, 0, min(_WARM_UP, take.num_frames))
+            evaluate_tracker(start, hands, make(start, hands))
+            report = evaluate_tracker(take, hands, make(take, hands), done=done)
+            waits = _try(take, hands, name, make, trials, seed)
+            measured.append(Measured(name, users, capture, report, *waits))
     return measured
 
 
