@@ -15,7 +15,6 @@ from handsim.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.transforms import multiply_quaternions, quaternion_vectors
 from track.digit_search import digit_ranges
 from track.expectation import Expectation
-from track.gloved_hand import gloved_hand
 from track.hinge_belief import HingeBelief, foresee, resting_covariance
 from track.inverse_kinematics import FEWEST_MARKERS, PoseSolver, Prediction, move
 from track.user import UserHand
@@ -64,11 +63,14 @@ class Estimate(NamedTuple):
     """3D RMS distance over the markers that are there [m]."""
     residuals: Float[np.ndarray, "M 3"]
     """Model minus marker [m], NaN where a marker is missing."""
-    places: Float[np.ndarray, "M 3"]
-    """Where the pose and the markers' habits have them [m]."""
     covariances: Float[np.ndarray, "M 3 3"]
-    """How far they may be from there [m^2]."""
+    """How far the markers may be from where the pose has them [m^2]."""
     expected: Expectation
+
+    @property
+    def places(self) -> Float[np.ndarray, "M 3"]:
+        """Where the pose has the markers [m]."""
+        return self.expected.places
 
 
 class HandMemory:
@@ -91,10 +93,9 @@ class HandMemory:
         self.variance = np.full(count, _FIRST_SPREAD**2)
         self._learned = np.zeros(count)
         self._seen = np.zeros(count)
-        self.adapted = gloved_hand(hand.model, hand.attachment)
+        self.adapted = self.solver.hand
         self._designed = self.adapted.places[:, 0].copy()
         self.ranges = digit_ranges(self.adapted)
-        self._turns = np.zeros((count, 3, 3))
         self._hinges = resting_covariance()
         self.places = np.full((count, 3), np.nan)
 
@@ -108,11 +109,6 @@ class HandMemory:
         moved: NDArray[np.float64] = move(self.qpos[None], min(span, _LONGEST_GLIDE) * self._speed[None])[0]
         shift, turn = (at_once + 0.5 * gain * span**2 for at_once, gain in _WRIST)
         return Coming(moved, foresee(moved[7:], self._hinges, span), (shift, turn))
-
-    def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
-        """Where a pose and the markers' habits, as the bones last lay, have the markers [m]."""
-        places: NDArray[np.float64] = self.solver.place(qpos) - self._habit_in(self._turns)
-        return places
 
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], coming: Coming
@@ -134,12 +130,7 @@ class HandMemory:
         # An arc leaves its tangent: open along it means open across it, by the square over twice its radius.
         bend = np.trace(expected.covariances, axis1=1, axis2=2) / (2.0 * _ARC)
         covariances = expected.covariances + (self.variance + bend**2)[:, None, None] * np.eye(3)
-        places = expected.places - self._habit_in(expected.turns)
-        return Estimate(expected.qpos, rms, residuals, places, covariances, expected)
-
-    def _habit_in(self, turns: Float[np.ndarray, "M 3 3"]) -> Float[np.ndarray, "M 3"]:
-        habit: NDArray[np.float64] = np.einsum("mij,mj->mi", turns, self._habit)
-        return habit
+        return Estimate(expected.qpos, rms, residuals, covariances, expected)
 
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
         """Log chance of each marker to come back when it did, were it the point that was born then [s]."""
@@ -159,8 +150,8 @@ class HandMemory:
         self._take(estimate, time)
         return estimate
 
-    def carry_on(self, estimate: Estimate, time: float) -> None:
-        """Take over the pose of the next frame and what it says of the markers' habits."""
+    def carry_on(self, estimate: Estimate, firm: Bool[np.ndarray, "M"], time: float) -> None:
+        """Take over the pose of the next frame, and what it says of the habits of markers whose names are firm."""
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
@@ -169,21 +160,23 @@ class HandMemory:
             speed = np.concatenate([qpos[:3] - self.qpos[:3], turn, qpos[7:] - self.qpos[7:]]) / span
             self._speed += _SMOOTHING * (speed - self._speed)
         self._take(estimate, time)
+        self._learn(estimate, firm)
 
     def _take(self, estimate: Estimate, time: float) -> None:
         self.qpos, self.time, self.places = estimate.qpos, time, estimate.places
-        self._hinges, self._turns = estimate.expected.hinges, estimate.expected.turns
+        self._hinges = estimate.expected.hinges
         there = np.isfinite(estimate.residuals[:, 0])
         missing = np.bincount(self.digits[~there & (self.digits >= 0)], minlength=len(DIGITS))
         self._speed[6:].reshape(len(DIGITS), -1)[missing > 0] *= _FADING
-        self._learn(estimate.residuals, there)
         self._seen[there] = time
 
-    def _learn(self, misses: Float[np.ndarray, "M 3"], there: Bool[np.ndarray, "M"]) -> None:
-        local = np.einsum("mji,mj->mi", self._turns, np.where(there[:, None], misses, 0.0))
+    def _learn(self, estimate: Estimate, firm: Bool[np.ndarray, "M"]) -> None:
+        there = np.isfinite(estimate.residuals[:, 0]) & firm
+        off = np.einsum(
+            "mji,mj->mi", estimate.expected.turns, np.where(there[:, None], estimate.residuals, 0.0)
+        )
         self._learned[there] = np.minimum(self._learned[there] + 1.0, _MEMORY)
         rate = np.where(there, 1.0 / np.maximum(self._learned, 1.0), 0.0)
-        off = local - self._habit
         self._habit += rate[:, None] * off
         known = np.maximum(rate, 1.0 / _MEMORY) * there * (self._learned > 1.0)
         self.variance += known * ((off**2).sum(axis=1) - self.variance)

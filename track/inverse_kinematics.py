@@ -86,11 +86,12 @@ class PoseSolver:
     ) -> None:
         if outlier_distance is not None and not outlier_distance > 0.0:
             raise ShapeError(f"outlier_distance is {outlier_distance:g} m, wanted a positive distance")
-        self._hand: GlovedHand = gloved_hand(model, attachment)
+        self.hand: GlovedHand = gloved_hand(model, attachment)
+        """What poses are solved with; whoever moves its markers finds them moved."""
         self._shapes: StartingShapes = starting_shapes(model, attachment)
         self._tightness = 0.0 if outlier_distance is None else outlier_distance**-2
         parts = (*range(len(DIGITS)), -1)  # the palm last
-        self._on_part = np.array([(self._hand.digits == number).sum() for number in parts])
+        self._on_part = np.array([(self.hand.digits == number).sum() for number in parts])
 
     def solve(
         self,
@@ -130,7 +131,7 @@ class PoseSolver:
                 raise ShapeError(f"initial has shape {starts.shape}, wanted ({len(targets)}, {NUM_QPOS})")
         angles, trust = _rows(prediction, len(targets))
         wrong, qpos, rms, residuals, steps = _fit_frames(
-            self._hand,
+            self.hand,
             self._shapes,
             self._on_part,
             targets,
@@ -152,8 +153,8 @@ class PoseSolver:
 
     def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Where a pose has its markers [m]."""
-        places = np.empty((len(self._hand.digits), 3))
-        carry_markers(self._hand, np.array(qpos, dtype=np.float64), places)
+        places = np.empty((len(self.hand.digits), 3))
+        carry_markers(self.hand, np.array(qpos, dtype=np.float64), places)
         return places
 
     def expect(
@@ -174,9 +175,9 @@ class PoseSolver:
             precision: How surely, and after them the wrist where the pose has it.
             noise: Standard deviation of those markers around the pose's [m].
         """
-        expected = expectation(len(self._hand.digits))
+        expected = expectation(len(self.hand.digits))
         expect_markers(
-            self._hand,
+            self.hand,
             self._on_part,
             np.array(qpos, dtype=np.float64),
             np.array(targets, dtype=np.float64, order="C"),

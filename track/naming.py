@@ -41,7 +41,7 @@ def forget_surprises(
     Where that is so of many, it is the pose that was not coming, and the names stay.
     """
     mine = np.flatnonzero(names >= 0)
-    places = memory.place(coming.qpos)
+    places = memory.solver.place(coming.qpos)
     off = ((points[mine] - places[names[mine]]) ** 2).sum(axis=1)
     wrong = mine[off > _GATE * (memory.variance[names[mine]] + _SURPRISE**2)]
     if len(wrong) <= _MOST_SURPRISES * len(mine):

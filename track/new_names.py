@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 _REACH_WHOLE, _REACH_MISSING = 0.012, 0.05  # [m] around a marker seen or not: points that may be its
 _MOST_CANDIDATES: Final = 7  # points that are tried on a digit
-_YOUNG: Final = 4.0  # credit below which a name stands for re-election
+YOUNG: Final = 4.0
+"""Credit below which a name stands for re-election."""
 
 
 class Following(NamedTuple):
@@ -82,7 +83,7 @@ def name_new(
     digits = [_digit(hand, digit, names) for hand in hands for digit in range(len(DIGITS))]
     contested = np.zeros(len(points), dtype=bool)
     for one in digits:
-        young = one.own[credit[one.own] < _YOUNG]
+        young = one.own[credit[one.own] < YOUNG]
         for other in digits:
             if other is not one and len(young):
                 places = other.hand.estimate.places[other.missing]
@@ -140,7 +141,7 @@ def _search(
     near |= (free | contested) & _near(points, places[missing], _REACH_MISSING)
     near[own] = False
     rivals = np.flatnonzero(near)
-    if not (len(rivals) or contested[own].any() or (len(missing) and (credit[own] < _YOUNG).any())):
+    if not (len(rivals) or contested[own].any() or (len(missing) and (credit[own] < YOUNG).any())):
         return None
     apart = np.linalg.norm(points[rivals, None] - places[markers], axis=-1).min(axis=1)
     rivals = rivals[np.argsort(apart)[: _MOST_CANDIDATES - len(own)]]

@@ -16,7 +16,7 @@ from handsim.topology import NUM_QPOS
 from track.finding import MOST_RMS, HandFinder
 from track.hand_memory import Estimate, HandMemory
 from track.naming import fit_names, forget_surprises, targets_of
-from track.new_names import Following, name_new
+from track.new_names import YOUNG, Following, name_new
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.user import UserHand
 from train.labeling import Labeler
@@ -127,7 +127,9 @@ class Tracker:
         """Take a pose over or throw it away."""
         mine = np.flatnonzero(names >= 0)
         if fit is not None and len(mine) >= _FEWEST and fit.rms <= MOST_RMS:
-            memory.carry_on(fit, time)
+            firm = np.zeros(memory.num_markers, dtype=bool)
+            firm[names[mine]] = credit[mine] >= YOUNG
+            memory.carry_on(fit, firm, time)
             off = ((points[mine] - memory.places[names[mine]]) ** 2).sum(axis=1)
             income = _INCOME - 0.5 * off / memory.variance[names[mine]]
             credit[mine] = np.clip(credit[mine] + income, 0.0, _MOST_CREDIT)
