@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _FIRST_SPREAD: Final = 0.003  # [m] of a marker around where a hand not yet known has it
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
+_UNEVEN: Final = 0.3  # of the hand's usual miss: so much it changes as the hand moves
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
 _WRIST: Final = ((0.001, 10.0), (np.deg2rad(1.5), 100.0))
@@ -151,7 +152,7 @@ class HandMemory:
         return estimate
 
     def carry_on(self, estimate: Estimate, firm: Bool[np.ndarray, "M"], time: float) -> None:
-        """Take over the pose of the next frame, and what it says of the habits of markers whose names are firm."""
+        """Take over the pose of the next frame, and what it says of the habits of firmly named markers."""
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
@@ -180,5 +181,7 @@ class HandMemory:
         self._habit += rate[:, None] * off
         known = np.maximum(rate, 1.0 / _MEMORY) * there * (self._learned > 1.0)
         self.variance += known * ((off**2).sum(axis=1) - self.variance)
-        np.maximum(self.variance, _LEAST_SPREAD**2, out=self.variance)
+        usual = (self._habit[self._learned > 0.0] ** 2).sum(axis=1)
+        least = _LEAST_SPREAD**2 + _UNEVEN**2 * (usual.mean() if len(usual) else 0.0)
+        np.maximum(self.variance, least, out=self.variance)
         self.adapted.places[:, 0] = self._designed - self._habit
