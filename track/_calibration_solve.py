@@ -1,307 +1,65 @@
-"""Levenberg-Marquardt over the poses of some frames, marker places, contact points and one hand shape together.
-
-The energy is that of Han et al. 2018, section 4.5, with a shape that is solved too, all in units of the
-markers' noise:
-
-    E = E_data + E_prior(M) + E_contact + what people differ by + hinges' ranges
+"""Levenberg-Marquardt over poses, marker places, contact points and one hand shape together.
 
 A frame's pose meets no other frame's, so poses are eliminated frame by frame (Schur complement), which leaves
-one system for shape and markers. Contact points slide after each step; what is left of a contact is then its
-gap along the normal, exact to first order, as sliding changes it no more.
+one system for shape and markers.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.jacobian import skinned_jacobian
-from handsim.model import HandModel
-from handsim.shape import HandShape
-from handsim.topology import NUM_BONES
-from track.contacts import PRESS, Contacts, Meeting, meet, slide_contacts, trust
-from track.hand_parameters import (
-    NUM_PARAMETERS,
-    shape_at,
-    shape_precision,
-    skeleton_numbers,
-    skinned,
-    skinned_shape_slopes,
-    slopes_of,
-)
-from track.inverse_kinematics import move
-from track.skin_walk import (
-    Corners,
-    SkinPatch,
-    SkinPlaces,
-    place_points,
-    place_weights,
-    slide,
-    weight_slopes,
-)
+from track._calibration_energy import Equations, Fit, Guess, Problem
+from track.contacts import slide_contacts, trust
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
     from numpy.typing import NDArray
 
-ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
-"""Of E_prior, along the normal and in the skin (Han et al. 2018)."""
-PLACE_SPREAD: Final = 0.006
-"""How far markers slip along the skin [m]; noise over this, squared, is the paper's lambda_1."""
-HEIGHT_SPREAD: Final = 0.0004
-"""How far a marker's centre is off one radius above the skin [m]."""
-CONTACT_SPREAD: Final = 0.0004
-"""How far pads are from giving way by `contacts.PRESS` [m]; noise over this, squared, is lambda_2."""
-_LIMIT_SPREAD: Final = np.deg2rad(2.0)
-_REST_SPREAD: Final = np.deg2rad(90.0)
-_REST: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
+Progress = Callable[[int, float, float], None]
+"""Called after each step: its number, RMS of the markers and of the touches' gaps [m] (NaN: none yet)."""
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
 _MOST_TRIALS: Final = 8
+_SMALL_GAIN: Final = 1e-4  # of the energy, after which steps end
 
 
-@dataclass(frozen=True, eq=False)
-class Guess:
-    """One place in the space that is searched."""
+def descend(
+    problem: Problem, guess: Guess, steps: int, most: int, progress: Progress | None
+) -> tuple[Guess, Fit, int]:
+    """Step until the energy hardly falls any more, or there have been `most` steps.
 
-    parameters: Float[np.ndarray, "53"]
-    points: Float[np.ndarray, "M 3"]
-    """Marker centres on the rest hand of this shape [m]."""
-    places: SkinPlaces
-    """The same on its skin."""
-    qpos: Float[np.ndarray, "F 27"]
-    contacts: Contacts | None = None
-    """Frames count in `qpos`."""
-
-
-class Fit(NamedTuple):
-    """What a guess amounts to."""
-
-    model: HandModel
-    bones: Float[np.ndarray, "F L 4 4"]
-    misses: Float[np.ndarray, "F M 3"]
-    """Model minus marker [m], zero where a marker is missing."""
-    off_design: Float[np.ndarray, "M 3"]
-    """Marker minus where the glove as designed has it on this hand [m]."""
-    normals: Float[np.ndarray, "M 3"]
-    meeting: Meeting | None
-    cost: float
-
-
-class Equations(NamedTuple):
-    """Normal equations: of each pose (P), between poses and what is shared (S), and of what is shared."""
-
-    pose: Float[np.ndarray, "F 26 26"]
-    mixed: Float[np.ndarray, "F 26 S"]
-    shared: Float[np.ndarray, "S S"]
-    pose_gradient: Float[np.ndarray, "F 26"]
-    shared_gradient: Float[np.ndarray, "S"]
-
-
-class Problem:
-    """What does not change while a hand is calibrated.
-
-    Args:
-        shape: The right hand to begin with.
-        design: Where the glove as designed sits on its skin.
-        radius: Of the markers [m].
-        targets: Labelled markers of the chosen frames (F, M, 3) [m]; NaN where missing.
-        noise: Standard deviation of a marker's coordinates [m].
-        reach: Distance from which a marker loses its say [m].
+    Returns:
+        The guess, its fit, and the number of the last step.
     """
+    fit, damping, better = problem.fit(guess), _FIRST_DAMPING, True
+    while better and steps < most:
+        before = fit.cost
+        guess, fit, damping, better = _step(problem, guess, fit, damping)
+        steps += 1
+        if progress is not None:
+            progress(steps, marker_rms(problem, fit), contact_gap(guess, fit))
+        if abs(before - fit.cost) < _SMALL_GAIN * before:
+            break
+    return guess, fit, steps
 
-    def __init__(
-        self,
-        shape: HandShape,
-        design: SkinPlaces,
-        radius: float,
-        targets: Float[np.ndarray, "F M 3"],
-        *,
-        noise: float,
-        reach: float,
-    ) -> None:
-        self.shape, self.design, self.radius = shape, design, radius
-        self.there = np.isfinite(targets).all(axis=2)
-        self.targets = np.where(self.there[..., None], targets, 0.0)
-        self.noise, self.reach = noise, reach
-        self.precision = shape_precision()
-        self._ranges = HandModel(shape).skeleton.ranges
 
-    def fit(self, guess: Guess) -> Fit:
-        """Residuals and energy of a guess."""
-        model = HandModel(shape_at(self.shape, guess.parameters))
-        bones = model.forward_kinematics(guess.qpos)
-        weights = place_weights(guess.places)
-        _, carried = skinned(model, bones, guess.points, weights)
-        placed = np.einsum("ml,tmli->tmi", weights, carried, optimize=True)
-        misses = np.where(self.there[..., None], placed - self.targets, 0.0)
-        faces, count = self._faces(guess), len(guess.points)
-        corners = SkinPatch(faces).corners(model.shape)
-        _, normals = place_points(guess.places, _part(corners, 0, count))
-        design, _ = place_points(self.design, _part(corners, count, 2 * count))
-        meeting = None
-        if guess.contacts is not None:
-            pads = _part(corners, 2 * count, len(faces))
-            meeting = meet(guess.contacts, pads, model, bones[guess.contacts.frames])
-        fit = Fit(model, bones, misses, guess.points - design, normals, meeting, 0.0)
-        return fit._replace(cost=self._cost(guess, fit))
+def marker_rms(problem: Problem, fit: Fit) -> float:
+    """RMS distance of the markers [m]."""
+    return float(np.sqrt((fit.misses**2).sum() / problem.there.sum()))
 
-    def _faces(self, guess: Guess) -> NDArray[np.int64]:
-        faces = [guess.places.faces, self.design.faces]
-        if guess.contacts is not None:
-            faces += [guess.contacts.thumb_places.faces, guess.contacts.finger_places.faces]
-        return np.concatenate(faces)
 
-    def _cost(self, guess: Guess, fit: Fit) -> float:
-        squares = (fit.misses**2).sum(axis=2)
-        cost = (squares / (1.0 + squares / self.reach**2)).sum() / self.noise**2
-        cost += guess.parameters @ self.precision @ guess.parameters
-        cost += (fit.off_design * self._place_pull(fit, fit.off_design)).sum()
-        cost += ((guess.places.heights - self.radius) ** 2).sum() / HEIGHT_SPREAD**2
-        values, weights = self._angle_pulls(guess)
-        cost += (weights * values**2).sum()
-        if fit.meeting is not None and guess.contacts is not None:
-            weights = trust(fit.meeting.gaps, guess.contacts.fingers)
-            cost += (weights * fit.meeting.gaps**2).sum() / CONTACT_SPREAD**2
-        return float(cost)
-
-    def _place_pull(self, fit: Fit, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """E_prior's matrix times vectors (M, 3)."""
-        along = (vectors * fit.normals).sum(axis=1, keepdims=True) * fit.normals
-        pull: NDArray[np.float64] = ALPHA_ALONG * vectors + (ALPHA_NORMAL - ALPHA_ALONG) * along
-        return pull / PLACE_SPREAD**2
-
-    def _angle_pulls(self, guess: Guess) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What shall be small of the hinges (F, 40), and how much each counts."""
-        angles = guess.qpos[:, 7:]
-        low, high = self._ranges.T
-        beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
-        values = np.concatenate([beyond, angles - _REST], axis=1)
-        weights = np.concatenate([(beyond != 0.0) / _LIMIT_SPREAD**2, np.full_like(angles, _REST_SPREAD**-2)], 1)
-        return values, weights
-
-    def equations(self, guess: Guess, fit: Fit) -> Equations:
-        """Gauss-Newton's equations, unknowns shared by all frames in the order parameters, markers."""
-        count = len(guess.points)
-        faces = self._faces(guess)
-        patch, corners = SkinPatch(faces), SkinPatch(faces).corners(fit.model.shape)
-
-        def rest_points(shape: HandShape) -> NDArray[np.float64]:
-            return place_points(self._all_places(guess), patch.corners(shape))[0]
-
-        rest = slopes_of(self.shape, guess.parameters, rest_points)
-        raw = slopes_of(
-            self.shape, guess.parameters, skeleton_numbers
-        )
-        by_pose, by_shared = self._marker_slopes(guess, fit, _part(corners, 0, count), rest[:count], raw)
-        squares = (fit.misses**2).sum(axis=2)
-        weights = self.there / (1.0 + squares / self.reach**2) ** 2 / self.noise**2
-        rows = np.repeat(weights, 3, axis=1)[..., None]
-        residual = fit.misses.reshape(len(fit.misses), -1, 1)
-        pose = by_pose.swapaxes(1, 2) @ (rows * by_pose)
-        mixed = by_pose.swapaxes(1, 2) @ (rows * by_shared)
-        flat = (np.sqrt(rows) * by_shared).reshape(-1, by_shared.shape[2])
-        shared = flat.T @ flat
-        pose_gradient = (by_pose.swapaxes(1, 2) @ (rows * residual))[..., 0]
-        shared_gradient = np.einsum("fns,fn->s", by_shared, (rows * residual)[..., 0])
-        result = Equations(pose, mixed, shared, pose_gradient, shared_gradient)
-        self._add_priors(guess, fit, rest[:count] - rest[count : 2 * count], result)
-        if guess.contacts is not None and fit.meeting is not None:
-            self._add_contacts(guess, fit, rest[2 * count :], raw, result)
-        return result
-
-    def _all_places(self, guess: Guess) -> SkinPlaces:
-        parts = [guess.places, self.design]
-        if guess.contacts is not None:
-            parts += [
-                side._replace(heights=np.full(len(guess.contacts.frames), -PRESS))
-                for side in (guess.contacts.thumb_places, guess.contacts.finger_places)
-            ]
-        return SkinPlaces(*(np.concatenate(values) for values in zip(*parts, strict=True)))
-
-    def _marker_slopes(
-        self, guess: Guess, fit: Fit, corners: Corners, rest: NDArray[np.float64], raw: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Derivatives of all markers by the poses (F, 3 M, 26) and by what is shared (F, 3 M, S)."""
-        frames, count = len(guess.qpos), len(guess.points)
-        weights = place_weights(guess.places)
-        everywhere = np.tile(np.arange(NUM_BONES), (count, 1))
-        by_pose = skinned_jacobian(fit.model, fit.bones, guess.points, everywhere, weights)
-        by_shape = skinned_shape_slopes(fit.model, fit.bones, guess.points, weights) @ raw
-        turns, carried = skinned(fit.model, fit.bones, guess.points, weights)
-        by_shape += turns @ rest
-        turns += np.einsum("tmli,mlj->tmij", carried, weight_slopes(guess.places, corners), optimize=True)
-        by_shared = np.zeros((frames, count, 3, NUM_PARAMETERS + 3 * count))
-        by_shared[..., :NUM_PARAMETERS] = by_shape
-        for marker in range(count):
-            first = NUM_PARAMETERS + 3 * marker
-            by_shared[:, marker, :, first : first + 3] = turns[:, marker]
-        return by_pose.reshape(frames, 3 * count, -1), by_shared.reshape(frames, 3 * count, -1)
-
-    def _add_priors(self, guess: Guess, fit: Fit, off_slopes: NDArray[np.float64], result: Equations) -> None:
-        count = len(guess.points)
-        first = NUM_PARAMETERS
-        result.shared[:first, :first] += self.precision
-        result.shared_gradient[:first] += self.precision @ guess.parameters
-        slopes = np.concatenate([off_slopes, np.zeros((count, 3, 3 * count))], axis=2)
-        heights = np.zeros((count, result.shared.shape[0]))
-        for marker in range(count):
-            mine = slice(first + 3 * marker, first + 3 * marker + 3)
-            slopes[marker, :, mine] = np.eye(3)
-            heights[marker, mine] = fit.normals[marker]
-        pulled = np.stack([self._place_pull(fit, slopes[..., s]) for s in range(slopes.shape[2])], axis=-1)
-        result.shared[:] += np.einsum("mis,mir->sr", slopes, pulled, optimize=True)
-        result.shared_gradient[:] += np.einsum("mi,mis->s", fit.off_design, pulled)
-        result.shared[:] += heights.T @ heights / HEIGHT_SPREAD**2
-        result.shared_gradient[:] += (guess.places.heights - self.radius) @ heights / HEIGHT_SPREAD**2
-        values, weights = self._angle_pulls(guess)
-        hinge = np.arange(6, 26)
-        result.pose[:, hinge, hinge] += weights[:, :20] + weights[:, 20:]
-        result.pose_gradient[:, 6:] += (weights * values)[:, :20] + (weights * values)[:, 20:]
-
-    def _add_contacts(
-        self, guess: Guess, fit: Fit, rest: NDArray[np.float64], raw: NDArray[np.float64], result: Equations
-    ) -> None:
-        contacts, meeting = guess.contacts, fit.meeting
-        assert contacts is not None
-        assert meeting is not None
-        count = len(contacts.frames)
-        places = self._all_places(guess)
-        pads = SkinPlaces(*(values[len(values) - 2 * count :] for values in places))
-        points, _ = place_points(pads, SkinPatch(pads.faces).corners(fit.model.shape))
-        weights = place_weights(pads)
-        say = trust(meeting.gaps, contacts.fingers) / CONTACT_SPREAD**2
-        everywhere = np.tile(np.arange(NUM_BONES), (2, 1))
-        for number, frame in enumerate(contacts.frames):
-            both = [number, count + number]
-            bones, share = fit.bones[frame : frame + 1], weights[both]
-            by_pose = skinned_jacobian(fit.model, bones, points[both], everywhere, share)[0]
-            by_shape = skinned_shape_slopes(fit.model, bones, points[both], share)[0] @ raw
-            by_shape += skinned(fit.model, bones, points[both], share)[0][0] @ rest[both]
-            way = meeting.directions[number]
-            pose = way @ (by_pose[1] - by_pose[0])
-            shared = np.zeros(result.shared.shape[0])
-            shared[:NUM_PARAMETERS] = way @ (by_shape[1] - by_shape[0])
-            result.pose[frame] += say[number] * np.outer(pose, pose)
-            result.mixed[frame] += say[number] * np.outer(pose, shared)
-            result.shared[:] += say[number] * np.outer(shared, shared)
-            result.pose_gradient[frame] += say[number] * meeting.gaps[number] * pose
-            result.shared_gradient[:] += say[number] * meeting.gaps[number] * shared
-
-    def moved(self, guess: Guess, pose_step: NDArray[np.float64], shared_step: NDArray[np.float64]) -> Guess:
-        """The guess after a step, its markers found again on the new hand's skin."""
-        parameters = guess.parameters + shared_step[:NUM_PARAMETERS]
-        shape = shape_at(self.shape, parameters)
-        carried, _ = place_points(guess.places, SkinPatch(guess.places.faces).corners(shape))
-        points = carried + shared_step[NUM_PARAMETERS:].reshape(-1, 3)
-        qpos = move(guess.qpos, np.clip(pose_step, -0.5, 0.5))
-        places = slide(guess.places, points, shape)
-        return dataclasses.replace(guess, parameters=parameters, points=points, places=places, qpos=qpos)
+def contact_gap(guess: Guess, fit: Fit) -> float:
+    """RMS gap of the trusted touches [m], NaN without any."""
+    if guess.contacts is None or fit.meeting is None:
+        return float("nan")
+    say = trust(fit.meeting, guess.contacts.fingers)
+    return float(np.sqrt((say * fit.meeting.gaps**2).sum() / max(say.sum(), 1e-12)))
 
 
 def eliminate(equations: Equations, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The shared part of the equations with the poses eliminated, and what poses follow it by (F, 26, S + 1)."""
+    """Equations of what is shared (S, S + 1), the poses eliminated, and how poses follow (F, 26, S + 1)."""
     pose = equations.pose.copy()
     every = np.arange(pose.shape[1])
     pose[:, every, every] *= 1.0 + damping
@@ -313,8 +71,8 @@ def eliminate(equations: Equations, damping: float) -> tuple[NDArray[np.float64]
     return reduced, solved
 
 
-def step(problem: Problem, guess: Guess, fit: Fit, damping: float) -> tuple[Guess, Fit, float, bool]:
-    """One step down; returns the new guess, its fit, the damping to go on with, and whether it is any better."""
+def _step(problem: Problem, guess: Guess, fit: Fit, damping: float) -> tuple[Guess, Fit, float, bool]:
+    """One step down: the new guess, its fit, the damping to go on with, and whether it is any better."""
     equations = problem.equations(guess, fit)
     for _ in range(_MOST_TRIALS):
         reduced, solved = eliminate(equations, damping)
@@ -338,8 +96,3 @@ def _slid(problem: Problem, guess: Guess, fit: Fit) -> tuple[Guess, Fit]:
     contacts = slide_contacts(guess.contacts, fit.model, fit.bones[guess.contacts.frames])
     slid = dataclasses.replace(guess, contacts=contacts)
     return slid, problem.fit(slid)
-
-
-
-def _part(corners: Corners, first: int, last: int) -> Corners:
-    return Corners(corners.points[first:last], corners.normals[first:last])

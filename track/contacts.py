@@ -1,8 +1,8 @@
-"""Where the thumb touches the other fingers: found in a tracked motion, and kept as points that slide on the skin.
+"""Where the thumb touches other fingers: found in a tracked motion, kept as points that slide on the skin.
 
-Nobody says when the user touches. A touch is a moment at which the last bones of thumb and one finger are near
-and hold still against each other; what only looks like one lies apart from the others of its finger, and loses
-its say.
+Nobody says when the user touches. A touch is a moment at which the last bones of thumb and one finger are
+near and hold still against each other; what only looks like one lies apart from the others of its finger, and
+loses its say.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from handsim.model import HandModel
 from handsim.shape import HandShape
 from handsim.topology import DIGITS, bones_of
 from poses.touch import FINGERS, thumb_contact
-from track.skin_walk import Corners, SkinPlaces, nearest_places, place_points, place_weights, slide
+from track.skin_walk import Corners, SkinPatch, SkinPlaces, nearest_places, place_points, place_weights, slide
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -31,7 +31,9 @@ _SPEED_TIME: Final = 0.025  # [s] before and after, over which speed is taken
 _ODD: Final = 0.002  # [m] off its finger's others, where a touch has lost half its say and more
 _DEPTH: Final = 0.006  # [m] below the skin, about a pad's middle
 _SLIDES: Final = 3
-_USUAL: Final = 0.35  # touches are the nearest a thumb comes: rather the lower ones of a finger's are taken for true
+_USUAL: Final = 0.35
+_OPPOSED: Final = -0.8  # cosine between the normals of pads that face each other
+_ASIDE: Final = 0.002  # [m]
 
 
 class Contacts(NamedTuple):
@@ -51,8 +53,8 @@ class Meeting(NamedTuple):
     """From thumb to finger."""
     gaps: Float[np.ndarray, "K"]
     """Between the pads, both having given way by `PRESS` [m]; negative where they press harder."""
-    points: Float[np.ndarray, "2 K 3"]
-    """On the skins of thumb and finger [m]."""
+    square: Bool[np.ndarray, "K"]
+    """Whether the pads face each other there."""
 
 
 def find_touches(
@@ -143,7 +145,8 @@ def _flesh(model: HandModel, bones: NDArray[np.float64], finger: str) -> NDArray
     ends = np.stack([pads[0][first], pads[1][second]])
     way = (ends[1] - ends[0]) / apart.min()
     radii = model.shape.radii[[0, DIGITS.index(finger)], 2:].mean(axis=1)
-    return ends + radii[:, None] * np.stack([way, -way])
+    skin: NDArray[np.float64] = ends + radii[:, None] * np.stack([way, -way])
+    return skin
 
 
 def slide_contacts(
@@ -159,7 +162,7 @@ def slide_contacts(
     for _ in range(_SLIDES):
         for own, other in ((0, 1), (1, 0)):
             inner = sides[other]._replace(heights=np.full(len(contacts.frames), -_DEPTH))
-            target = _posed(inner, shape, model, T_world_bone)[0]
+            target = _posed(inner, shape, model, T_world_bone)
             blend = _blends(sides[own], model, T_world_bone)
             rest = np.linalg.solve(blend[:, :, :3], (target - blend[:, :, 3])[..., None])[..., 0]
             slid = slide(sides[own], rest, shape)
@@ -167,7 +170,9 @@ def slide_contacts(
     return contacts._replace(thumb_places=sides[0], finger_places=sides[1])
 
 
-def meet(contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]) -> Meeting:
+def meet(
+    contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: NDArray[np.float64]
+) -> Meeting:
     """How the pads lie to each other.
 
     Args:
@@ -186,36 +191,37 @@ def meet(contacts: Contacts, corners: Corners, model: HandModel, T_world_bone: N
         normals.append(np.einsum("kij,kj->ki", blend[:, :, :3], normal))
     direction = normals[0] - normals[1]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    gaps = ((points[1] - points[0]) * direction).sum(axis=1) + 2.0 * PRESS
-    return Meeting(direction, gaps, np.stack(points))
+    way = points[1] - points[0]
+    along = (way * direction).sum(axis=1)
+    aside = np.linalg.norm(way - along[:, None] * direction, axis=1)
+    normals = [normal / np.linalg.norm(normal, axis=1, keepdims=True) for normal in normals]
+    square = ((normals[0] * normals[1]).sum(axis=1) < _OPPOSED) & (aside < _ASIDE)
+    return Meeting(direction, along + 2.0 * PRESS, square)
 
 
-def trust(gaps: Float[np.ndarray, "K"], fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-    """How much each touch counts, 0 to 1: little where its gap is unlike those of its finger's other touches."""
-    usual = np.zeros(len(gaps))
-    for finger in np.unique(fingers):
-        mine = fingers == finger
-        usual[mine] = np.quantile(gaps[mine], _USUAL)
-    weights: NDArray[np.float64] = (1.0 + ((gaps - usual) / _ODD) ** 2) ** -2.0  # Geman and McClure 1987
+def trust(meeting: Meeting, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
+    """How much each touch counts, 0 to 1: little where its gap is unlike its finger's others.
+
+    Geman and McClure's weights (1987), around a lower quantile, as touches are the nearest a thumb comes.
+    """
+    weights = np.zeros(len(meeting.gaps))
+    for finger in np.unique(fingers[meeting.square]):
+        mine = (fingers == finger) & meeting.square
+        off = meeting.gaps[mine] - np.quantile(meeting.gaps[mine], _USUAL)
+        weights[mine] = (1.0 + (off / _ODD) ** 2) ** -2.0
     return weights
 
 
 def _posed(
     places: SkinPlaces, shape: HandShape, model: HandModel, T_world_bone: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    from track.skin_walk import SkinPatch
-
-    rest, normals = place_points(places, SkinPatch(places.faces).corners(shape))
-    blend = _blends(places, model, T_world_bone)
-    return (
-        np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3],
-        np.einsum("kij,kj->ki", blend[:, :, :3], normals),
-    )
-
-
-def _blends(
-    places: SkinPlaces, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> NDArray[np.float64]:
+    rest, _ = place_points(places, SkinPatch(places.faces).corners(shape))
+    blend = _blends(places, model, T_world_bone)
+    posed: NDArray[np.float64] = np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3]
+    return posed
+
+
+def _blends(places: SkinPlaces, model: HandModel, T_world_bone: NDArray[np.float64]) -> NDArray[np.float64]:
     """The blended transforms (K, 3, 4) that carry each place in its own frame."""
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
     blends: NDArray[np.float64] = np.einsum("kl,klij->kij", place_weights(places), motion)

@@ -1,4 +1,4 @@
-"""A hand's shape as a short vector around a first guess, with what people differ by, and how points follow it.
+"""A hand's shape as a short vector around a first guess, what people differ by, and how points follow.
 
 Everything is a right hand's. Lengths and breadth scale the whole hand; bones, knuckles, directions of the
 digits, girths and the palm's thickness vary on top, as `handsim.shape.sample_shape` has it.
@@ -31,7 +31,7 @@ GIRTHS: Final = slice(47, 52)
 THICKNESS: Final = 52
 NUM_PARAMETERS: Final = 53
 # Standard deviations. The nearest of five sizes may be a size off and more; length and breadth go together
-# (ANSUR II). Knuckles vary more than in the simulated population, whose millimetre is the least one can expect.
+# (ANSUR II). Real knuckles are taken to vary twice as much as the simulated population's.
 _SIZE_SPREAD: Final = 0.09
 _SIZE_CORRELATION: Final = 0.6
 _KNUCKLE_SPREAD: Final = 2.0 * ADULTS.knuckle_spread
@@ -96,8 +96,8 @@ def skinned_shape_slopes(
 ) -> Float[np.ndarray, "T M 3 45"]:
     """Derivative of skinned points by `skeleton_numbers`, the rest points and the poses held.
 
-    A longer bone carries all beyond it outwards, in the pose and at rest alike; what is seen is the difference,
-    as the rest transform is undone first.
+    A longer bone carries all beyond it outwards, in the pose and at rest alike; what is seen is the
+    difference, as the rest transform is undone first.
 
     Args:
         model: A right hand.
@@ -107,7 +107,9 @@ def skinned_shape_slopes(
     """
     rest = model.rest_transforms
     slopes = np.zeros((len(T_world_bone), len(points), 3, 45))
-    _fill_slopes(np.ascontiguousarray(T_world_bone), rest, points, weights, _turning_axes(model.shape), slopes)
+    _fill_slopes(
+        np.ascontiguousarray(T_world_bone), rest, points, weights, _turning_axes(model.shape), slopes
+    )
     return slopes
 
 
@@ -121,18 +123,17 @@ def _turning_axes(shape: HandShape) -> Float[np.ndarray, "5 3 3"]:
         there = build_skeleton(dataclasses.replace(shape, base_angles=nudged)).rotations[1::3]
         spin = np.einsum("dij,dkj->dik", there - here, here) / 1e-6
         axes[:, angle] = np.stack(
-            [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]], axis=1
+            [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]],
+            axis=1,
         )
     return 0.5 * axes
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _fill_slopes(bones: Any, rest: Any, points: Any, weights: Any, axes: Any, slopes: Any) -> None:
-    turn, carried, arm = np.empty((3, 3)), np.empty(3), np.empty(3)
+    turn = np.empty((3, 3))
     for frame in range(len(bones)):
-        wrist = bones[frame, 0]
         for bone in range(1, NUM_BONES):
-            digit, place, first = (bone - 1) // 3, (bone - 1) % 3, bone - (bone - 1) % 3
             own = bones[frame, bone]
             for i in range(3):
                 for j in range(3):
@@ -141,25 +142,35 @@ def _fill_slopes(bones: Any, rest: Any, points: Any, weights: Any, axes: Any, sl
                         turn[i, j] += own[i, k] * rest[bone, j, k]
             for point in range(len(points)):
                 share = weights[point, bone]
-                if share == 0.0:
-                    continue
-                row = slopes[frame, point]
-                for i in range(3):
-                    carried[i] = own[i, 3] - bones[frame, first, i, 3]
-                    arm[i] = points[point, i] - rest[first, i, 3]
-                    for j in range(3):
-                        carried[i] += turn[i, j] * (points[point, j] - rest[bone, j, 3])
-                for segment in range(place):  # the bones before this one
-                    other = first + segment
-                    for i in range(3):
-                        moved = bones[frame, other, i, 0]
-                        for j in range(3):
-                            moved -= turn[i, j] * rest[other, j, 0]
-                        row[i, 3 * digit + segment] += share * moved
-                for a in range(3):
-                    for i in range(3):
-                        row[i, 15 + 3 * digit + a] += share * (wrist[i, a] - turn[i, a])
-                    _add_turn(row, 30 + 3 * digit + a, share, wrist, turn, axes[digit, a], carried, arm)
+                if share != 0.0:
+                    _add_share(
+                        slopes[frame, point], bone, share, points[point], bones[frame], rest, turn, axes
+                    )
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _add_share(
+    row: Any, bone: Any, share: Any, point: Any, bones: Any, rest: Any, turn: Any, axes: Any
+) -> None:
+    """What one bone's share adds to a point's slopes; `turn` is how it is turned from rest."""
+    digit, place, first = (bone - 1) // 3, (bone - 1) % 3, bone - (bone - 1) % 3
+    carried, arm = np.empty(3), np.empty(3)
+    for i in range(3):
+        carried[i] = bones[bone, i, 3] - bones[first, i, 3]
+        arm[i] = point[i] - rest[first, i, 3]
+        for j in range(3):
+            carried[i] += turn[i, j] * (point[j] - rest[bone, j, 3])
+    for segment in range(place):  # the bones before this one
+        other = first + segment
+        for i in range(3):
+            moved = bones[other, i, 0]
+            for j in range(3):
+                moved -= turn[i, j] * rest[other, j, 0]
+            row[i, 3 * digit + segment] += share * moved
+    for axis in range(3):
+        for i in range(3):
+            row[i, 15 + 3 * digit + axis] += share * (bones[0, i, axis] - turn[i, axis])
+        _add_turn(row, 30 + 3 * digit + axis, share, bones[0], turn, axes[digit, axis], carried, arm)
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
@@ -173,9 +184,15 @@ def _add_turn(
     a = axis[1] * arm[2] - axis[2] * arm[1]
     b = axis[2] * arm[0] - axis[0] * arm[2]
     c = axis[0] * arm[1] - axis[1] * arm[0]
-    row[0, column] += share * (y * carried[2] - z * carried[1] - turn[0, 0] * a - turn[0, 1] * b - turn[0, 2] * c)
-    row[1, column] += share * (z * carried[0] - x * carried[2] - turn[1, 0] * a - turn[1, 1] * b - turn[1, 2] * c)
-    row[2, column] += share * (x * carried[1] - y * carried[0] - turn[2, 0] * a - turn[2, 1] * b - turn[2, 2] * c)
+    row[0, column] += share * (
+        y * carried[2] - z * carried[1] - turn[0, 0] * a - turn[0, 1] * b - turn[0, 2] * c
+    )
+    row[1, column] += share * (
+        z * carried[0] - x * carried[2] - turn[1, 0] * a - turn[1, 1] * b - turn[1, 2] * c
+    )
+    row[2, column] += share * (
+        x * carried[1] - y * carried[0] - turn[2, 0] * a - turn[2, 1] * b - turn[2, 2] * c
+    )
 
 
 def skinned(
@@ -190,5 +207,3 @@ def skinned(
     carried = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
     carried += motion[:, None, ..., 3]
     return turns, carried
-
-

@@ -1,8 +1,8 @@
 """Places on the skin of a hand whose shape still changes, and how they slide from triangle to triangle.
 
-The mesh is the hand's own, subdivided once more (Han et al. 2018, section 4.5), always a right hand's. A place
-is a triangle, three barycentric coordinates and a height along the normal between the corners' normals, as
-`gloves.attach` measures a marker's radius; so a place goes with the skin when the shape changes.
+The mesh is the hand's own, subdivided once more (Han et al. 2018, section 4.5), always a right hand's. A
+place is a triangle, three barycentric coordinates and a height along the normal between the corners' normals,
+as `gloves.attach` measures a marker's radius; so a place goes with the skin when the shape changes.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from scipy import sparse
 
+from gloves.attach import Attachment
+from gloves.layout import MarkerLayout
 from handsim.shape import HandShape, named_shape
 from handsim.subdivision import catmull_clark
 from handsim.surface import build_surface, vertex_normals
@@ -126,8 +128,39 @@ def place_points(
 def place_weights(places: SkinPlaces) -> Float[np.ndarray, "P 16"]:
     """Shares of all bones at these places."""
     mesh = skin_mesh()
-    weights: NDArray[np.float64] = np.einsum("pc,pcb->pb", places.bary, mesh.weights[mesh.faces[places.faces]])
+    weights: NDArray[np.float64] = np.einsum(
+        "pc,pcb->pb", places.bary, mesh.weights[mesh.faces[places.faces]]
+    )
     return weights
+
+
+def wear_at(layout: MarkerLayout, places: SkinPlaces, shape: HandShape) -> Attachment:
+    """A glove whose markers sit at these places of a right hand, each carried by its four strongest bones."""
+    points, normals = place_points(places, SkinPatch(places.faces).corners(shape))
+    weights = place_weights(places)
+    bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    shares = np.clip(np.take_along_axis(weights, bones, axis=1), 0.0, None)
+    return Attachment(layout, points, normals, bones, shares / shares.sum(axis=1, keepdims=True))
+
+
+def slip(
+    worn: Attachment, shape: HandShape, distance: float, lift: float = 0.0, *, rng: np.random.Generator
+) -> Attachment:
+    """A glove worn by a right hand with every marker moved along the skin, as real ones are.
+
+    Args:
+        worn: The glove as designed.
+        shape: The hand.
+        distance: How far each marker goes, in a direction of its own [m].
+        lift: Standard deviation of its height over the skin [m].
+        rng: Source of all randomness.
+    """
+    ways = rng.normal(size=worn.points.shape)
+    ways -= (ways * worn.normals).sum(axis=1, keepdims=True) * worn.normals
+    ways *= distance / np.linalg.norm(ways, axis=1, keepdims=True)
+    places = slide(nearest_places(worn.points, shape), worn.points + ways, shape)
+    heights = worn.layout.radius + rng.normal(scale=lift, size=len(ways))
+    return wear_at(worn.layout, places._replace(heights=heights), shape)
 
 
 def weight_slopes(places: SkinPlaces, corners: Corners) -> Float[np.ndarray, "P 16 3"]:

@@ -89,7 +89,7 @@ def simulate_calibration(
 def calibration_angles(
     model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Hinge angles (T, 20) [rad]: the touches, rounds of all fingers that the thumb reaches, then free motion."""
+    """Hinge angles (T, 20) [rad]: rounds of touches, as far as the thumb reaches, then free motion."""
     free = sample_motion(model, config.free, _FREE, rng=rng).qpos[: count_frames(config.free, _FREE), 7:]
     touches = [pose for _ in range(config.rounds) for pose in _round(model, rng)]
     if not touches:
