@@ -54,7 +54,7 @@ class Meeting(NamedTuple):
     gaps: Float[np.ndarray, "K"]
     """Between the pads, both having given way by `PRESS` [m]; negative where they press harder."""
     square: Bool[np.ndarray, "K"]
-    """Whether the pads face each other there."""
+    """Whether the places are on the last bones and face each other."""
 
 
 def find_touches(
@@ -195,8 +195,18 @@ def meet(
     along = (way * direction).sum(axis=1)
     aside = np.linalg.norm(way - along[:, None] * direction, axis=1)
     normals = [normal / np.linalg.norm(normal, axis=1, keepdims=True) for normal in normals]
-    square = ((normals[0] * normals[1]).sum(axis=1) < _OPPOSED) & (aside < _ASIDE)
+    square = ((normals[0] * normals[1]).sum(axis=1) < _OPPOSED) & (aside < _ASIDE) & _on_tips(contacts)
     return Meeting(direction, along + 2.0 * PRESS, square)
+
+
+def _on_tips(contacts: Contacts) -> NDArray[np.bool_]:
+    """Whether both places are on last bones, and have not slid away."""
+    last = np.array([bones_of(digit)[2] for digit in DIGITS])
+    every = np.arange(len(contacts.frames))
+    thumb = place_weights(contacts.thumb_places)[:, last[0]]
+    finger = place_weights(contacts.finger_places)[every, last[contacts.fingers]]
+    tips: NDArray[np.bool_] = np.minimum(thumb, finger) > 0.5
+    return tips
 
 
 def trust(meeting: Meeting, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
