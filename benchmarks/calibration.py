@@ -6,9 +6,9 @@ Each user is one hand, right and left in turn: a size's mean hand made 8 % large
 individual spreads of `handsim.shape.sample_shape`, in a dense19 glove whose markers sit 5 mm from where they
 belong, along the skin, and 0.3 mm above or below it. It makes a capture of touches and free motion before
 the 16 cameras of "figure5"; labels are the truth's. The calibration begins with the size's mean hand and the
-glove as designed. Another capture of the same user holds the touches that the gaps are told for: of all frames
-in which the true flesh of thumb and finger meets, how far the flesh of the tracked hand is from touching, apart
-or dug in, and how far the distance of its skins is from that of the true hand's.
+glove as designed. Another capture of the same user holds the touches that the gaps are told for: of all
+frames in which the true flesh of thumb and finger meets, how far the flesh of the tracked hand is from
+touching, apart or dug in, and how far the distance of its skins is from that of the true hand's.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ import numpy as np
 from handsim.jacobian import skinned_jacobian
 from handsim.model import HandModel
 from handsim.shape import HandShape
+from handsim.surface import build_surface
 from handsim.topology import NUM_BONES
 from track.contacts import PRESS, Contacts, Meeting, meet, trust
 from track.hand_parameters import (
@@ -55,6 +56,8 @@ CONTACT_SPREAD: Final = 0.0004
 """How far pads are from giving way by `contacts.PRESS` [m]; noise over this, squared, is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)
 _REST_SPREAD: Final = np.deg2rad(90.0)
+_STALE: Final = 0.02  # log lengths, radians
+_STEP: Final = 1e-5
 _REST: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
 
 
@@ -124,6 +127,8 @@ class Problem:
         self.noise, self.reach = noise, reach
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
+        self._grown: NDArray[np.float64] | None = None
+        self._grown_at = np.zeros(NUM_PARAMETERS)
 
     def fit(self, guess: Guess) -> Fit:
         """Residuals and energy of a guess."""
@@ -183,13 +188,9 @@ class Problem:
     def equations(self, guess: Guess, fit: Fit) -> Equations:
         """Gauss-Newton's equations, unknowns shared by all frames in the order parameters, markers."""
         count = len(guess.points)
-        faces = self._faces(guess)
-        patch, corners = SkinPatch(faces), SkinPatch(faces).corners(fit.model.shape)
-
-        def rest_points(shape: HandShape) -> NDArray[np.float64]:
-            return place_points(self._all_places(guess), patch.corners(shape))[0]
-
-        rest = slopes_of(self.shape, guess.parameters, rest_points)
+        skin = build_surface(fit.model.shape).vertices
+        patch = SkinPatch(self._faces(guess))
+        corners, rest = patch.corners_on(skin), self._rest_slopes(guess, patch, skin)
         raw = slopes_of(self.shape, guess.parameters, skeleton_numbers)
         by_pose, by_shared = self._marker_slopes(guess, fit, _part(corners, 0, count), rest[:count], raw)
         squares = (fit.misses**2).sum(axis=2)
@@ -207,6 +208,23 @@ class Problem:
         if guess.contacts is not None and fit.meeting is not None:
             self._add_contacts(guess, fit, rest[2 * count :], raw, result)
         return result
+
+    def _rest_slopes(self, guess: Guess, patch: SkinPatch, skin: NDArray[np.float64]) -> NDArray[np.float64]:
+        """How places on the rest skin move by the parameters (P, 3, 53).
+
+        The skin is built anew for every guess, but its derivative only where a hand has changed much: a slope
+        that is a little off slows a step down and leaves the minimum where it is.
+        """
+        if self._grown is None or np.abs(guess.parameters - self._grown_at).max() > _STALE:
+            self._grown = slopes_of(self.shape, guess.parameters, lambda shape: build_surface(shape).vertices)
+            self._grown_at = guess.parameters
+        places = self._all_places(guess)
+        here, _ = place_points(places, patch.corners_on(skin))
+        columns = []
+        for number in range(NUM_PARAMETERS):
+            grown = skin + _STEP * self._grown[..., number]
+            columns.append((place_points(places, patch.corners_on(grown))[0] - here) / _STEP)
+        return np.stack(columns, axis=-1)
 
     def _all_places(self, guess: Guess) -> SkinPlaces:
         parts = [guess.places, self.design]

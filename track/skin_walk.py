@@ -111,7 +111,11 @@ class SkinPatch:
 
     def corners(self, shape: HandShape) -> Corners:
         """Corners of the triangles on a hand of this shape, in the wrist's frame [m]."""
-        points = self._rows @ build_surface(shape).vertices
+        return self.corners_on(build_surface(shape).vertices)
+
+    def corners_on(self, vertices: Float[np.ndarray, "C 3"]) -> Corners:
+        """The same for a skin whose coarse vertices are known [m]."""
+        points = self._rows @ vertices
         return Corners(points[self._corners], vertex_normals(points, self._faces)[self._corners])
 
 
