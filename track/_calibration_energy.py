@@ -52,7 +52,7 @@ PLACE_SPREAD: Final = 0.006
 """How far markers slip along the skin [m]; noise over this, squared, is the paper's lambda_1."""
 HEIGHT_SPREAD: Final = 0.0004
 """How far a marker's centre is off one radius above the skin [m]."""
-CONTACT_SPREAD: Final = 0.0004
+CONTACT_SPREAD: Final = 0.0007
 """How far pads are from giving way by `contacts.PRESS` [m]; noise over this, squared, is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)
 _REST_SPREAD: Final = np.deg2rad(90.0)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 ENOUGH_RANGE: Final = 0.3
 """Share of a hinge's range that the user has to cover."""
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
+_OPTICS: Final = 0.00015  # [m] what an optical system alone may leave a coordinate off by
+_WORTH: Final = 4.0  # frames that tell different things about flesh
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
@@ -30,6 +32,20 @@ def marker_noise(problem: Problem, fit: Fit) -> float:
     typical = np.minimum(squares, 9.0 * np.median(squares))
     freedom = 3 * len(squares) - 26 * len(fit.misses) - NUM_PARAMETERS - 3 * fit.misses.shape[1]
     return float(np.clip(np.sqrt(typical.sum() / max(freedom, 1)), _LEAST_NOISE, _MOST_NOISE))
+
+
+def weighing_noise(noise: float, num_frames: int) -> float:
+    """The noise that a capture's frames are weighed by, so that they count for no more than they tell [m].
+
+    Optical noise is new in every frame. What markers are off beyond it is flesh that moves with the pose: as
+    much again in every like pose, so that many frames tell of it what a few do.
+
+    Args:
+        noise: Standard deviation of a marker's coordinates [m].
+        num_frames: Frames that are weighed.
+    """
+    flesh = max(noise**2 - _OPTICS**2, 0.0)
+    return float(np.sqrt(noise**2 + flesh * max(num_frames / _WORTH - 1.0, 0.0)))
 
 
 def standard_errors(

@@ -23,7 +23,7 @@ from handsim.model import HandModel
 from handsim.topology import BONES, DIGITS, Side
 from handsim.transforms import MIRROR
 from track._calibration_energy import Fit, Guess, Problem
-from track._calibration_report import gaps_on, marker_noise, standard_errors, still_joints
+from track._calibration_report import gaps_on, marker_noise, standard_errors, still_joints, weighing_noise
 from track._calibration_solve import Progress, descend
 from track.contacts import find_touches, place_contacts, trust
 from track.hand_parameters import NUM_PARAMETERS, shape_at
@@ -265,7 +265,7 @@ def _with_touches(
         problem.design,
         problem.radius,
         np.concatenate([targets, markers[track.frames[frames]]]),
-        noise=noise,
+        noise=weighing_noise(noise, len(chosen) + len(frames)),
         reach=_REACH_IN_NOISES * noise,
     )
     guess = dataclasses.replace(guess, qpos=np.concatenate([guess.qpos, track.qpos[frames]]))

@@ -44,7 +44,8 @@ def save_picture(path: str | Path, calibration: Calibration) -> None:
         for panel, title, sign in zip(panels, _VIEWS, (1.0, -1.0), strict=True):
             _draw(panel, calibration, sign)
             panel.set_title(title, color=_SOFT, fontsize=10)
-        panels[0].legend(loc="lower left", frameon=False, fontsize=8.5, labelcolor=_INK)
+        handles, labels = panels[1].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False, labelcolor=_INK)
         figure.suptitle(_headline(calibration), color=_INK, fontsize=11)
         with atomic_write(path) as temporary:
             figure.savefig(temporary, dpi=_DPI, facecolor=_CARD)
@@ -81,9 +82,10 @@ def _draw(panel: Axes, calibration: Calibration, sign: float) -> None:
                 name, (place[0], place[1]), (5, 4), textcoords="offset points", fontsize=6.5, color=_INK,
                 zorder=7, parse_math=False,
             )  # fmt: skip
-    points = [touch.points for touch in calibration.touches if touch.trust > 0.25]
-    touched = np.concatenate(points) if points else np.empty((0, 3))
-    panel.plot(*_flat(touched, sign).T, "o", color=_TOUCH, markersize=3.5, zorder=8, label="touches")
+    if sign < 0.0:  # touches are of pads
+        points = [touch.points for touch in calibration.touches if touch.trust > 0.25]
+        touched = np.concatenate(points) if points else np.empty((0, 3))
+        panel.plot(*_flat(touched, sign).T, "o", color=_TOUCH, markersize=3.5, zorder=8, label="touches")
     panel.set_aspect("equal")
     panel.set_axis_off()
 

@@ -16,6 +16,7 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.motion import HandMotion
 from handsim.topology import NUM_JOINTS
+from poses.detours import can_be_left
 from poses.library import gesture
 from poses.motions import angles_through, count_frames, sample_motion
 from poses.pace import MotionConfig
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 _PLACES: Final = (0.22, -0.22)  # where each hand is [m], so that hands do not meet
 _VOLUME: Final = 0.1
+_MOST_DRAWS: Final = 20
 _STARTS: Final = ("pinch_pad", "pinch_tip")
 _JITTER: Final = np.deg2rad(8.0)
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
@@ -89,13 +91,26 @@ def simulate_calibration(
 def calibration_angles(
     model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Hinge angles (T, 20) [rad]: rounds of touches, as far as the thumb reaches, then free motion."""
-    free = sample_motion(model, config.free, _FREE, rng=rng).qpos[: count_frames(config.free, _FREE), 7:]
+    """Hinge angles (T, 20) [rad]: rounds of touches, as far as the thumb reaches, then free motion.
+
+    Raises:
+        ShapeError: This hand cannot move.
+    """
     touches = [pose for _ in range(config.rounds) for pose in _round(model, rng)]
+    free = _free_motion(model, config.free, rng)
     if not touches:
         return free
     poses = np.stack([*touches, free[0]])
     return np.concatenate([poses[:1], angles_through(model, poses, _TOUCHING, rng=rng), free])
+
+
+def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Free motion from a pose that can be reached from everywhere."""
+    for _ in range(_MOST_DRAWS):
+        free = sample_motion(model, seconds, _FREE, rng=rng).qpos[: count_frames(seconds, _FREE), 7:]
+        if can_be_left(model, free[:1]).all():
+            return free
+    raise ShapeError("this hand finds no way from its touches to a free motion")
 
 
 def _round(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
@@ -105,5 +120,7 @@ def _round(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float6
         pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
         start = make_valid(model, (pinch + rng.normal(scale=_JITTER, size=NUM_JOINTS))[None])
         with contextlib.suppress(ShapeError):  # another finger, or the next round
-            poses.append(touching_angles(model, finger, start))
+            touch = touching_angles(model, finger, start)
+            if can_be_left(model, touch[None]).all():
+                poses.append(touch)
     return poses

@@ -60,7 +60,7 @@ def calibrated(side) -> tuple[UserHand, Calibration, list]:
     rng = np.random.default_rng(6)
     hand, qpos = somebody()
     markers = hand.attachment.centres(hand.model, hand.model.forward_kinematics(qpos))
-    markers += rng.normal(scale=0.0002, size=markers.shape)
+    markers += rng.normal(scale=0.0001, size=markers.shape)
     markers[rng.random(markers.shape[:2]) < 0.01] = np.nan
     if side == "left":
         hand, markers = mirrored(hand), markers @ MIRROR
