@@ -1,6 +1,6 @@
 """From a glove of ten markers, nothing but a TOML file, to a labeler: three commands, timed and measured.
 
-python benchmarks/new_layout.py [--frames 170330] [--samples 1200000]
+python benchmarks/new_layout.py [--frames 170330] [--samples 800000]
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ WANTED, LIMIT = 0.93, 15 * 60
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=170_330)
-    parser.add_argument("--samples", type=int, default=1_200_000)
+    parser.add_argument("--samples", type=int, default=800_000)
     options = parser.parse_args()
     print(describe("torch", "mujoco"))
     with tempfile.TemporaryDirectory() as folder:

@@ -127,8 +127,17 @@ def workspace(num_markers: Any) -> Any:
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def place_markers(hand: Any, angles: Any, work: Any) -> None:
     """Bones, hinge axes and markers of a pose in the wrist's frame."""
-    for bone in range(1, NUM_BONES):
-        digit, place = (bone - 1) // 3, (bone - 1) % 3
+    for digit in range(NUM_JOINTS // 4):
+        place_digit(hand, digit, angles[4 * digit : 4 * digit + 4], work)
+    for marker in range(len(hand.bones)):
+        place_marker(hand, marker, work)
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def place_digit(hand: Any, digit: Any, angles: Any, work: Any) -> None:
+    """Bones and hinge axes of one digit in the wrist's frame."""
+    for place in range(3):
+        bone = 1 + 3 * digit + place
         parent = bone - 1 if place > 0 else 0
         turned, own = work.rotations[parent], work.rotations[bone]
         for i in range(3):
@@ -138,20 +147,25 @@ def place_markers(hand: Any, angles: Any, work: Any) -> None:
                 own[i, j] = 0.0
                 for k in range(3):
                     own[i, j] += turned[i, k] * hand.rotations[bone, k, j]
-        for hinge in range(4 * digit + (place + 1 if place > 0 else 0), 4 * digit + place + 2):
-            _turn(own, hand.axes[hinge], angles[hinge], work.axes[hinge])
-    for marker in range(len(hand.bones)):
-        work.markers[marker] = 0.0
-        for slot in range(4):
-            bone = hand.bones[marker, slot]
-            if bone < 0:
-                break
-            own, place = work.rotations[bone], hand.places[marker, slot]
-            for i in range(3):
-                carried = hand.shares[marker, slot] * work.origins[bone, i]
-                carried += own[i, 0] * place[0] + own[i, 1] * place[1] + own[i, 2] * place[2]
-                work.carried[marker, slot, i] = carried
-                work.markers[marker, i] += carried
+        for number in range(place + 1 if place > 0 else 0, place + 2):
+            hinge = 4 * digit + number
+            _turn(own, hand.axes[hinge], angles[number], work.axes[hinge])
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def place_marker(hand: Any, marker: Any, work: Any) -> None:
+    """One marker in the wrist's frame, its bones being placed."""
+    work.markers[marker] = 0.0
+    for slot in range(4):
+        bone = hand.bones[marker, slot]
+        if bone < 0:
+            break
+        own, place = work.rotations[bone], hand.places[marker, slot]
+        for i in range(3):
+            carried = hand.shares[marker, slot] * work.origins[bone, i]
+            carried += own[i, 0] * place[0] + own[i, 1] * place[1] + own[i, 2] * place[2]
+            work.carried[marker, slot, i] = carried
+            work.markers[marker, i] += carried
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -170,34 +184,33 @@ def _turn(own: Any, axis: Any, angle: Any, outside: Any) -> None:
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def find_slopes(hand: Any, work: Any) -> None:
-    """Derivatives of all markers by all unknowns, in the wrist's frame."""
-    for marker in range(len(hand.bones)):
-        slopes = work.slopes[marker]
-        for i in range(3):
-            for hinge in range(hand.reach[marker, 0], hand.reach[marker, 1]):
-                slopes[i, hinge] = 0.0
-        for slot in range(4):
-            bone = hand.bones[marker, slot]
-            if bone < 0:
-                break
-            if bone == 0:
-                continue
-            digit, place = (bone - 1) // 3, (bone - 1) % 3
-            share = hand.shares[marker, slot]
-            for number in range(place + 2):
-                hinge, anchor = 4 * digit + number, 1 + 3 * digit + max(0, number - 1)
-                x = work.carried[marker, slot, 0] - share * work.origins[anchor, 0]
-                y = work.carried[marker, slot, 1] - share * work.origins[anchor, 1]
-                z = work.carried[marker, slot, 2] - share * work.origins[anchor, 2]
-                a, b, c = work.axes[hinge, 0], work.axes[hinge, 1], work.axes[hinge, 2]
-                slopes[0, hinge] += b * z - c * y
-                slopes[1, hinge] += c * x - a * z
-                slopes[2, hinge] += a * y - b * x
-        x, y, z = work.markers[marker, 0], work.markers[marker, 1], work.markers[marker, 2]
-        slopes[1, _TURN], slopes[2, _TURN] = -z, y
-        slopes[0, _TURN + 1], slopes[2, _TURN + 1] = z, -x
-        slopes[0, _TURN + 2], slopes[1, _TURN + 2] = -y, x
+def find_slopes(hand: Any, marker: Any, work: Any) -> None:
+    """Derivatives of one marker by all unknowns, in the wrist's frame."""
+    slopes = work.slopes[marker]
+    for i in range(3):
+        for hinge in range(hand.reach[marker, 0], hand.reach[marker, 1]):
+            slopes[i, hinge] = 0.0
+    for slot in range(4):
+        bone = hand.bones[marker, slot]
+        if bone < 0:
+            break
+        if bone == 0:
+            continue
+        digit, place = (bone - 1) // 3, (bone - 1) % 3
+        share = hand.shares[marker, slot]
+        for number in range(place + 2):
+            hinge, anchor = 4 * digit + number, 1 + 3 * digit + max(0, number - 1)
+            x = work.carried[marker, slot, 0] - share * work.origins[anchor, 0]
+            y = work.carried[marker, slot, 1] - share * work.origins[anchor, 1]
+            z = work.carried[marker, slot, 2] - share * work.origins[anchor, 2]
+            a, b, c = work.axes[hinge, 0], work.axes[hinge, 1], work.axes[hinge, 2]
+            slopes[0, hinge] += b * z - c * y
+            slopes[1, hinge] += c * x - a * z
+            slopes[2, hinge] += a * y - b * x
+    x, y, z = work.markers[marker, 0], work.markers[marker, 1], work.markers[marker, 2]
+    slopes[1, _TURN], slopes[2, _TURN] = -z, y
+    slopes[0, _TURN + 1], slopes[2, _TURN + 1] = z, -x
+    slopes[0, _TURN + 2], slopes[1, _TURN + 2] = -y, x
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -206,8 +219,8 @@ def gather(hand: Any, weights: Any, work: Any) -> None:
     normal, gradient = work.normal, work.gradient
     normal[:] = 0.0
     gradient[:] = 0.0
-    find_slopes(hand, work)
     for marker in range(len(weights)):
+        find_slopes(hand, marker, work)
         weight, slopes = weights[marker], work.slopes[marker]
         if weight == 0.0:
             continue

@@ -19,12 +19,13 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.topology import DIGITS, NUM_JOINTS, NUM_QPOS
 from handsim.transforms import multiply_quaternions, vector_quaternions
+from track.expectation import Expectation, expect_markers
 from track.gloved_hand import GlovedHand, gloved_hand, workspace
 from track.pose_descent import MARKER_NOISE, descend, find_misses
 from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
     from numpy.typing import ArrayLike, NDArray
 
 _REST_PULL: Final = np.deg2rad(90.0) ** -2  # [1/rad^2] of a hinge around rest
@@ -134,6 +135,41 @@ class PoseSolver:
                 f"initial has a quaternion of length zero in frame {wrong}, wanted an orientation"
             )
         return PoseFit(qpos, rms, residuals, steps)
+
+    def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
+        """Where a pose has its markers [m]."""
+        nowhere = np.zeros(len(self._hand.digits), dtype=bool)
+        return self.expect(qpos, nowhere, spread=np.ones(NUM_JOINTS), noise=MARKER_NOISE).places
+
+    def expect(
+        self,
+        qpos: Float[np.ndarray, "27"],
+        there: Bool[np.ndarray, "M"],
+        *,
+        spread: Float[np.ndarray, "20"],
+        noise: float,
+    ) -> Expectation:
+        """Where a fitted pose has its markers, and how far they may be from there.
+
+        Args:
+            qpos: The pose.
+            there: The markers that it was fitted to.
+            spread: Standard deviations of its hinges [rad] as they were thought to be before the fit; they
+                count as in `solve`.
+            noise: Standard deviation of those markers around the pose's [m].
+        """
+        count = len(self._hand.digits)
+        expectation = Expectation(np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3)))
+        expect_markers(
+            self._hand,
+            self._on_digit,
+            np.array(qpos, dtype=np.float64),
+            np.array(there),
+            np.array(spread, dtype=np.float64) ** -2,
+            noise**-2,
+            *expectation,
+        )
+        return expectation
 
 
 def solve_poses(

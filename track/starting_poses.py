@@ -85,7 +85,7 @@ def lay_shapes(shapes: Any, digits: Any, target: Any) -> Any:
 def _choose_digits(shapes: Any, digits: Any, target: Any, pose: Any, markers: Any) -> None:
     """Take each digit from the shape whose markers are nearest, the wrist held."""
     turn = np.empty((3, 3))
-    _write_rotation(pose[3:7], turn)
+    write_rotation(pose[3:7], turn)
     squares = np.zeros((5, len(shapes.angles)))
     for marker in range(len(target)):
         if digits[marker] < 0 or np.isnan(target[marker, 0]):
@@ -141,7 +141,7 @@ def lay_rigidly(source: Any, target: Any, weights: Any, pose: Any) -> Any:
     values, vectors = np.linalg.eigh(form)
     turn = np.empty((3, 3))
     pose[3:7] = vectors[:, 3]
-    _write_rotation(pose[3:7], turn)
+    write_rotation(pose[3:7], turn)
     for i in range(3):
         pose[i] = centres[1, i]
         for j in range(3):
@@ -150,7 +150,8 @@ def lay_rigidly(source: Any, target: Any, weights: Any, pose: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _write_rotation(quaternion: Any, turn: Any) -> None:
+def write_rotation(quaternion: Any, turn: Any) -> None:
+    """The matrix of a unit quaternion."""
     w, x, y, z = quaternion
     turn[0, 0], turn[0, 1], turn[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     turn[1, 0], turn[1, 1], turn[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)

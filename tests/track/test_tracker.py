@@ -1,0 +1,90 @@
+"""The tracker on simulated captures whose truth is known."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.attach import attach
+from gloves.take import Take
+from handsim.model import HandModel
+from track.tracked_frame import Status, TrackedFrame
+from track.tracker import Tracker
+from track.user import UserHand
+from train.labeler import load_labeler
+from train.twins import TwinConfig, simulate_twin
+
+
+@pytest.fixture(scope="module")
+def labeler():
+    return load_labeler("dense19")
+
+
+@pytest.fixture(scope="module")
+def take() -> Take:
+    return simulate_twin(TwinConfig(kind="hand-controller", num_frames=240))
+
+
+def users(take: Take) -> list[UserHand]:
+    models = [HandModel(hand.shape) for hand in take.hands]
+    return [
+        UserHand(model, attach(hand.layout, model)) for model, hand in zip(models, take.hands, strict=True)
+    ]
+
+
+def seen(take: Take, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points, IDs and true labels of one frame; the object's markers are nobody's."""
+    here = np.isfinite(take.points[frame, :, 0])
+    labels = take.labels[frame, here].astype(int)
+    labels[labels >= take.hand_labels[-1].stop] = -1
+    return take.points[frame, here], take.ids[frame, here], labels
+
+
+def run(tracker: Tracker, take: Take, frames: range) -> list[TrackedFrame]:
+    return [tracker.step(*seen(take, frame)[:2], frame / take.rate) for frame in frames]
+
+
+def test_hands_are_found_and_followed(take, labeler):
+    frames = range(take.num_frames)
+    tracked = run(Tracker(users(take), labeler), take, frames)
+    assert [hand.status for hand in tracked[0].hands] == [Status.FOUND, Status.FOUND]
+    assert all(hand.status is Status.TRACKED for frame in tracked[1:] for hand in frame.hands)
+    right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
+    assert np.mean(right) >= 0.98
+    for number, hand in enumerate(take.hands):
+        model = HandModel(hand.shape)
+        poses = np.array([frame.hands[number].qpos for frame in tracked])
+        bones = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (poses, hand.qpos)]
+        assert np.linalg.norm(bones[0] - bones[1], axis=-1).mean() <= 0.0005
+        assert np.rad2deg(np.abs(poses[:, 7:] - hand.qpos[:, 7:])).mean() <= 1.0
+
+
+def test_hands_are_found_again_after_a_second_without_points(take, labeler):
+    tracker = Tracker(users(take), labeler)
+    run(tracker, take, range(60))
+    dark = [tracker.step(np.zeros((0, 3)), np.zeros(0, dtype=int), (60 + n) / 120) for n in range(120)]
+    assert [hand.status for hand in dark[0].hands] == [Status.COASTING] * 2
+    assert [hand.status for hand in dark[-1].hands] == [Status.LOST] * 2
+    assert np.isnan(dark[-1].hands[0].qpos).all()
+    after = run(tracker, take, range(180, 183))
+    assert all(hand.status is not Status.LOST for hand in after[-1].hands)
+    assert np.array_equal(after[-1].labels, seen(take, 182)[2])
+
+
+def test_points_without_ids_are_named_by_where_they_are(take, labeler):
+    nameless = dataclasses.replace(take, ids=np.full_like(take.ids, -1))
+    tracked = run(Tracker(users(take), labeler), nameless, range(20))
+    right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
+    assert np.mean(right) >= 0.9
+
+
+def test_an_id_that_goes_over_to_another_marker_loses_its_name(take, labeler):
+    tracker = Tracker(users(take), labeler)
+    run(tracker, take, range(10))
+    points, ids, labels = seen(take, 10)
+    one, two = np.flatnonzero(labels == 6)[0], np.flatnonzero(labels == 9)[0]
+    ids = ids.copy()
+    ids[[one, two]] = ids[[two, one]]
+    assert np.array_equal(tracker.step(points, ids, 10 / 120).labels, labels)

@@ -1,0 +1,269 @@
+"""Which points are a digit's markers: every way to name a few points is tried on the digit itself, compiled.
+
+The palm being known, a digit is four hinges, and three markers on it leave five of nine coordinates to check.
+So a handful of points near a digit can be named by trying: each naming is fitted, and what counts is how well
+its points lie on the digit, how far its hinges are from where they were coming to, and for how long an ID has
+carried a name.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numba
+import numpy as np
+
+from handsim.topology import DIGITS
+from track.gloved_hand import (
+    FAST,
+    GlovedHand,
+    find_slopes,
+    place_digit,
+    place_marker,
+    place_markers,
+    workspace,
+)
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_STEPS: Final = 10
+_LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
+_FREEDOM: Final = 4.0  # squared deviations of a prior from which on it loses its say
+_SLACK: Final = 0.006  # [m] that two markers may be nearer or farther than on any pose of the hand
+_OVER: Final = 1e9
+
+
+class DigitRanges(NamedTuple):
+    """How near and how far two markers of one digit can be from each other."""
+
+    nearest: Float[np.ndarray, "M M"]
+    farthest: Float[np.ndarray, "M M"]
+
+
+def digit_ranges(hand: GlovedHand) -> DigitRanges:
+    """The distances of a hand's markers over a grid of its hinges, with some slack."""
+    work = workspace(len(hand.digits))
+    shares = np.linspace(0.0, 1.0, 5)
+    grid = np.stack(np.meshgrid(*[shares] * 4, indexing="ij"), axis=-1).reshape(-1, 4)
+    count = len(hand.digits)
+    nearest, farthest = np.full((count, count), np.inf), np.zeros((count, count))
+    for angles in grid:
+        low, high = hand.ranges[:, 0], hand.ranges[:, 1]
+        posed = low + np.tile(angles, len(DIGITS)) * (high - low)
+        place_markers(hand, posed, work)
+        apart = np.linalg.norm(work.markers[:, None] - work.markers[None], axis=-1)
+        nearest, farthest = np.minimum(nearest, apart), np.maximum(farthest, apart)
+    return DigitRanges(nearest - _SLACK, farthest + _SLACK)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def search_digit(
+    hand: Any,
+    ranges: Any,
+    digit: Any,
+    markers: Any,
+    points: Any,
+    credit: Any,
+    variance: Any,
+    worth: Any,
+    posed: Any,
+    coming: Any,
+    trust: Any,
+    best: Any,
+    hinges: Any,
+) -> Any:
+    """The best naming of points as markers of one digit.
+
+    Args:
+        hand: The hand, its markers where their habits have them.
+        ranges: See `digit_ranges`.
+        digit: Which digit.
+        markers: Its markers (K,).
+        points: Points (C, 3) [m] in the wrist's frame.
+        credit: What each name is worth to each point (C, K) beyond the fit, for the IDs' sake.
+        variance: Of each marker (M,) around its place [m^2].
+        worth: What naming a point is worth that lies where its marker is expected (M,).
+        posed: Angles (20,) [rad] of the whole hand: skin between two fingers moves with both.
+        coming: Angles (4,) [rad] that the hinges were coming to.
+        trust: Inverse variances (4,) of these.
+        best: Point of each marker (K,), -1 for none; overwritten.
+        hinges: Angles (4,) of the best naming; overwritten.
+
+    Returns:
+        The score of the best naming, and by how much it is better than the best that gives any point or
+        marker of it another part.
+    """
+    count, choices = len(markers), len(points) + 1
+    work = workspace(len(hand.digits))
+    place_markers(hand, posed, work)
+    naming, angles = np.full(count, -1), np.empty(4)
+    first, second = -_OVER, -_OVER
+    total = 1
+    for _ in range(count):
+        total *= choices
+    for number in range(total):
+        rest = number
+        for place in range(count):
+            naming[place] = rest % choices - 1
+            rest //= choices
+        most = _most(ranges, markers, points, credit, worth, naming)
+        if most <= second:
+            continue
+        score = -_OVER
+        for start in range(2):
+            angles[:] = coming if start == 0 else hinges
+            if start == 1 and first == -_OVER:
+                break
+            reached = most - _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
+            if reached > score:
+                score = reached
+                if score > first:
+                    kept = angles.copy()
+        if score > first:
+            first, second = score, first
+            best[:] = naming
+            hinges[:] = kept
+        elif score > second:
+            second = score
+    return first, first - second
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _most(ranges: Any, markers: Any, points: Any, credit: Any, worth: Any, naming: Any) -> Any:
+    """What a naming is worth if every point lies where it should; far below zero if they cannot."""
+    total = 0.0
+    for place in range(len(markers)):
+        point = naming[place]
+        if point < 0:
+            continue
+        total += worth[markers[place]] + credit[point, place]
+        for other in range(place):
+            if naming[other] < 0:
+                continue
+            if naming[other] == point:
+                return -_OVER
+            apart = 0.0
+            for i in range(3):
+                apart += (points[point, i] - points[naming[other], i]) ** 2
+            apart = np.sqrt(apart)
+            one, two = markers[place], markers[other]
+            if apart < ranges.nearest[one, two] or apart > ranges.farthest[one, two]:
+                return -_OVER
+    return total
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _fit(
+    hand: Any,
+    digit: Any,
+    markers: Any,
+    points: Any,
+    variance: Any,
+    naming: Any,
+    coming: Any,
+    trust: Any,
+    angles: Any,
+    work: Any,
+) -> Any:
+    """Bring four hinges to a minimum; returns the misfit of named points and hinges."""
+    trial, factor, rest = angles.copy(), np.empty((4, 4)), np.empty(4)
+    normal, gradient = np.empty((4, 4)), np.empty(4)
+    cost = _gather(
+        hand, digit, markers, points, variance, naming, coming, trust, angles, work, normal, gradient
+    )
+    damping = 1e-3
+    for _ in range(_STEPS):
+        for row in range(4):
+            rest[row] = -gradient[row]
+            for column in range(4):
+                factor[row, column] = normal[row, column]
+            factor[row, row] *= 1.0 + damping
+        _solve_four(factor, rest)
+        for row in range(4):
+            trial[row] = angles[row] + rest[row]
+        tried = _gather(
+            hand, digit, markers, points, variance, naming, coming, trust, trial, work, normal, gradient
+        )
+        if tried < cost:
+            small = cost - tried < 0.01
+            cost = tried
+            angles[:] = trial
+            damping = max(damping * 0.1, 1e-9)
+            if small:
+                break
+        else:
+            damping *= 30.0
+            if damping > 1e5:
+                break
+            _gather(
+                hand, digit, markers, points, variance, naming, coming, trust, angles, work, normal, gradient
+            )
+    return cost
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _gather(
+    hand: Any,
+    digit: Any,
+    markers: Any,
+    points: Any,
+    variance: Any,
+    naming: Any,
+    coming: Any,
+    trust: Any,
+    angles: Any,
+    work: Any,
+    normal: Any,
+    gradient: Any,
+) -> Any:
+    """Cost at some angles, with its normal matrix and half its gradient."""
+    normal[:] = 0.0
+    gradient[:] = 0.0
+    cost, first = 0.0, 4 * digit
+    place_digit(hand, digit, angles, work)
+    for place in range(len(markers)):
+        if naming[place] < 0:
+            continue
+        marker, point = markers[place], points[naming[place]]
+        place_marker(hand, marker, work)
+        find_slopes(hand, marker, work)
+        weight, slopes = 1.0 / variance[marker], work.slopes[marker]
+        for i in range(3):
+            miss = work.markers[marker, i] - point[i]
+            cost += 0.5 * weight * miss * miss
+            for row in range(4):
+                gradient[row] += weight * slopes[i, first + row] * miss
+                for column in range(4):
+                    normal[row, column] += weight * slopes[i, first + row] * slopes[i, first + column]
+    away = 0.0
+    for row in range(4):
+        away += trust[row] * (angles[row] - coming[row]) ** 2
+    say = 1.0 / (1.0 + away / _FREEDOM)
+    cost += 0.5 * _FREEDOM * np.log(1.0 + away / _FREEDOM)
+    for row in range(4):
+        gradient[row] += say * trust[row] * (angles[row] - coming[row])
+        normal[row, row] += say * trust[row]
+        low, high = hand.ranges[first + row, 0], hand.ranges[first + row, 1]
+        beyond = max(angles[row] - high, 0.0) + min(angles[row] - low, 0.0)
+        if beyond != 0.0:
+            cost += 0.5 * _LIMIT_WEIGHT * beyond * beyond
+            gradient[row] += _LIMIT_WEIGHT * beyond
+            normal[row, row] += _LIMIT_WEIGHT
+    return cost
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _solve_four(matrix: Any, rest: Any) -> None:
+    """Solve a small positive system in place by elimination."""
+    for row in range(4):
+        scale = 1.0 / matrix[row, row]
+        for other in range(row + 1, 4):
+            share = matrix[other, row] * scale
+            for column in range(row, 4):
+                matrix[other, column] -= share * matrix[row, column]
+            rest[other] -= share * rest[row]
+    for row in range(3, -1, -1):
+        for column in range(row + 1, 4):
+            rest[row] -= matrix[row, column] * rest[column]
+        rest[row] /= matrix[row, row]

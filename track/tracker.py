@@ -1,0 +1,167 @@
+"""The online tracker: points of a frame in, hands in motion out.
+
+Section 4 of Han et al. 2018, with more memory: names go along with IDs while they fit, new points are named
+by what the hand that is coming explains (`track.naming`), and a hand of which nothing is known is looked for
+with the labeler (`track.finding`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.topology import NUM_QPOS
+from track.finding import MOST_RMS, HandFinder
+from track.hand_memory import HandMemory
+from track.inverse_kinematics import PoseFit
+from track.naming import fit_names, forget_surprises, name_new
+from track.tracked_frame import Status, TrackedFrame, TrackedHand
+from track.user import UserHand
+from train.labeling import Labeler
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+_FEWEST: Final = 6  # named points that a pose can be relied on for
+_LONGEST_COAST: Final = 0.1  # [s] that a pose is carried on without them
+_MOST_CREDIT: Final = 12.0
+_INCOME: Final = 2.0  # credit of a name in each frame, less half the squared deviations it is off
+
+
+class Tracker:
+    """Follows the user's hands from frame to frame.
+
+    Args:
+        hands: The user's hands, each side at most once.
+        labeler: Knows the markers of the hands' glove.
+    """
+
+    def __init__(self, hands: Sequence[UserHand], labeler: Labeler) -> None:
+        self._memories = [HandMemory(hand) for hand in hands]
+        self._finder = HandFinder(self._memories, labeler)
+        sizes = [memory.num_markers for memory in self._memories]
+        self._first = np.cumsum([0, *sizes])
+        self._labels: dict[int, tuple[int, float]] = {}
+
+    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
+        """Take in the next frame.
+
+        Args:
+            points: Points [m], none of them missing.
+            ids: The system's IDs: a point keeps its own for as long as it is seen; -1 where there is none.
+            time: Time of the frame [s].
+        """
+        names, credit = self._carry_over(ids)
+        sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
+        hands: list[TrackedHand] = []
+        for number, memory in enumerate(self._memories):
+            mine = names[number]
+            fit = None
+            if memory.qpos is not None:
+                fit = self._follow(number, points, names, credit, sure, time)
+            hands.append(self._judge(memory, points, mine, credit, fit, time))
+        self._find_lost(points, names, hands, time)
+        labels = np.where(names >= 0, names + self._first[:-1, None], -1).max(axis=0, initial=-1)
+        self._labels = {
+            point: (label, worth)
+            for point, label, worth in zip(ids.tolist(), labels.tolist(), credit.tolist(), strict=True)
+            if label >= 0 and point >= 0
+        }
+        return TrackedFrame(time, tuple(hands), labels, sure)
+
+    def _carry_over(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Names (H, N) that the IDs carry, and what they are worth (N,)."""
+        known = [self._labels.get(point, (-1, 0.0)) for point in ids.tolist()]
+        labels = np.array([label for label, _ in known], dtype=np.int64)
+        names = labels - self._first[:-1, None]
+        names[(names < 0) | (labels >= self._first[1:, None])] = -1
+        return names, np.array([worth for _, worth in known])
+
+    def _follow(
+        self,
+        number: int,
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        credit: NDArray[np.float64],
+        sure: NDArray[np.float64],
+        time: float,
+    ) -> PoseFit | None:
+        """The pose of a hand that was there before; its names (a row of H, N) and credits are overwritten."""
+        memory, mine = self._memories[number], names[number]
+        coming = memory.predict(time)
+        forget_surprises(memory, points, mine, coming, time)
+        fit = fit_names(memory, points, mine, coming, time)
+        if fit is None:
+            return None
+        free = np.logical_not((names >= 0).any(axis=0))
+        how_sure = name_new(memory, points, mine, free, credit, fit.qpos[0], coming, time)
+        changed = np.isfinite(how_sure)
+        if changed.any():
+            credit[changed], sure[changed] = 0.0, how_sure[changed]
+            fit = fit_names(memory, points, mine, coming, time)
+        return fit
+
+    def _judge(
+        self,
+        memory: HandMemory,
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        credit: NDArray[np.float64],
+        fit: PoseFit | None,
+        time: float,
+    ) -> TrackedHand:
+        """Take a pose over or throw it away."""
+        mine = np.flatnonzero(names >= 0)
+        if fit is not None and len(mine) >= _FEWEST and fit.rms[0] <= MOST_RMS:
+            memory.carry_on(fit, time)
+            off = ((points[mine] - memory.places[names[mine]]) ** 2).sum(axis=1)
+            income = _INCOME - 0.5 * off / memory.variance[names[mine]]
+            credit[mine] = np.clip(credit[mine] + income, 0.0, _MOST_CREDIT)
+            return _tracked(memory, Status.TRACKED, points, names, fit)
+        if memory.qpos is not None and time - memory.time > _LONGEST_COAST:
+            memory.qpos = None
+        if memory.qpos is None:
+            names[:] = -1
+            return _tracked(memory, Status.LOST, points, names, None)
+        return _tracked(memory, Status.COASTING, points, names, None)
+
+    def _find_lost(
+        self,
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        hands: list[TrackedHand],
+        time: float,
+    ) -> None:
+        """Look for the hands that have no pose among the points without a name."""
+        lost = [n for n, hand in enumerate(hands) if hand.status in (Status.LOST, Status.COASTING)]
+        if not lost:
+            return
+        others = np.delete(names, lost, axis=0)
+        free = np.flatnonzero((others < 0).all(axis=0))
+        for found in self._finder.find(points[free], lost):
+            memory = self._memories[found.number]
+            names[found.number] = -1
+            names[found.number, free] = found.names
+            memory.begin(found.fit, time)
+            hands[found.number] = _tracked(memory, Status.FOUND, points, names[found.number], found.fit)
+
+
+def _tracked(
+    memory: HandMemory,
+    status: Status,
+    points: NDArray[np.float64],
+    names: NDArray[np.int64],
+    fit: PoseFit | None,
+) -> TrackedHand:
+    count = memory.num_markers
+    if memory.qpos is None:
+        nothing = np.full((count, 3), np.nan)
+        return TrackedHand(memory.hand.side, status, np.full(NUM_QPOS, np.nan), np.nan, nothing, np.arange(0))
+    markers, mine = memory.places.copy(), names >= 0
+    markers[names[mine]] = points[mine]
+    filled = np.setdiff1d(np.arange(count), names[mine])
+    rms = np.nan if fit is None else float(fit.rms[0])
+    return TrackedHand(memory.hand.side, status, memory.qpos, rms, markers, filled)
