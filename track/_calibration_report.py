@@ -23,15 +23,16 @@ ENOUGH_RANGE: Final = 0.3
 """Share of a hinge's range that the user has to cover."""
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _OPTICS: Final = 0.00015  # [m] what an optical system alone may leave a coordinate off by
+_MIDDLE: Final = 2.366  # median of a chi-squared variable of three degrees of freedom
 _WORTH: Final = 4.0  # frames that tell different things about flesh
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
-    """Standard deviation of a marker's coordinates, from the residuals and what was fitted to them."""
+    """Standard deviation of a marker's coordinates [m], from the middle one and what was fitted to all."""
     squares = (fit.misses**2).sum(axis=2)[problem.there]
-    typical = np.minimum(squares, 9.0 * np.median(squares))
     freedom = 3 * len(squares) - 26 * len(fit.misses) - NUM_PARAMETERS - 3 * fit.misses.shape[1]
-    return float(np.clip(np.sqrt(typical.sum() / max(freedom, 1)), _LEAST_NOISE, _MOST_NOISE))
+    left = max(freedom, 1) / (3 * len(squares))
+    return float(np.clip(np.sqrt(np.median(squares) / (_MIDDLE * left)), _LEAST_NOISE, _MOST_NOISE))
 
 
 def weighing_noise(noise: float, num_frames: int) -> float:

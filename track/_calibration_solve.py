@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, float, float], None]
 """Called after each step: its number, RMS of the markers and of the touches' gaps [m] (NaN: none yet)."""
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
+_MORE, _LESS, _LEAST_RAISED = 10.0, 0.2, 1e-6  # what a step that failed and one that worked make of it
 _MOST_TRIALS: Final = 8
 _SMALL_GAIN: Final = 1e-4  # of the energy, after which steps end
 
@@ -84,8 +85,8 @@ def _step(problem: Problem, guess: Guess, fit: Fit, damping: float) -> tuple[Gue
         trial = problem.moved(guess, poses, shared)
         trial_fit = problem.fit(trial)
         if trial_fit.cost < fit.cost:
-            return *_slid(problem, trial, trial_fit), max(0.2 * damping, 1e-8), True
-        damping = max(10.0 * damping, 1e-6)
+            return *_slid(problem, trial, trial_fit), max(_LESS * damping, _LEAST_DAMPING), True
+        damping = max(_MORE * damping, _LEAST_RAISED)
     return guess, fit, damping, False
 
 

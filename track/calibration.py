@@ -12,37 +12,47 @@ off by; the spreads were chosen on simulated people (docs/calibration.md).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.attach import Attachment
-from handsim.errors import ShapeError
 from handsim.model import HandModel
-from handsim.topology import BONES, DIGITS, Side
+from handsim.topology import DIGITS, Side
 from handsim.transforms import MIRROR
 from track._calibration_energy import Fit, Guess, Problem
+from track._calibration_frames import (
+    CalibrationError,
+    Track,
+    check_markers,
+    check_motion,
+    first_look,
+    follow,
+    telling_frames,
+    usable_frames,
+    whole_digits,
+)
 from track._calibration_report import gaps_on, marker_noise, standard_errors, still_joints, weighing_noise
 from track._calibration_solve import Progress, descend
 from track.contacts import find_touches, place_contacts, trust
 from track.hand_parameters import NUM_PARAMETERS, shape_at
-from track.inverse_kinematics import PoseSolver
 from track.skin_walk import SkinPatch, nearest_places, place_points, wear_at
 from track.user import UserHand
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Float
     from numpy.typing import NDArray
 
-NUM_FRAMES: Final = 160
-FEWEST_FRAMES: Final = 30
+__all__ = ["Calibration", "CalibrationError", "Touch", "calibrate", "calibrate_hands"]
+
+_WIDE_STEPS: Final = 6  # of which none gives up a marker that is far off
 _CONTACTS_FROM: Final = 10  # steps without contacts, as in the paper
 _MOST_STEPS: Final = 30
 _FIRST_NOISE, _FIRST_REACH = 0.001, 0.03  # [m]
 _REACH_IN_NOISES: Final = 8.0
-_CANDIDATES: Final = 2000
-_SOLVABLE: Final = 6  # markers at least
+_COUNTS: Final = 0.25  # trust from which a touch counts for one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +78,7 @@ class Calibration:
     start: UserHand
     """What the calibration began with."""
     rms_before: float
-    """RMS distance of markers from the tracked hand [m], over the capture, a frame at most every few."""
+    """Median over frames of the markers' RMS distance from the tracked hand [m]."""
     rms_after: float
     shifts: Float[np.ndarray, "M"]
     """How far each marker sits from where the glove as designed has it on this hand [m]."""
@@ -80,12 +90,17 @@ class Calibration:
     still_joints: tuple[str, ...]
     """Hinges that moved too little to tell what lies on either side of them."""
 
-    def gaps(self, finger: str | None = None) -> Float[np.ndarray, "2"]:
-        """Mean distance from touching [m], before and after, of touches that counted; NaN without any."""
-        chosen = [t for t in self.touches if t.trust > 0.25 and finger in {None, t.finger}]
-        if not chosen:
+    @property
+    def trusted_touches(self) -> tuple[Touch, ...]:
+        """Those that counted for more than a little."""
+        return tuple(touch for touch in self.touches if touch.trust > _COUNTS)
+
+    def gaps(self) -> Float[np.ndarray, "2"]:
+        """Mean distance from touching [m], before and after, of trusted touches; NaN without any."""
+        if not self.trusted_touches:
             return np.full(2, np.nan)
-        means: NDArray[np.float64] = np.abs([[t.gap_before, t.gap_after] for t in chosen]).mean(axis=0)
+        pairs = np.abs([[touch.gap_before, touch.gap_after] for touch in self.trusted_touches])
+        means: NDArray[np.float64] = pairs.mean(axis=0)
         return means
 
     def advice(self) -> tuple[str, ...]:
@@ -96,19 +111,11 @@ class Calibration:
             if hinges:
                 told = ", ".join(hinge.replace("_", " ") for hinge in hinges)
                 sentences.append(f"move the {digit} more: {told} covered too little of its range")
-        touched = {touch.finger for touch in self.touches if touch.trust > 0.25}
+        touched = {touch.finger for touch in self.trusted_touches}
         missing = [finger for finger in DIGITS[1:] if finger not in touched]
         if missing:
             sentences.append(f"touch the thumb to the tip of the {', '.join(missing)} finger and hold still")
         return tuple(sentences)
-
-
-class _Track(NamedTuple):
-    """Poses of some frames."""
-
-    frames: NDArray[np.int64]
-    qpos: NDArray[np.float64]
-    rms: NDArray[np.float64]
 
 
 def calibrate(
@@ -128,112 +135,77 @@ def calibrate(
         progress: Called after each step.
 
     Raises:
-        ShapeError: `markers` do not fit the glove, `rate` is not positive, or too few frames have enough
-            markers.
+        CalibrationError: Too few frames have enough markers, or the hand does not move.
+        ShapeError: `markers` do not fit the glove, or `rate` is not positive.
     """
-    markers = _checked(markers, start, rate)
     mirror = MIRROR if start.side == "left" else np.eye(3)
-    markers, right = markers @ mirror, _mirrored(start, "right")
-    usable = np.flatnonzero(np.isfinite(markers[..., 0]).sum(axis=1) >= _needed(markers.shape[1]))
-    track = _follow(markers, right, usable[:: max(1, len(usable) // _CANDIDATES)])
-    digits = _digits(right.attachment)
-    there = np.isfinite(markers[..., 0])
-    chosen = _informative(track, there)
+    markers, right = check_markers(markers, start, rate) @ mirror, start.with_side("right")
+    usable = usable_frames(markers, start)
+    whole = whole_digits(markers, right.attachment)
+    track = first_look(markers, right, usable)
+    check_motion(track, whole, start)
+    chosen = telling_frames(track, markers)
     problem, guess = _begin(markers, right, track, chosen)
-    guess, fit, steps = descend(problem, guess, 0, _CONTACTS_FROM, progress)
+    guess, fit, steps = _descend_without_touches(problem, guess, progress)
     rough = _user_hand(right, problem, guess)
-    rough_track = _follow(markers, rough, usable)
-    whole = np.stack([there[:, digits == d].all(axis=1) for d in range(len(DIGITS))], axis=1)
-    touches = find_touches(rough.model, rough_track.qpos[:, 7:], whole[rough_track.frames], rate)
-    noise = marker_noise(problem, fit)
-    problem, guess = _with_touches(problem, guess, markers, rough_track, chosen, touches, noise)
+    rough_track = follow(markers, rough, usable)
+    touches = find_touches(rough.model, rough_track.qpos[:, 7:], whole[usable], rate)
+    problem, guess = _with_touches(problem, guess, fit, markers, rough_track, chosen, touches)
     guess, fit, steps = descend(problem, guess, steps, _MOST_STEPS, progress)
     done = _user_hand(right, problem, guess)
     before = _gaps_before(right, markers, touches, usable)
-    final = _follow(markers, done, usable, rough_track.qpos)
+    final = follow(markers, done, usable, rough_track.qpos)
     place_errors, length_errors = standard_errors(problem, guess, fit)
     return Calibration(
-        hand=_mirrored(done, start.side),
+        hand=done.with_side(start.side),
         start=start,
-        rms_before=float(np.sqrt((track.rms**2).mean())),
-        rms_after=float(np.sqrt((final.rms**2).mean())),
+        rms_before=float(np.median(track.rms)),
+        rms_after=float(np.median(final.rms)),
         shifts=np.linalg.norm(fit.off_design, axis=1),
         place_errors=place_errors,
         length_errors=length_errors,
         touches=_touches(guess, fit, touches, rough_track.frames, before, mirror),
-        still_joints=still_joints(final.qpos[:, 7:], whole[final.frames], done.model),
+        still_joints=still_joints(final.qpos[:, 7:], whole[usable], done.model),
     )
 
 
-def _checked(markers: Float[np.ndarray, "T M 3"], start: UserHand, rate: float) -> NDArray[np.float64]:
-    values = np.array(markers, dtype=np.float64)
-    count = start.attachment.layout.num_markers
-    if values.ndim != 3 or values.shape[1:] != (count, 3):
-        raise ShapeError(f"markers have shape {values.shape}, wanted (T, {count}, 3) for this glove")
-    if not 0.0 < rate < np.inf:
-        raise ShapeError(f"rate is {rate:g} Hz, wanted a positive number")
-    values[~np.isfinite(values).all(axis=2)] = np.nan
-    enough = int((np.isfinite(values[..., 0]).sum(axis=1) >= _needed(count)).sum())
-    if enough < FEWEST_FRAMES:
-        raise ShapeError(
-            f"{enough} of {len(values)} frames have {_needed(count)} or more of the {count} markers, "
-            f"wanted at least {FEWEST_FRAMES} such frames"
+def calibrate_hands(
+    markers: Mapping[Side, Float[np.ndarray, "T M 3"]],
+    start: Sequence[UserHand],
+    rate: float,
+    *,
+    progress: Callable[[Side, int, float, float], None] | None = None,
+) -> tuple[Calibration, ...]:
+    """Calibrate each of a user's hands that a capture shows.
+
+    Args:
+        markers: For each side the markers in the glove's order [m]; NaN where missing, everywhere for a hand
+            that is not there.
+        start: Where to begin, each side at most once; sides that `markers` lacks are left out.
+        rate: Frames a second [Hz].
+        progress: Called after each step with the side and what `calibrate` tells.
+
+    Raises:
+        CalibrationError: No hand is there, or one that is shows too little.
+        ShapeError: Markers do not fit a glove, or `rate` is not positive.
+    """
+    shown = [hand for hand in start if np.isfinite(markers.get(hand.side, np.nan)).any()]
+    if not shown:
+        wanted = " or ".join(hand.side for hand in start) or "any"
+        raise CalibrationError(f"the capture has no marker of the {wanted} hand, wanted half a minute of one")
+    return tuple(
+        calibrate(
+            markers[hand.side],
+            hand,
+            rate,
+            progress=None if progress is None else partial(progress, hand.side),
         )
-    return values
-
-
-def _needed(count: int) -> int:
-    """Markers that a frame must have to be looked at."""
-    return max(_SOLVABLE, round(0.75 * count)) if count > _SOLVABLE else count
-
-
-def _mirrored(hand: UserHand, side: Side) -> UserHand:
-    """The same hand in its glove on the other arm, if it is not on this one."""
-    if hand.side == side:
-        return hand
-    worn = hand.attachment
-    shape = dataclasses.replace(hand.model.shape, side=side)
-    turned = dataclasses.replace(worn, points=worn.points @ MIRROR, normals=worn.normals @ MIRROR)
-    return UserHand(HandModel(shape), turned)
-
-
-def _follow(
-    markers: NDArray[np.float64],
-    hand: UserHand,
-    frames: NDArray[np.int64],
-    initial: NDArray[np.float64] | None = None,
-) -> _Track:
-    """Poses of some frames."""
-    found = PoseSolver(hand.model, hand.attachment).solve(markers[frames], initial)
-    return _Track(frames, found.qpos, found.rms)
-
-
-def _digits(attachment: Attachment) -> NDArray[np.int64]:
-    """Digit of each marker, -1 for the palm."""
-    bones = attachment.bone_indices[np.arange(len(attachment.points)), attachment.bone_weights.argmax(axis=1)]
-    return np.array([BONES[bone].digit for bone in bones])
-
-
-def _informative(track: _Track, there: Bool[np.ndarray, "T M"]) -> NDArray[np.int64]:
-    """Places in a track of frames as unlike each other as can be, those that lack no marker first."""
-    lacking = (~there[track.frames]).sum(axis=1)
-    steady = track.rms < 3.0 * np.median(track.rms)
-    for allowed in range(there.shape[1]):
-        candidates = np.flatnonzero((lacking <= allowed) & steady)
-        if len(candidates) >= min(3 * NUM_FRAMES, steady.sum()):
-            break
-    angles = track.qpos[candidates, 7:]
-    distance = np.full(len(candidates), np.inf)
-    chosen = [int(np.abs(angles - angles.mean(axis=0)).sum(axis=1).argmax())]
-    while len(chosen) < min(NUM_FRAMES, len(candidates)):
-        distance = np.minimum(distance, ((angles - angles[chosen[-1]]) ** 2).sum(axis=1))
-        chosen.append(int(distance.argmax()))
-    picked: NDArray[np.int64] = candidates[np.sort(chosen)]
-    return picked
+        for hand in shown
+    )
 
 
 def _begin(
-    markers: NDArray[np.float64], right: UserHand, track: _Track, chosen: NDArray[np.int64]
+    markers: NDArray[np.float64], right: UserHand, track: Track, chosen: NDArray[np.int64]
 ) -> tuple[Problem, Guess]:
     shape, worn = right.model.shape, right.attachment
     places = nearest_places(worn.points, shape)
@@ -248,16 +220,26 @@ def _begin(
     return problem, Guess(np.zeros(NUM_PARAMETERS), worn.points, places, track.qpos[chosen])
 
 
+def _descend_without_touches(
+    problem: Problem, guess: Guess, progress: Progress | None
+) -> tuple[Guess, Fit, int]:
+    """The first steps; markers that are far off are given up only when the hand nearly fits."""
+    guess, fit, steps = descend(problem, guess, 0, _WIDE_STEPS, progress)
+    problem.reach = _REACH_IN_NOISES * marker_noise(problem, fit)
+    return descend(problem, guess, steps, _CONTACTS_FROM, progress)
+
+
 def _with_touches(
     problem: Problem,
     guess: Guess,
+    fit: Fit,
     markers: NDArray[np.float64],
-    track: _Track,
+    track: Track,
     chosen: NDArray[np.int64],
     touches: list[tuple[int, str]],
-    noise: float,
 ) -> tuple[Problem, Guess]:
     """The problem with the touches' frames added, at its own noise."""
+    noise = marker_noise(problem, fit)
     frames = np.array([frame for frame, _ in touches], dtype=np.int64)
     targets = np.where(problem.there[..., None], problem.targets, np.nan)
     larger = Problem(
@@ -311,4 +293,4 @@ def _gaps_before(
     if not touches:
         return np.empty(0)
     there = frames[[frame for frame, _ in touches]]
-    return gaps_on(right.model, touches, _follow(markers, right, there).qpos)
+    return gaps_on(right.model, touches, follow(markers, right, there).qpos)

@@ -83,7 +83,7 @@ def _draw(panel: Axes, calibration: Calibration, sign: float) -> None:
                 zorder=7, parse_math=False,
             )  # fmt: skip
     if sign < 0.0:  # touches are of pads
-        points = [touch.points for touch in calibration.touches if touch.trust > 0.25]
+        points = [touch.points for touch in calibration.trusted_touches]
         touched = np.concatenate(points) if points else np.empty((0, 3))
         panel.plot(*_flat(touched, sign).T, "o", color=_TOUCH, markersize=3.5, zorder=8, label="touches")
     panel.set_aspect("equal")

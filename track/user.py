@@ -19,6 +19,7 @@ from handsim.io import atomic_write
 from handsim.model import HandModel
 from handsim.shape import HandShape
 from handsim.topology import NUM_BONES, Side
+from handsim.transforms import MIRROR
 
 SCHEMA: Final = 1
 _ARRAYS: Final = {"points": (3,), "normals": (3,), "bone_indices": (4,), "bone_weights": (4,)}
@@ -48,6 +49,14 @@ class UserHand:
     def side(self) -> Side:
         """Which hand this is."""
         return self.model.shape.side
+
+    def with_side(self, side: Side) -> UserHand:
+        """The same hand in its glove on the other (or the same) arm."""
+        if side == self.side:
+            return self
+        worn = self.attachment
+        turned = dataclasses.replace(worn, points=worn.points @ MIRROR, normals=worn.normals @ MIRROR)
+        return UserHand(HandModel(self.model.shape.with_side(side)), turned)
 
 
 def usual_hand(layout: MarkerLayout, size: str, side: Side) -> UserHand:
