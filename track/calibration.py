@@ -144,13 +144,12 @@ def calibrate(
     whole = whole_digits(markers, right.attachment)
     track = first_look(markers, right, usable)
     check_motion(track, whole, start)
-    chosen = telling_frames(track, markers)
-    problem, guess = _begin(markers, right, track, chosen)
+    problem, guess = _begin(markers, right, track)
     guess, fit, steps = _descend_without_touches(problem, guess, progress)
     rough = _user_hand(right, problem, guess)
     rough_track = follow(markers, rough, usable)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], whole[usable], rate)
-    problem, guess = _with_touches(problem, guess, fit, markers, rough_track, chosen, touches)
+    problem, guess = _with_touches(problem, guess, fit, markers, rough_track, touches)
     guess, fit, steps = descend(problem, guess, steps, _MOST_STEPS, progress)
     done = _user_hand(right, problem, guess)
     before = _gaps_before(right, markers, touches, usable)
@@ -204,9 +203,8 @@ def calibrate_hands(
     )
 
 
-def _begin(
-    markers: NDArray[np.float64], right: UserHand, track: Track, chosen: NDArray[np.int64]
-) -> tuple[Problem, Guess]:
+def _begin(markers: NDArray[np.float64], right: UserHand, track: Track) -> tuple[Problem, Guess]:
+    chosen = telling_frames(track, markers)
     shape, worn = right.model.shape, right.attachment
     places = nearest_places(worn.points, shape)
     problem = Problem(
@@ -235,26 +233,29 @@ def _with_touches(
     fit: Fit,
     markers: NDArray[np.float64],
     track: Track,
-    chosen: NDArray[np.int64],
     touches: list[tuple[int, str]],
 ) -> tuple[Problem, Guess]:
-    """The problem with the touches' frames added, at its own noise."""
+    """The problem with the touches' frames, at its own noise.
+
+    The other frames are chosen anew: on a hand that nearly fits, one with a wrong label stands out.
+    """
     noise = marker_noise(problem, fit)
-    frames = np.array([frame for frame, _ in touches], dtype=np.int64)
-    targets = np.where(problem.there[..., None], problem.targets, np.nan)
+    chosen = telling_frames(track, markers)
+    touching = np.array([frame for frame, _ in touches], dtype=np.int64)
+    frames = np.concatenate([chosen, touching])
     larger = Problem(
         problem.shape,
         problem.design,
         problem.radius,
-        np.concatenate([targets, markers[track.frames[frames]]]),
-        noise=weighing_noise(noise, len(chosen) + len(frames)),
+        markers[track.frames[frames]],
+        noise=weighing_noise(noise, len(frames)),
         reach=_REACH_IN_NOISES * noise,
     )
-    guess = dataclasses.replace(guess, qpos=np.concatenate([guess.qpos, track.qpos[frames]]))
+    guess = dataclasses.replace(guess, qpos=track.qpos[frames])
     if not touches:
         return larger, guess
     model = HandModel(shape_at(problem.shape, guess.parameters))
-    contacts = place_contacts(model, touches, model.forward_kinematics(track.qpos[frames]))
+    contacts = place_contacts(model, touches, model.forward_kinematics(track.qpos[touching]))
     contacts = contacts._replace(frames=len(chosen) + np.arange(len(touches)))
     return larger, dataclasses.replace(guess, contacts=contacts)
 
