@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 __all__ = ["Calibration", "CalibrationError", "Touch", "calibrate", "calibrate_hands"]
 
 _WIDE_STEPS: Final = 6  # of which none gives up a marker that is far off
-_CONTACTS_FROM: Final = 10  # steps without contacts, as in the paper
+_CONTACTS_FROM: Final = 10  # steps at most without contacts, as in the paper
 _MOST_STEPS: Final = 30
 _FIRST_NOISE, _FIRST_REACH = 0.001, 0.03  # [m]
 _REACH_IN_NOISES: Final = 8.0
