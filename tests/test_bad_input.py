@@ -105,6 +105,10 @@ CASES = {
     "an export of an unknown labeler": ["export", "dense91", "--out", "out.onnx"],
     "an unknown labeler of a table": ["reproduce", "table4", "--labelers", "dense91"],
     "a table of another glove's labeler": ["reproduce", "table6", "--labelers", "dense19"],
+    "an unknown glove of a tracking table": ["reproduce", "table5", "--glove", "dense91"],
+    "a tracking table without frames": ["reproduce", "table7", "--num-frames", "0", "--json", "out.json"],
+    "a labeler of another glove in a tracking table": ["reproduce", "table5", "--labeler", "sparse13"],
+    "an unknown rig of fewer cameras": ["reproduce", "cameras", "--rig", "figure6", "--json", "out.json"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }
 

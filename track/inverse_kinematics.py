@@ -19,19 +19,20 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.topology import DIGITS, NUM_JOINTS, NUM_QPOS
 from handsim.transforms import multiply_quaternions, vector_quaternions
-from track.expectation import Expectation, expect_markers
-from track.gloved_hand import GlovedHand, gloved_hand, workspace
+from track.expectation import Expectation, carry_markers, expect_markers, expectation
+from track.gloved_hand import NUM_UNKNOWNS, GlovedHand, gloved_hand, workspace
 from track.pose_descent import MARKER_NOISE, descend, find_misses
 from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
     from numpy.typing import ArrayLike, NDArray
 
 _REST_PULL: Final = np.deg2rad(90.0) ** -2  # [1/rad^2] of a hinge around rest
 _WHISPER: Final = 1e-4  # what is left of it for a digit whose markers are all there
-_FEWEST_ON_A_DIGIT: Final = 3  # that tell its four hinges also when it is straight
-_FEWEST_MARKERS: Final = 4
+_FEWEST_ON_A_PART: Final = 3  # that tell a digit's four hinges also when it is straight, or a palm's place
+FEWEST_MARKERS: Final = 4
+"""Markers without which no pose is solved."""
 _EASING: Final = (1 / 64, 1 / 8, 1.0)  # of the tightness of a robust loss, so that a start may be far off
 _EASY_STEPS: Final = 8
 _GOOD: Final = 0.0005  # [m] RMS, limits and prior included, from which on no further start is tried
@@ -52,12 +53,19 @@ class PoseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Where hinges are thought to be; it counts for digits that lack a marker or never had three."""
+    """Where hinges are thought to be; it counts for digits that lack a marker or never had three.
+
+    And where the wrist is; that counts where the palm lacks a marker or never had three.
+    """
 
     angles: Float[np.ndarray, "*T 20"]
     """Angles [rad], for each frame or for all."""
     spread: ArrayLike
     """Their standard deviation [rad]: one number, or an array that goes with the angles."""
+    wrist: Float[np.ndarray, "7"] | None = None
+    """Place [m] and orientation, for all frames."""
+    wrist_spread: tuple[float, float] = (np.inf, np.inf)
+    """Their standard deviations [m, rad]."""
 
 
 class PoseSolver:
@@ -78,10 +86,12 @@ class PoseSolver:
     ) -> None:
         if outlier_distance is not None and not outlier_distance > 0.0:
             raise ShapeError(f"outlier_distance is {outlier_distance:g} m, wanted a positive distance")
-        self._hand: GlovedHand = gloved_hand(model, attachment)
+        self.hand: GlovedHand = gloved_hand(model, attachment)
+        """What poses are solved with; whoever moves its markers finds them moved."""
         self._shapes: StartingShapes = starting_shapes(model, attachment)
         self._tightness = 0.0 if outlier_distance is None else outlier_distance**-2
-        self._on_digit = np.array([(self._hand.digits == number).sum() for number in range(len(DIGITS))])
+        parts = (*range(len(DIGITS)), -1)  # the palm last
+        self._on_part = np.array([(self.hand.digits == number).sum() for number in parts])
 
     def solve(
         self,
@@ -111,26 +121,31 @@ class PoseSolver:
                 f"targets have shape {targets.shape}, wanted (T, {self._shapes.markers.shape[1]}, 3)"
             )
         starts = np.empty((0, NUM_QPOS))
+        wrist = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+        if prediction is not None and prediction.wrist is not None:
+            wrist[:7] = check_array("prediction.wrist", prediction.wrist, (7,))
+            wrist[7:] = np.array(prediction.wrist_spread) ** -2.0
         if initial is not None:
             starts = np.array(check_array("initial", initial, (None, NUM_QPOS)), order="C")
             if starts.shape != (len(targets), NUM_QPOS):
                 raise ShapeError(f"initial has shape {starts.shape}, wanted ({len(targets)}, {NUM_QPOS})")
         angles, trust = _rows(prediction, len(targets))
         wrong, qpos, rms, residuals, steps = _fit_frames(
-            self._hand,
+            self.hand,
             self._shapes,
-            self._on_digit,
+            self._on_part,
             targets,
             starts,
             angles,
             trust,
+            wrist,
             self._tightness,
             iterations,
         )
         if wrong >= 0:
             there = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
-            if there < _FEWEST_MARKERS:
-                raise ShapeError(f"frame {wrong} has {there} markers, wanted at least {_FEWEST_MARKERS}")
+            if there < FEWEST_MARKERS:
+                raise ShapeError(f"frame {wrong} has {there} markers, wanted at least {FEWEST_MARKERS}")
             raise ShapeError(
                 f"initial has a quaternion of length zero in frame {wrong}, wanted an orientation"
             )
@@ -138,38 +153,40 @@ class PoseSolver:
 
     def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Where a pose has its markers [m]."""
-        nowhere = np.zeros(len(self._hand.digits), dtype=bool)
-        return self.expect(qpos, nowhere, spread=np.ones(NUM_JOINTS), noise=MARKER_NOISE).places
+        places = np.empty((len(self.hand.digits), 3))
+        carry_markers(self.hand, np.array(qpos, dtype=np.float64), places)
+        return places
 
     def expect(
         self,
         qpos: Float[np.ndarray, "27"],
-        there: Bool[np.ndarray, "M"],
+        targets: Float[np.ndarray, "M 3"],
         *,
-        spread: Float[np.ndarray, "20"],
+        angles: Float[np.ndarray, "20"],
+        precision: Float[np.ndarray, "26 26"],
         noise: float,
     ) -> Expectation:
         """Where a fitted pose has its markers, and how far they may be from there.
 
         Args:
             qpos: The pose.
-            there: The markers that it was fitted to.
-            spread: Standard deviations of its hinges [rad] as they were thought to be before the fit; they
-                count as in `solve`.
+            targets: The markers that it was fitted to [m]; NaN where missing.
+            angles: Where its hinges were believed to be before the fit [rad].
+            precision: How surely, and after them the wrist where the pose has it.
             noise: Standard deviation of those markers around the pose's [m].
         """
-        count = len(self._hand.digits)
-        expectation = Expectation(np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3)))
+        expected = expectation(len(self.hand.digits))
         expect_markers(
-            self._hand,
-            self._on_digit,
+            self.hand,
+            self._on_part,
             np.array(qpos, dtype=np.float64),
-            np.array(there),
-            np.array(spread, dtype=np.float64) ** -2,
+            np.array(targets, dtype=np.float64, order="C"),
+            np.array(angles, dtype=np.float64),
+            np.array(precision, dtype=np.float64, order="C"),
             noise**-2,
-            *expectation,
+            expected,
         )
-        return expectation
+        return expected
 
 
 def solve_poses(
@@ -217,11 +234,12 @@ def _rows(prediction: Prediction | None, frames: int) -> tuple[NDArray[np.float6
 def _fit_frames(
     hand: Any,
     shapes: Any,
-    on_digit: Any,
+    on_part: Any,
     targets: Any,
     initial: Any,
     predicted: Any,
     trust: Any,
+    wrist: Any,
     tightness: Any,
     iterations: Any,
 ) -> Any:
@@ -229,13 +247,13 @@ def _fit_frames(
     frames, count = targets.shape[:2]
     qpos, residuals = np.empty((frames, NUM_QPOS)), np.empty((frames, count, 3))
     rms, steps = np.zeros(frames), np.zeros(frames, dtype=np.int64)
-    centre, pull, seen = np.empty(NUM_JOINTS), np.empty(NUM_JOINTS), np.empty(len(on_digit), dtype=np.int64)
+    centre, pull, seen = np.empty(NUM_QPOS), np.empty(NUM_UNKNOWNS), np.empty(len(on_part), dtype=np.int64)
     work, pose, target = workspace(count), np.empty(NUM_QPOS), np.empty((count, 3))
     for frame in range(frames):
         there = _read_markers(hand.digits, targets[frame], target, seen)
-        if there < _FEWEST_MARKERS:
+        if there < FEWEST_MARKERS:
             return frame, qpos, rms, residuals, steps
-        _set_prior(seen, on_digit, predicted[frame:], trust[frame:], centre, pull)
+        _set_prior(seen, on_part, predicted[frame:], trust[frame:], wrist, centre, pull)
         if len(initial) > 0:
             starts = initial[frame : frame + 1].copy()
             length = np.sqrt((starts[0, 3:7] ** 2).sum())
@@ -266,31 +284,37 @@ def _fit_frames(
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _read_markers(digits: Any, given: Any, target: Any, seen: Any) -> Any:
-    """Copy one frame's markers, each whole or NaN; count them, and those on each digit."""
+    """Copy one frame's markers, each whole or NaN; count them, and those on each digit and the palm."""
     seen[:] = 0
     there = 0
     for marker in range(len(given)):
         if np.isfinite(given[marker, 0] + given[marker, 1] + given[marker, 2]):
             target[marker] = given[marker]
             there += 1
-            if digits[marker] >= 0:
-                seen[digits[marker]] += 1
+            seen[digits[marker]] += 1
         else:
             target[marker] = np.nan
     return there
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _set_prior(seen: Any, on_digit: Any, predicted: Any, trust: Any, centre: Any, pull: Any) -> None:
-    """Where this frame's hinges are drawn to and how strongly; `predicted` and `trust` begin with its row."""
+def _set_prior(
+    seen: Any, on_part: Any, predicted: Any, trust: Any, wrist: Any, centre: Any, pull: Any
+) -> None:
+    """Where this frame's pose is drawn to and how strongly; `predicted` and `trust` begin with its row."""
+    centre[:7] = wrist[:7]
+    vague = seen[-1] < max(on_part[-1], _FEWEST_ON_A_PART)
+    pull[NUM_JOINTS : NUM_JOINTS + 3] = wrist[7] if vague else 0.0
+    pull[NUM_JOINTS + 3 :] = wrist[8] if vague else 0.0
     for hinge in range(NUM_JOINTS):
         digit = hinge // 4
-        whole = seen[digit] == on_digit[digit] and seen[digit] >= _FEWEST_ON_A_DIGIT
-        centre[hinge], pull[hinge] = RESTING[hinge], _REST_PULL * (_WHISPER if whole else 1.0)
+        whole = seen[digit] == on_part[digit] and seen[digit] >= _FEWEST_ON_A_PART
+        rest, weight = RESTING[hinge], _REST_PULL * (_WHISPER if whole else 1.0)
         if len(predicted) > 0 and not whole:
-            both = pull[hinge] + trust[0, hinge]
-            centre[hinge] += (predicted[0, hinge] - RESTING[hinge]) * trust[0, hinge] / both
-            pull[hinge] = both
+            both = weight + trust[0, hinge]
+            rest += (predicted[0, hinge] - rest) * trust[0, hinge] / both
+            weight = both
+        centre[7 + hinge], pull[hinge] = rest, weight
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -19,7 +19,14 @@ _SMALL_GAIN = (1e-6 / MARKER_NOISE) ** 2  # markers nearer by a micron; what is 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def descend(
-    hand: Any, target: Any, qpos: Any, centre: Any, pull: Any, tightness: Any, most_steps: Any, work: Any
+    hand: Any,
+    target: Any,
+    qpos: Any,
+    centre: Any,
+    pull: Any,
+    tightness: Any,
+    most_steps: Any,
+    work: Any,
 ) -> Any:
     """Bring a pose to a minimum of its cost; returns the cost and how many steps were tried.
 
@@ -27,8 +34,8 @@ def descend(
         hand: The hand and its glove.
         target: Markers (M, 3) [m]; NaN where missing.
         qpos: Pose (27,) to start from, overwritten.
-        centre: Angles (20,) [rad] that the prior draws the hinges to.
-        pull: How strongly it does (20,) [1/rad^2].
+        centre: Pose (27,) that the prior draws the hand to.
+        pull: How strongly it does (26,), as a step's unknowns go [1/rad^2, 1/m^2, 1/rad^2].
         tightness: Squared inverse of the distance from which a marker loses its say [1/m^2]; zero for never.
         most_steps: Steps at most.
         work: Room for the arithmetic.
@@ -90,9 +97,13 @@ def _find_cost(hand: Any, target: Any, qpos: Any, centre: Any, pull: Any, tightn
             cost += _MARKER_WEIGHT * square / (1.0 + tightness * square)  # Geman and McClure 1987
     for hinge in range(NUM_JOINTS):
         angle = qpos[7 + hinge]
-        off = angle - centre[hinge]
+        off = angle - centre[7 + hinge]
         beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
         cost += pull[hinge] * off * off + _LIMIT_WEIGHT * beyond * beyond
+    if pull[NUM_JOINTS] > 0.0:
+        wrist_offsets(centre, qpos, work.step)
+        for unknown in range(NUM_JOINTS, NUM_UNKNOWNS):
+            cost += pull[unknown] * work.step[unknown] ** 2
     return cost
 
 
@@ -106,12 +117,17 @@ def _linearise(hand: Any, qpos: Any, centre: Any, pull: Any, tightness: Any, wei
     gather(hand, weights, work)
     for hinge in range(NUM_JOINTS):
         angle = qpos[7 + hinge]
-        work.gradient[hinge] += pull[hinge] * (angle - centre[hinge])
+        work.gradient[hinge] += pull[hinge] * (angle - centre[7 + hinge])
         work.normal[hinge, hinge] += pull[hinge]
         beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
         if beyond != 0.0:
             work.gradient[hinge] += _LIMIT_WEIGHT * beyond
             work.normal[hinge, hinge] += _LIMIT_WEIGHT
+    if pull[NUM_JOINTS] > 0.0:
+        wrist_offsets(centre, qpos, work.step)
+        for unknown in range(NUM_JOINTS, NUM_UNKNOWNS):
+            work.gradient[unknown] += pull[unknown] * work.step[unknown]
+            work.normal[unknown, unknown] += pull[unknown]
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -166,3 +182,20 @@ def move_wrist(qpos: Any, step: Any, moved: Any) -> None:
     scale = 1.0 / np.sqrt(moved[3] ** 2 + moved[4] ** 2 + moved[5] ** 2 + moved[6] ** 2)
     for n in range(3, 7):
         moved[n] *= scale
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def wrist_offsets(before: Any, now: Any, step: Any) -> None:
+    """How the wrist moved and turned, along its own axes now: the last six of a step; the first stay."""
+    w, x, y, z = now[3], now[4], now[5], now[6]
+    a, b, c = now[0] - before[0], now[1] - before[1], now[2] - before[2]
+    i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
+    step[NUM_JOINTS] = a + 2.0 * (w * i + j * z - k * y)
+    step[NUM_JOINTS + 1] = b + 2.0 * (w * j + k * x - i * z)
+    step[NUM_JOINTS + 2] = c + 2.0 * (w * k + i * y - j * x)
+    p, q, r, s = before[3], -before[4], -before[5], -before[6]
+    e = p * w - q * x - r * y - s * z
+    share = 2.0 if e >= 0.0 else -2.0
+    step[NUM_JOINTS + 3] = share * (p * x + q * w + r * z - s * y)
+    step[NUM_JOINTS + 4] = share * (p * y - q * z + r * w + s * x)
+    step[NUM_JOINTS + 5] = share * (p * z + q * y - r * x + s * w)

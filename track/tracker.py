@@ -14,9 +14,9 @@ import numpy as np
 
 from handsim.topology import NUM_QPOS
 from track.finding import MOST_RMS, HandFinder
-from track.hand_memory import HandMemory
-from track.inverse_kinematics import PoseFit
-from track.naming import fit_names, forget_surprises, name_new
+from track.hand_memory import Estimate, HandMemory
+from track.naming import fit_names, forget_surprises, targets_of
+from track.new_names import YOUNG, Following, name_new
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.user import UserHand
 from train.labeling import Labeler
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-_FEWEST: Final = 6  # named points that a pose can be relied on for
+_FEWEST: Final = 5  # named points that a pose can be relied on for
 _LONGEST_COAST: Final = 0.1  # [s] that a pose is carried on without them
 _MOST_CREDIT: Final = 12.0
 _INCOME: Final = 2.0  # credit of a name in each frame, less half the squared deviations it is off
@@ -45,6 +45,7 @@ class Tracker:
         sizes = [memory.num_markers for memory in self._memories]
         self._first = np.cumsum([0, *sizes])
         self._labels: dict[int, tuple[int, float]] = {}
+        self._born: dict[int, float] = {}
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
         """Take in the next frame.
@@ -55,14 +56,13 @@ class Tracker:
             time: Time of the frame [s].
         """
         names, credit = self._carry_over(ids)
+        born = self._births(ids, time)
         sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
-        hands: list[TrackedHand] = []
-        for number, memory in enumerate(self._memories):
-            mine = names[number]
-            fit = None
-            if memory.qpos is not None:
-                fit = self._follow(number, points, names, credit, sure, time)
-            hands.append(self._judge(memory, points, mine, credit, fit, time))
+        following = self._follow(points, names, credit, sure, born, time)
+        hands = [
+            self._judge(memory, points, names[number], credit, following.get(number), time)
+            for number, memory in enumerate(self._memories)
+        ]
         self._find_lost(points, names, hands, time)
         labels = np.where(names >= 0, names + self._first[:-1, None], -1).max(axis=0, initial=-1)
         self._labels = {
@@ -80,29 +80,40 @@ class Tracker:
         names[(names < 0) | (labels >= self._first[1:, None])] = -1
         return names, np.array([worth for _, worth in known])
 
+    def _births(self, ids: NDArray[np.int64], time: float) -> NDArray[np.float64]:
+        """Since when each point has been there."""
+        self._born = {point: self._born.get(point, time) for point in ids.tolist() if point >= 0}
+        return np.array([self._born.get(point, time) for point in ids.tolist()])
+
     def _follow(
         self,
-        number: int,
         points: NDArray[np.float64],
         names: NDArray[np.int64],
         credit: NDArray[np.float64],
         sure: NDArray[np.float64],
+        born: NDArray[np.float64],
         time: float,
-    ) -> PoseFit | None:
-        """The pose of a hand that was there before; its names (a row of H, N) and credits are overwritten."""
-        memory, mine = self._memories[number], names[number]
-        coming = memory.predict(time)
-        forget_surprises(memory, points, mine, coming, time)
-        fit = fit_names(memory, points, mine, coming, time)
-        if fit is None:
-            return None
-        free = np.logical_not((names >= 0).any(axis=0))
-        how_sure = name_new(memory, points, mine, free, credit, fit.qpos[0], coming, time)
+    ) -> dict[int, Estimate]:
+        """Poses of the hands that were there before; names (H, N) and credits are overwritten."""
+        hands = []
+        for number, memory in enumerate(self._memories):
+            if memory.qpos is None:
+                continue
+            coming = memory.predict(time)
+            forget_surprises(memory, points, names[number], coming)
+            estimate = fit_names(memory, points, names[number], coming)
+            hands.append(Following(number, memory, coming, estimate))
+        before = names.copy()
+        how_sure = name_new(hands, points, names, credit, born)
         changed = np.isfinite(how_sure)
-        if changed.any():
-            credit[changed], sure[changed] = 0.0, how_sure[changed]
-            fit = fit_names(memory, points, mine, coming, time)
-        return fit
+        credit[changed], sure[changed] = 0.0, how_sure[changed]
+        fitted = {}
+        for hand in hands:
+            mine, estimate = names[hand.number], hand.estimate
+            if (mine != before[hand.number]).any():
+                estimate = fit_names(hand.memory, points, mine, hand.coming)
+            fitted[hand.number] = estimate
+        return fitted
 
     def _judge(
         self,
@@ -110,13 +121,15 @@ class Tracker:
         points: NDArray[np.float64],
         names: NDArray[np.int64],
         credit: NDArray[np.float64],
-        fit: PoseFit | None,
+        fit: Estimate | None,
         time: float,
     ) -> TrackedHand:
         """Take a pose over or throw it away."""
         mine = np.flatnonzero(names >= 0)
-        if fit is not None and len(mine) >= _FEWEST and fit.rms[0] <= MOST_RMS:
-            memory.carry_on(fit, time)
+        if fit is not None and len(mine) >= _FEWEST and fit.rms <= MOST_RMS:
+            firm = np.zeros(memory.num_markers, dtype=bool)
+            firm[names[mine]] = credit[mine] >= YOUNG
+            memory.carry_on(fit, firm, time)
             off = ((points[mine] - memory.places[names[mine]]) ** 2).sum(axis=1)
             income = _INCOME - 0.5 * off / memory.variance[names[mine]]
             credit[mine] = np.clip(credit[mine] + income, 0.0, _MOST_CREDIT)
@@ -145,8 +158,10 @@ class Tracker:
             memory = self._memories[found.number]
             names[found.number] = -1
             names[found.number, free] = found.names
-            memory.begin(found.fit, time)
-            hands[found.number] = _tracked(memory, Status.FOUND, points, names[found.number], found.fit)
+            fit = memory.begin(
+                found.fit.qpos[0], targets_of(points, names[found.number], memory.num_markers), time
+            )
+            hands[found.number] = _tracked(memory, Status.FOUND, points, names[found.number], fit)
 
 
 def _tracked(
@@ -154,7 +169,7 @@ def _tracked(
     status: Status,
     points: NDArray[np.float64],
     names: NDArray[np.int64],
-    fit: PoseFit | None,
+    fit: Estimate | None,
 ) -> TrackedHand:
     count = memory.num_markers
     if memory.qpos is None:
@@ -163,5 +178,5 @@ def _tracked(
     markers, mine = memory.places.copy(), names >= 0
     markers[names[mine]] = points[mine]
     filled = np.setdiff1d(np.arange(count), names[mine])
-    rms = np.nan if fit is None else float(fit.rms[0])
+    rms = np.nan if fit is None else fit.rms
     return TrackedHand(memory.hand.side, status, memory.qpos, rms, markers, filled)

@@ -1,0 +1,146 @@
+"""All trackers on the same takes, with calibrated hands and without: the figures of the tracking tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.take import Take
+from track.baselines import HungarianTracker, NearestNeighbourTracker
+from track.evaluation import (
+    FrameTracker,
+    TrackingReport,
+    evaluate_tracker,
+    seen_frame,
+    true_users,
+    usual_users,
+)
+from track.paper_tracker import PaperTracker
+from track.tracker import Tracker
+from track.trials import FEWEST_FRAMES, cut, first_locks, recoveries
+from track.user import UserHand
+from train.labeling import Labeler
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    MakeTracker = Callable[[Take, Sequence[UserHand]], FrameTracker]
+
+OURS: Final = "handsim"
+PAPERS_LOOP: Final = "paper's loop"
+GIVEN_FIRST: Final = ("nearest point", "Hungarian")
+"""Those that are given the labels of the first frame, and so do not begin by themselves."""
+USERS: Final[dict[str, Callable[[Take], list[UserHand]]]] = {
+    "calibrated": true_users,
+    "uncalibrated": usual_users,
+}
+TRIALS: Final = 10
+_WARM_UP: Final = 30  # frames before the clock counts: kernels are loaded
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What one tracker made of one take with one pair of hands."""
+
+    method: str
+    users: str
+    capture: str
+    report: TrackingReport
+    locks: Float[np.ndarray, "S"]
+    """Frames until all was right, from random ones of the take; NaN for more than a second. See `trials`."""
+    recoveries: Float[np.ndarray, "S"]
+    """The same after a second in the dark."""
+
+    def record(self) -> dict[str, Any]:
+        """All figures, for JSON; None where there is nothing to count."""
+        figures = {name: number_or_none(value) for name, value in self.report.figures().items()}
+        errors = [
+            {
+                "missing": list(bounds),
+                "hands": count,
+                "joint_error": number_or_none(joint),
+                "angle_error": number_or_none(angle),
+            }
+            for bounds, (count, joint, angle) in self.report.by_occlusion().items()
+        ]
+        return {
+            "method": self.method,
+            "hands": self.users,
+            "capture": self.capture,
+            "frames": len(self.report.right),
+            **figures,
+            "by_occlusion": errors,
+            "first_lock_frames": [number_or_none(value) for value in self.locks],
+            "recovery_frames": [number_or_none(value) for value in self.recoveries],
+        }
+
+
+def trackers(labeler: Labeler, seed: int) -> dict[str, MakeTracker]:
+    """What makes a tracker for a take (or a part of it) and hands, by the method's name.
+
+    Args:
+        labeler: Labeler of those that need one.
+        seed: Seed of the paper's loop.
+    """
+    return {
+        OURS: lambda take, users: Tracker(users, labeler),
+        PAPERS_LOOP: lambda take, users: PaperTracker(users, labeler, rng=np.random.default_rng(seed)),
+        GIVEN_FIRST[0]: lambda take, users: NearestNeighbourTracker(users, seen_frame(take, 0).labels),
+        GIVEN_FIRST[1]: lambda take, users: HungarianTracker(users, seen_frame(take, 0).labels),
+    }
+
+
+def compare_trackers(
+    takes: Mapping[str, Take],
+    labeler: Labeler,
+    *,
+    seed: int,
+    trials: int = 0,
+    done: Callable[[], None] | None = None,
+) -> list[Measured]:
+    """Run every tracker over every take, with every kind of hands.
+
+    Args:
+        takes: Simulated takes, by name.
+        labeler: Labeler of those that need one.
+        seed: Seed of the paper's loop, and of where trials begin.
+        trials: How often first lock and recovery are measured in each take that is long enough.
+        done: Called after every frame of a take; trials are not counted.
+    """
+    wearers = {
+        (users, capture): hands_of(take)
+        for users, hands_of in USERS.items()
+        for capture, take in takes.items()
+    }
+    measured = []
+    for name, make in trackers(labeler, seed).items():
+        for (users, capture), hands in wearers.items():
+            take = takes[capture]
+            start = cut(take, 0, min(_WARM_UP, take.num_frames))
+            evaluate_tracker(start, hands, make(start, hands))
+            report = evaluate_tracker(take, hands, make(take, hands), done=done)
+            waits = _try(take, hands, name, make, trials, seed)
+            measured.append(Measured(name, users, capture, report, *waits))
+    return measured
+
+
+def _try(
+    take: Take, hands: Sequence[UserHand], name: str, make: MakeTracker, trials: int, seed: int
+) -> tuple[Float[np.ndarray, "S"], Float[np.ndarray, "S"]]:
+    """First locks and recoveries, nothing where there is nothing to measure."""
+    nothing = np.zeros(0)
+    if take.num_frames < FEWEST_FRAMES or not trials:
+        return nothing, nothing
+    rng = np.random.default_rng(seed)
+    again = recoveries(take, lambda part: make(part, hands), trials, rng=rng)
+    if name in GIVEN_FIRST:
+        return nothing, again
+    return first_locks(take, lambda part: make(part, hands), trials, rng=rng), again
+
+
+def number_or_none(value: float) -> float | None:
+    """What JSON can hold of a figure: it knows no NaN."""
+    return None if np.isnan(value) else float(value)
