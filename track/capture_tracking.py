@@ -17,11 +17,13 @@ from gloves.captures import Capture
 from gloves.identities import number_runs
 from gloves.tracked_take import LOST, STATUSES, MarkedBody, TrackedTake, WornGlove
 from handsim.errors import CaptureError
+from handsim.topology import NUM_QPOS
 from track.rigid_body import RigidTemplate
 from track.streaming import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
+from track.tracker import Tracker
 from track.user import UserHand
-from train.labeling import check_unit
+from train.labeling import Labeler, check_unit
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 
 _RESTART: Final = 0.01
 """Time between the last frame of a recording and its first, when it begins anew [s]."""
+_APART: Final = 0.5  # [m] between hands that are tried out
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
@@ -105,6 +108,25 @@ def follow(frames: Iterable[StreamedFrame], tracker: Stepper) -> Iterator[tuple[
         yield told, tracker.step(frame.points, frame.ids, now)
 
 
+def warm_up(hands: Sequence[UserHand], labeler: Labeler) -> None:
+    """Make ready what a tracker needs: on a machine's first run its kernels are compiled, for half a minute.
+
+    Without it the first frames of a stream would wait for that.
+    """
+    tracker = Tracker(hands, labeler)
+    qpos = np.zeros((len(hands), NUM_QPOS))
+    qpos[:, 0], qpos[:, 3] = _APART * np.arange(len(hands)), 1.0
+    points = np.concatenate(
+        [
+            hand.attachment.centres(hand.model, hand.model.forward_kinematics(row[None]))[0]
+            for hand, row in zip(hands, qpos, strict=True)
+        ]
+    )
+    for number in range(3):  # found, followed, and named anew
+        ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
+        tracker.step(points, ids, 0.01 * number)
+
+
 class TakeRecorder:
     """Keeps what a tracker said, frame by frame; `take` may be asked for at any time.
 
@@ -122,6 +144,11 @@ class TakeRecorder:
     def num_frames(self) -> int:
         """How many frames there are by now."""
         return len(self._frames)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return self._frames[-1][0].time - self._frames[0][0].time if self._frames else 0.0
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Keep a frame; a silence is none."""
@@ -162,8 +189,8 @@ class TakeRecorder:
             markers=np.array([[hand.markers for hand in row] for row in hands]),
             filled=filled,
             points=_spread(there, [frame.points for frame in frames], np.nan),
-            ids=_spread(there, [frame.ids for frame in frames], -1),
-            labels=_spread(there, [one.labels for one in tracked], -1),
+            ids=_spread(there, [frame.ids for frame in frames], -1).astype(np.int32),
+            labels=_spread(there, [one.labels for one in tracked], -1).astype(np.int16),
             confidence=_spread(there, [one.confidence for one in tracked], np.nan),
             **self._body_tracks(tracked),
             settings={},

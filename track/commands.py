@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from time import perf_counter
@@ -21,9 +21,9 @@ from gloves.take import SUFFIX
 from gloves.tracked_take import STATUSES, TrackedTake, save_tracked_take
 from handsim.errors import CaptureError, HandSimError
 from handsim.topology import Side
-from track.capture_tracking import TakeRecorder, follow
+from track.capture_tracking import TakeRecorder, follow, warm_up
 from track.capture_tracking import track as track_capture
-from track.streaming import PointStream, StreamedFrame, open_stream
+from track.streaming import StreamedFrame, open_stream
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from track.user import UserHand, usual_hand
@@ -69,6 +69,8 @@ def track(
     user = users(glove, size, hands)
     source = None if capture is None else read_capture(capture)
     network = labeler_for_glove(glove, labeler)
+    with Console(stderr=True).status("getting ready"):
+        warm_up(user, network)
     watch = Stopwatch(Tracker(user, network))
     if source is not None:
         with progress_bar("frames") as (bar, task):
@@ -165,9 +167,14 @@ def _check_options(
     capture: Path | None, live: str | None, seconds: float | None, out: Path, labelled: Path | None
 ) -> None:
     if (capture is None) == (live is None):
-        raise HandSimError("wanted either a capture or --live natnet://host")
-    if seconds is not None and (live is None or not 0.0 < seconds < np.inf):
-        raise HandSimError(f"--seconds is {seconds:g}, wanted a positive number beside --live")
+        given = (
+            "neither a capture nor --live" if capture is None else f"a capture, {capture}, and --live {live}"
+        )
+        raise HandSimError(f"given {given}, wanted a capture or --live natnet://host")
+    if seconds is not None and live is None:
+        raise HandSimError(f"--seconds is {seconds:g} without --live, wanted both or neither")
+    if seconds is not None and not 0.0 < seconds < np.inf:
+        raise HandSimError(f"--seconds is {seconds:g}, wanted a positive number")
     if out.suffix.lower() != ".npz" or out.name.endswith(SUFFIX):
         raise HandSimError(f"--out is {out}, wanted a file name that ends in .npz and not in {SUFFIX}")
     if labelled is not None:
@@ -181,10 +188,13 @@ def _track_live(
     recorder = TakeRecorder(user)
     console = Console(stderr=True)
     with closing(open_stream(url)) as stream, console.status("waiting for the first frame") as status:
-        shown = 0.0
+        began, shown = perf_counter(), 0.0
         try:
-            for frame, tracked in follow(_until(stream, seconds), watch):
+            for frame, tracked in follow(stream, watch):
                 recorder.add(frame, tracked)
+                elapsed = perf_counter() - began if frame.silent else recorder.duration
+                if seconds is not None and elapsed >= seconds:
+                    break
                 if frame.silent or perf_counter() > shown + _REFRESH:
                     shown = perf_counter()
                     status.update(_word(frame, tracked))
@@ -196,19 +206,6 @@ def _track_live(
     if stream.late or stream.damaged:
         notes.append(f"left out: {stream.late} frames that came late or twice, {stream.damaged} damaged ones")
     return recorder.take(), tuple(notes)
-
-
-def _until(stream: PointStream, seconds: float | None) -> Iterator[StreamedFrame]:
-    """The frames of a stream for some seconds after the first one."""
-    if seconds is None:
-        yield from stream
-        return
-    end = np.inf
-    for frame in stream:
-        end = min(end, perf_counter() + seconds)
-        if perf_counter() >= end:
-            return
-        yield frame
 
 
 def _word(frame: StreamedFrame, tracked: TrackedFrame) -> str:
