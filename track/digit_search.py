@@ -86,7 +86,7 @@ def search_digit(
         worth: What naming a point is worth that lies where its marker is expected (M,).
         posed: Angles (20,) [rad] of the whole hand: skin between two fingers moves with both.
         coming: Angles (4,) [rad] that the hinges were coming to.
-        trust: Inverse variances (4,) of these.
+        trust: How surely (4, 4) [1/rad^2].
         best: Point of each marker (K,), -1 for none; overwritten.
         hinges: Angles (4,) of the best naming; overwritten.
 
@@ -115,7 +115,8 @@ def search_digit(
             angles[:] = coming if start == 0 else hinges
             if start == 1 and first == -_OVER:
                 break
-            reached = most - _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
+            misfit, open_ = _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
+            reached = most - misfit - open_
             if reached > score:
                 score = reached
                 if score > first:
@@ -199,7 +200,19 @@ def _fit(
             _gather(
                 hand, digit, markers, points, variance, naming, coming, trust, angles, work, normal, gradient
             )
-    return cost
+    for row in range(4):
+        for column in range(4):
+            factor[row, column] = normal[row, column]
+    _solve_four(factor, rest)
+    shrunk = 0.0
+    for row in range(4):
+        shrunk += 0.5 * np.log(factor[row, row])
+        for column in range(4):
+            factor[row, column] = trust[row, column]
+    _solve_four(factor, rest)
+    for row in range(4):
+        shrunk -= 0.5 * np.log(factor[row, row])
+    return cost, shrunk
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -238,12 +251,14 @@ def _gather(
                     normal[row, column] += weight * slopes[i, first + row] * slopes[i, first + column]
     away = 0.0
     for row in range(4):
-        away += trust[row] * (angles[row] - coming[row]) ** 2
+        for column in range(4):
+            away += (angles[row] - coming[row]) * trust[row, column] * (angles[column] - coming[column])
     say = 1.0 / (1.0 + away / _FREEDOM)
     cost += 0.5 * _FREEDOM * np.log(1.0 + away / _FREEDOM)
     for row in range(4):
-        gradient[row] += say * trust[row] * (angles[row] - coming[row])
-        normal[row, row] += say * trust[row]
+        for column in range(4):
+            gradient[row] += say * trust[row, column] * (angles[column] - coming[column])
+            normal[row, column] += say * trust[row, column]
         low, high = hand.ranges[first + row, 0], hand.ranges[first + row, 1]
         beyond = max(angles[row] - high, 0.0) + min(angles[row] - low, 0.0)
         if beyond != 0.0:

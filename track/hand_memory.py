@@ -7,15 +7,17 @@ which is nearly as sharp for an uncalibrated hand as for a calibrated one.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from handsim.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.transforms import multiply_quaternions, quaternion_vectors
 from track.digit_search import digit_ranges
+from track.expectation import Expectation
 from track.gloved_hand import gloved_hand
-from track.inverse_kinematics import PoseFit, PoseSolver, Prediction, move
+from track.hinge_belief import HingeBelief, foresee, resting_covariance
+from track.inverse_kinematics import PoseSolver, Prediction, move
 from track.user import UserHand
 
 if TYPE_CHECKING:
@@ -26,12 +28,35 @@ _FIRST_SPREAD: Final = 0.003  # [m] of a marker around where a hand not yet know
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
-_SWAY: Final = (np.deg2rad(1.0), 150.0, np.deg2rad(40.0))
-"""Spread of a hinge nobody sees: at once [rad], by an unforeseen acceleration [rad/s^2], at most [rad]."""
 _ARC: Final = 0.04  # [m] radius of the arcs that markers move on
 _FADING: Final = 0.7  # of the speed of a digit that lacks markers, from frame to frame
 _SMOOTHING: Final = 0.6  # share of the newest speed
+_RETURN: Final = 0.01  # [s] over the time for which a marker was hidden: its chance to be back in a frame
+_MOST_RETURN: Final = 0.65
+_ELSEWHERE: Final = -7.0  # log chance of a marker that was seen while the point was there already
 _LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
+
+
+class Coming(NamedTuple):
+    """A hand before its markers are asked."""
+
+    qpos: Float[np.ndarray, "27"]
+    hinges: HingeBelief
+
+
+class Estimate(NamedTuple):
+    """A pose that was fitted to a frame's markers."""
+
+    qpos: Float[np.ndarray, "27"]
+    rms: float
+    """3D RMS distance over the markers that are there [m]."""
+    residuals: Float[np.ndarray, "M 3"]
+    """Model minus marker [m], NaN where a marker is missing."""
+    places: Float[np.ndarray, "M 3"]
+    """Where the pose and the markers' habits have them [m]."""
+    covariances: Float[np.ndarray, "M 3 3"]
+    """How far they may be from there [m^2]."""
+    expected: Expectation
 
 
 class HandMemory:
@@ -53,70 +78,88 @@ class HandMemory:
         self._habit = np.zeros((count, 3))
         self.variance = np.full(count, _FIRST_SPREAD**2)
         self._learned = np.zeros(count)
-        self._whole = np.zeros(len(DIGITS))
+        self._seen = np.zeros(count)
         self.adapted = gloved_hand(hand.model, hand.attachment)
         self._designed = self.adapted.places[:, 0].copy()
         self.ranges = digit_ranges(self.adapted)
         self._turns = np.zeros((count, 3, 3))
+        self._hinges = resting_covariance()
         self.places = np.full((count, 3), np.nan)
 
-    def predict(self, time: float) -> Float[np.ndarray, "27"]:
-        """The pose that is coming, if the hand moves on as it did.
+    def predict(self, time: float) -> Coming:
+        """What is coming if the hand moves on as it did.
 
         Only for a hand that has a pose.
         """
         assert self.qpos is not None
-        ahead = min(time - self.time, _LONGEST_GLIDE)
-        moved: NDArray[np.float64] = move(self.qpos[None], ahead * self._speed[None])[0]
-        return moved
+        span = time - self.time
+        moved: NDArray[np.float64] = move(self.qpos[None], min(span, _LONGEST_GLIDE) * self._speed[None])[0]
+        return Coming(moved, foresee(moved[7:], self._hinges, span))
 
-    def expect(
-        self, qpos: Float[np.ndarray, "27"], there: Bool[np.ndarray, "M"], time: float
-    ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 3 3"]]:
-        """Where a pose fitted to some markers and the markers' habits have them [m], with covariances."""
-        seen = self.solver.expect(qpos, there, spread=np.repeat(self.sway(time), 4), noise=_NOISE)
-        self._turns = seen.turns
-        places = seen.places - np.einsum("mij,mj->mi", seen.turns, self._habit)
+    def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
+        """Where a pose and the markers' habits, as the bones last lay, have the markers [m]."""
+        places: NDArray[np.float64] = self.solver.place(qpos) - self._habit_in(self._turns)
+        return places
+
+    def fit(
+        self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], coming: Coming
+    ) -> Estimate:
+        """The pose of labelled markers [m]; what they leave open is as it was coming."""
+        prediction = Prediction(coming.hinges.angles, coming.hinges.spread)
+        fit = self.solver.solve(targets[None], start[None], prediction=prediction)
+        expected = self.solver.expect(
+            fit.qpos[0],
+            targets,
+            angles=coming.hinges.angles,
+            precision=coming.hinges.precision,
+            noise=_NOISE,
+        )
         # An arc leaves its tangent: open along it means open across it, by the square over twice its radius.
-        bend = np.trace(seen.covariances, axis1=1, axis2=2) / (2.0 * _ARC)
-        return places, seen.covariances + (self.variance + bend**2)[:, None, None] * np.eye(3)
+        bend = np.trace(expected.covariances, axis1=1, axis2=2) / (2.0 * _ARC)
+        covariances = expected.covariances + (self.variance + bend**2)[:, None, None] * np.eye(3)
+        places = expected.places - self._habit_in(expected.turns)
+        return Estimate(expected.qpos, float(fit.rms[0]), fit.residuals[0], places, covariances, expected)
 
-    def fit(self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], time: float) -> PoseFit:
-        """Solve the pose; digits that lack markers are drawn to the start."""
-        prediction = Prediction(start[7:], np.repeat(self.sway(time), 4))
-        return self.solver.solve(targets[None], start[None], prediction=prediction)
+    def _habit_in(self, turns: Float[np.ndarray, "M 3 3"]) -> Float[np.ndarray, "M 3"]:
+        habit: NDArray[np.float64] = np.einsum("mij,mj->mi", turns, self._habit)
+        return habit
 
-    def sway(self, time: float) -> NDArray[np.float64]:
-        """How far the hinges of each digit may be from where they were coming to."""
-        at_once, gain, most = _SWAY
-        sway: NDArray[np.float64] = np.minimum(at_once + 0.5 * gain * (time - self._whole) ** 2, most)
-        return sway
+    def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
+        """Log chance of each marker to come back when it did, were it the point that was born then [s]."""
+        gap = born[:, None] - self._seen
+        chance: NDArray[np.float64] = np.log(np.minimum(_RETURN / np.maximum(gap, 1e-3), _MOST_RETURN))
+        chance[gap < 0.0] = _ELSEWHERE
+        return chance
 
-    def begin(self, fit: PoseFit, time: float) -> None:
+    def begin(
+        self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
+    ) -> Estimate:
         """Take up a hand that has just been found."""
         self._speed[:] = 0.0
-        self._take(fit, time)
+        self._seen[:] = time
+        estimate = self.fit(targets, qpos, Coming(qpos, foresee(qpos[7:], resting_covariance(), 0.0)))
+        self._take(estimate, time)
+        return estimate
 
-    def carry_on(self, fit: PoseFit, time: float) -> None:
+    def carry_on(self, estimate: Estimate, time: float) -> None:
         """Take over the pose of the next frame and what it says of the markers' habits."""
         assert self.qpos is not None
-        qpos, span = fit.qpos[0], time - self.time
+        qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
             back = self.qpos[3:7] * np.array([1.0, -1.0, -1.0, -1.0])
             turn = quaternion_vectors(multiply_quaternions(back[None], qpos[None, 3:7]))[0]
             speed = np.concatenate([qpos[:3] - self.qpos[:3], turn, qpos[7:] - self.qpos[7:]]) / span
             self._speed += _SMOOTHING * (speed - self._speed)
-        self._take(fit, time)
+        self._take(estimate, time)
 
-    def _take(self, fit: PoseFit, time: float) -> None:
-        self.qpos, self.time = fit.qpos[0], time
-        misses = fit.residuals[0]
-        there = np.isfinite(misses[:, 0])
-        self.places, _ = self.expect(fit.qpos[0], there, time)
+    def _take(self, estimate: Estimate, time: float) -> None:
+        self.qpos, self.time, self.places = estimate.qpos, time, estimate.places
+        self._hinges, self._turns = estimate.expected.hinges, estimate.expected.turns
+        there = np.isfinite(estimate.residuals[:, 0])
         missing = np.bincount(self.digits[~there & (self.digits >= 0)], minlength=len(DIGITS))
-        self._whole[missing == 0] = time
         self._speed[6:].reshape(len(DIGITS), -1)[missing > 0] *= _FADING
-        self._learn(misses, there)
+        self._learn(estimate.residuals, there)
+        self._seen[there] = time
 
     def _learn(self, misses: Float[np.ndarray, "M 3"], there: Bool[np.ndarray, "M"]) -> None:
         local = np.einsum("mji,mj->mi", self._turns, np.where(there[:, None], misses, 0.0))

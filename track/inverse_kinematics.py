@@ -19,13 +19,13 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.topology import DIGITS, NUM_JOINTS, NUM_QPOS
 from handsim.transforms import multiply_quaternions, vector_quaternions
-from track.expectation import Expectation, expect_markers
+from track.expectation import Expectation, carry_markers, expect_markers, expectation
 from track.gloved_hand import GlovedHand, gloved_hand, workspace
 from track.pose_descent import MARKER_NOISE, descend, find_misses
 from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Float, Int
     from numpy.typing import ArrayLike, NDArray
 
 _REST_PULL: Final = np.deg2rad(90.0) ** -2  # [1/rad^2] of a hinge around rest
@@ -138,38 +138,40 @@ class PoseSolver:
 
     def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Where a pose has its markers [m]."""
-        nowhere = np.zeros(len(self._hand.digits), dtype=bool)
-        return self.expect(qpos, nowhere, spread=np.ones(NUM_JOINTS), noise=MARKER_NOISE).places
+        places = np.empty((len(self._hand.digits), 3))
+        carry_markers(self._hand, np.array(qpos, dtype=np.float64), places)
+        return places
 
     def expect(
         self,
         qpos: Float[np.ndarray, "27"],
-        there: Bool[np.ndarray, "M"],
+        targets: Float[np.ndarray, "M 3"],
         *,
-        spread: Float[np.ndarray, "20"],
+        angles: Float[np.ndarray, "20"],
+        precision: Float[np.ndarray, "20 20"],
         noise: float,
     ) -> Expectation:
         """Where a fitted pose has its markers, and how far they may be from there.
 
         Args:
             qpos: The pose.
-            there: The markers that it was fitted to.
-            spread: Standard deviations of its hinges [rad] as they were thought to be before the fit; they
-                count as in `solve`.
+            targets: The markers that it was fitted to [m]; NaN where missing.
+            angles: Where its hinges were believed to be before the fit [rad].
+            precision: How surely [1/rad^2].
             noise: Standard deviation of those markers around the pose's [m].
         """
-        count = len(self._hand.digits)
-        expectation = Expectation(np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3, 3)))
+        expected = expectation(len(self._hand.digits))
         expect_markers(
             self._hand,
             self._on_digit,
             np.array(qpos, dtype=np.float64),
-            np.array(there),
-            np.array(spread, dtype=np.float64) ** -2,
+            np.array(targets, dtype=np.float64, order="C"),
+            np.array(angles, dtype=np.float64),
+            np.array(precision, dtype=np.float64, order="C"),
             noise**-2,
-            *expectation,
+            expected,
         )
-        return expectation
+        return expected
 
 
 def solve_poses(

@@ -11,8 +11,8 @@ import numpy as np
 
 from handsim.topology import DIGITS
 from track.digit_search import search_digit
-from track.hand_memory import HandMemory
-from track.inverse_kinematics import PoseFit
+from track.hand_memory import Coming, Estimate, HandMemory
+from track.hinge_belief import belief_of_digit
 from track.matching import gains, match, worth_of
 from track.starting_poses import write_rotation
 
@@ -43,15 +43,14 @@ def forget_surprises(
     memory: HandMemory,
     points: Float[np.ndarray, "N 3"],
     names: Int[np.ndarray, "N"],
-    coming: Float[np.ndarray, "27"],
-    time: float,
+    coming: Coming,
 ) -> None:
     """Take away names whose points are nowhere near where their markers were coming to.
 
     Where that is so of many, it is the pose that was not coming, and the names stay.
     """
     mine = np.flatnonzero(names >= 0)
-    places, _ = memory.expect(coming, np.ones(memory.num_markers, dtype=bool), time)
+    places = memory.place(coming.qpos)
     off = ((points[mine] - places[names[mine]]) ** 2).sum(axis=1)
     wrong = mine[off > _GATE * (memory.variance[names[mine]] + _SURPRISE**2)]
     if len(wrong) <= _MOST_SURPRISES * len(mine):
@@ -62,30 +61,28 @@ def fit_names(
     memory: HandMemory,
     points: Float[np.ndarray, "N 3"],
     names: Int[np.ndarray, "N"],
-    coming: Float[np.ndarray, "27"],
-    time: float,
-) -> PoseFit | None:
+    coming: Coming,
+) -> Estimate | None:
     """The pose of the named points; names that do not go with the others are taken away, the worst first.
 
     Returns:
         None with fewer than four names.
     """
-    start, sought_anew = coming, False
+    start, sought_anew = coming.qpos, False
     while True:
         mine = np.flatnonzero(names >= 0)
         if len(mine) < _FEWEST_TO_FIT:
             return None
         targets = targets_of(points, names, memory.num_markers)
-        fit = memory.fit(targets, start, time)
-        places, _ = memory.expect(fit.qpos[0], np.isfinite(targets[:, 0]), time)
-        off = ((points[mine] - places[names[mine]]) ** 2).sum(axis=1)
+        estimate = memory.fit(targets, start, coming)
+        off = ((points[mine] - estimate.places[names[mine]]) ** 2).sum(axis=1)
         off /= memory.variance[names[mine]] + _FIT**2
         if off.max() < _GATE:
-            return fit
-        if fit.rms[0] > _BAD and not sought_anew:
+            return estimate
+        if estimate.rms > _BAD and not sought_anew:
             sought_anew = True
             anew = memory.solver.solve(targets[None])
-            if anew.rms[0] < 0.5 * fit.rms[0]:
+            if anew.rms[0] < 0.5 * estimate.rms:
                 start = anew.qpos[0]
                 continue
         names[mine[off.argmax()]] = -1
@@ -97,9 +94,9 @@ def name_new(
     names: Int[np.ndarray, "N"],
     free: Bool[np.ndarray, "N"],
     credit: Float[np.ndarray, "N"],
-    qpos: Float[np.ndarray, "27"],
-    coming: Float[np.ndarray, "27"],
-    time: float,
+    born: Float[np.ndarray, "N"],
+    estimate: Estimate,
+    coming: Coming,
 ) -> Float[np.ndarray, "N"]:
     """Name points that are free, the palm's first, then each digit's together with those it has.
 
@@ -109,9 +106,9 @@ def name_new(
         names: Names of this hand, overwritten.
         free: Points that nobody has named.
         credit: What the name of each point is worth for the sake of its ID.
-        qpos: The pose of the names so far.
+        born: When each point appeared [s].
+        estimate: The pose of the names so far.
         coming: The pose that was coming.
-        time: Now [s].
 
     Returns:
         How sure each name is that has changed; NaN for those that have not.
@@ -119,11 +116,12 @@ def name_new(
     sure = np.full(len(points), np.nan)
     there = np.zeros(memory.num_markers, dtype=bool)
     there[names[names >= 0]] = True
-    places, covariances = memory.expect(qpos, there, time)
+    places, covariances = estimate.places, estimate.covariances
     open_points = np.flatnonzero(free)
     palm = np.flatnonzero(~there & (memory.digits < 0))
     if len(palm) and len(open_points):
-        found, how_sure = match(gains(points[open_points], places[palm], covariances[palm]))
+        odds = gains(points[open_points], places[palm], covariances[palm])
+        found, how_sure = match(odds + memory.chances(born[open_points])[:, palm])
         chosen = open_points[found >= 0]
         names[chosen], sure[chosen] = palm[found[found >= 0]], how_sure[found >= 0]
     apart = np.linalg.norm(points[open_points, None] - places, axis=-1)
@@ -136,7 +134,9 @@ def name_new(
         rivals = open_points[near][np.argsort(apart[near][:, markers].min(axis=1))[:_MOST_RIVALS]]
         own = np.flatnonzero(np.isin(names, markers))
         chosen = np.concatenate([own, rivals])
-        new, how_sure_all = _search(memory, digit, markers, points, names, chosen, credit, qpos, coming, time)
+        new, how_sure_all = _search(
+            memory, digit, markers, points, names, chosen, credit, born, estimate, coming
+        )
         changed = new != names[chosen]
         names[chosen] = new
         sure[chosen[changed]] = how_sure_all
@@ -151,19 +151,20 @@ def _search(
     names: NDArray[np.int64],
     chosen: NDArray[np.int64],
     credit: NDArray[np.float64],
-    qpos: NDArray[np.float64],
-    coming: NDArray[np.float64],
-    time: float,
+    born: NDArray[np.float64],
+    estimate: Estimate,
+    coming: Coming,
 ) -> tuple[NDArray[np.int64], float]:
     """The likeliest names of some points on a digit, and how sure they are together."""
-    turn = np.empty((3, 3))
+    qpos, turn = estimate.qpos, np.empty((3, 3))
     write_rotation(qpos[3:7], turn)
-    kept = np.zeros((len(chosen), len(markers)))
+    kept = memory.chances(born[chosen])[:, markers]
     for row, point in enumerate(chosen):
         if names[point] >= 0:
             kept[row, np.searchsorted(markers, names[point])] = credit[point]
     hinges = slice(7 + 4 * digit, 11 + 4 * digit)
     best, angles = np.full(len(markers), -1), qpos[hinges].copy()
+    believed, trust = belief_of_digit(coming.hinges, estimate.expected, digit)
     _, margin = search_digit(
         memory.adapted,
         memory.ranges,
@@ -174,8 +175,8 @@ def _search(
         memory.variance,
         worth_of(memory.variance),
         qpos[7:].copy(),
-        coming[hinges].copy(),
-        np.full(4, memory.sway(time)[digit] ** -2),
+        believed,
+        trust,
         best,
         angles,
     )

@@ -14,9 +14,8 @@ import numpy as np
 
 from handsim.topology import NUM_QPOS
 from track.finding import MOST_RMS, HandFinder
-from track.hand_memory import HandMemory
-from track.inverse_kinematics import PoseFit
-from track.naming import fit_names, forget_surprises, name_new
+from track.hand_memory import Estimate, HandMemory
+from track.naming import fit_names, forget_surprises, name_new, targets_of
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.user import UserHand
 from train.labeling import Labeler
@@ -45,6 +44,7 @@ class Tracker:
         sizes = [memory.num_markers for memory in self._memories]
         self._first = np.cumsum([0, *sizes])
         self._labels: dict[int, tuple[int, float]] = {}
+        self._born: dict[int, float] = {}
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
         """Take in the next frame.
@@ -55,13 +55,14 @@ class Tracker:
             time: Time of the frame [s].
         """
         names, credit = self._carry_over(ids)
+        born = self._births(ids, time)
         sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
         hands: list[TrackedHand] = []
         for number, memory in enumerate(self._memories):
             mine = names[number]
             fit = None
             if memory.qpos is not None:
-                fit = self._follow(number, points, names, credit, sure, time)
+                fit = self._follow(number, points, names, credit, sure, born, time)
             hands.append(self._judge(memory, points, mine, credit, fit, time))
         self._find_lost(points, names, hands, time)
         labels = np.where(names >= 0, names + self._first[:-1, None], -1).max(axis=0, initial=-1)
@@ -80,6 +81,11 @@ class Tracker:
         names[(names < 0) | (labels >= self._first[1:, None])] = -1
         return names, np.array([worth for _, worth in known])
 
+    def _births(self, ids: NDArray[np.int64], time: float) -> NDArray[np.float64]:
+        """Since when each point has been there."""
+        self._born = {point: self._born.get(point, time) for point in ids.tolist() if point >= 0}
+        return np.array([self._born.get(point, time) for point in ids.tolist()])
+
     def _follow(
         self,
         number: int,
@@ -87,21 +93,22 @@ class Tracker:
         names: NDArray[np.int64],
         credit: NDArray[np.float64],
         sure: NDArray[np.float64],
+        born: NDArray[np.float64],
         time: float,
-    ) -> PoseFit | None:
+    ) -> Estimate | None:
         """The pose of a hand that was there before; its names (a row of H, N) and credits are overwritten."""
         memory, mine = self._memories[number], names[number]
         coming = memory.predict(time)
-        forget_surprises(memory, points, mine, coming, time)
-        fit = fit_names(memory, points, mine, coming, time)
+        forget_surprises(memory, points, mine, coming)
+        fit = fit_names(memory, points, mine, coming)
         if fit is None:
             return None
         free = np.logical_not((names >= 0).any(axis=0))
-        how_sure = name_new(memory, points, mine, free, credit, fit.qpos[0], coming, time)
+        how_sure = name_new(memory, points, mine, free, credit, born, fit, coming)
         changed = np.isfinite(how_sure)
         if changed.any():
             credit[changed], sure[changed] = 0.0, how_sure[changed]
-            fit = fit_names(memory, points, mine, coming, time)
+            fit = fit_names(memory, points, mine, coming)
         return fit
 
     def _judge(
@@ -110,12 +117,12 @@ class Tracker:
         points: NDArray[np.float64],
         names: NDArray[np.int64],
         credit: NDArray[np.float64],
-        fit: PoseFit | None,
+        fit: Estimate | None,
         time: float,
     ) -> TrackedHand:
         """Take a pose over or throw it away."""
         mine = np.flatnonzero(names >= 0)
-        if fit is not None and len(mine) >= _FEWEST and fit.rms[0] <= MOST_RMS:
+        if fit is not None and len(mine) >= _FEWEST and fit.rms <= MOST_RMS:
             memory.carry_on(fit, time)
             off = ((points[mine] - memory.places[names[mine]]) ** 2).sum(axis=1)
             income = _INCOME - 0.5 * off / memory.variance[names[mine]]
@@ -145,8 +152,10 @@ class Tracker:
             memory = self._memories[found.number]
             names[found.number] = -1
             names[found.number, free] = found.names
-            memory.begin(found.fit, time)
-            hands[found.number] = _tracked(memory, Status.FOUND, points, names[found.number], found.fit)
+            fit = memory.begin(
+                found.fit.qpos[0], targets_of(points, names[found.number], memory.num_markers), time
+            )
+            hands[found.number] = _tracked(memory, Status.FOUND, points, names[found.number], fit)
 
 
 def _tracked(
@@ -154,7 +163,7 @@ def _tracked(
     status: Status,
     points: NDArray[np.float64],
     names: NDArray[np.int64],
-    fit: PoseFit | None,
+    fit: Estimate | None,
 ) -> TrackedHand:
     count = memory.num_markers
     if memory.qpos is None:
@@ -163,5 +172,5 @@ def _tracked(
     markers, mine = memory.places.copy(), names >= 0
     markers[names[mine]] = points[mine]
     filled = np.setdiff1d(np.arange(count), names[mine])
-    rms = np.nan if fit is None else float(fit.rms[0])
+    rms = np.nan if fit is None else fit.rms
     return TrackedHand(memory.hand.side, status, memory.qpos, rms, markers, filled)

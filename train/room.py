@@ -12,7 +12,7 @@ from gloves.attach import Attachment
 from gloves.identities import number_runs, pack_columns
 from gloves.mesh_sight import MeshTree, clear_of_body, clear_of_mesh, hand_tree
 from gloves.mirrors import cameras_by_mirror, reflect
-from gloves.optics import OpticsConfig, reconstruct
+from gloves.optics import OpticsConfig, Reconstruction, reconstruct
 from gloves.strays import StrayConfig, sample_strays
 from gloves.take import GlovedHand, HeldBody, Take
 from gloves.visibility import facing_cameras, free_rays
@@ -113,10 +113,11 @@ class Room:
         found = reconstruct(
             sources.places, sources.seen, self.rig, self.config.optics, continuous=True, rng=rng
         )
-        labels = np.concatenate([sources.labels, np.full(found.false_points.shape[1], -1)])
-        order = rng.permutation(len(labels))  # neither IDs nor columns may tell what a point comes from
+        owned = _owned(found, sources.places, sources.labels, self.config.optics.max_residual)
+        labels = np.hstack([np.tile(sources.labels, (self.num_frames, 1)), owned])
+        order = rng.permutation(labels.shape[1])  # neither IDs nor columns may tell what a point comes from
         positions = np.concatenate([found.positions, found.false_points], axis=1)[:, order]
-        labels = labels[order]
+        labels = labels[:, order]
         present = np.isfinite(positions).all(axis=-1)
         columns, count = pack_columns(present, rng=rng)
         frame, source = np.nonzero(present)
@@ -125,7 +126,7 @@ class Room:
         ids, truth = np.full((2, self.num_frames, count), -1)
         points[frame, column] = positions[frame, source]
         ids[frame, column] = number_runs(present)[frame, source]
-        truth[frame, column] = labels[source]
+        truth[frame, column] = labels[frame, source]
         hands = tuple(
             GlovedHand(actor.model.shape, actor.attachment.layout, actor.motion.qpos) for actor in self.actors
         )
@@ -228,3 +229,23 @@ def _in_ball(
     reach = radius * np.cbrt(rng.random(shape, dtype=np.float32)) / np.maximum(length, 1e-12)
     offsets *= reach[..., None]
     return offsets
+
+
+def _owned(
+    found: Reconstruction, places: Float[np.ndarray, "T S 3"], labels: Int[np.ndarray, "S"], reach: float
+) -> Int[np.ndarray, "T F"]:
+    """Labels of false points: the marker within reach [m] that has no other point, -1 for none.
+
+    Whoever labels a capture by hand takes such a point for the marker, a little off as it is.
+    """
+    owned = np.full(found.false_points.shape[:2], -1)
+    markers = np.flatnonzero(labels >= 0)
+    for frame in np.flatnonzero(np.isfinite(found.false_points[..., 0]).any(axis=1)):
+        missing = markers[found.rays[frame, markers] == 0]
+        off = np.linalg.norm(found.false_points[frame, :, None] - places[frame, missing], axis=-1)
+        off[~(off < reach)] = np.inf
+        while off.size and np.isfinite(off.min()):
+            point, marker = np.unravel_index(off.argmin(), off.shape)
+            owned[frame, point] = labels[missing[marker]]
+            off[point], off[:, marker] = np.inf, np.inf
+    return owned
