@@ -1,0 +1,221 @@
+"""How near a calibration comes to the truth, on simulated users.
+
+    python benchmarks/calibration.py [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
+        [--picture FILE.png] [--captures FOLDER]
+
+Each user is one hand, right and left in turn: a size's mean hand made 8 % larger or smaller, with the
+individual spreads of `handsim.shape.sample_shape`, in a glove whose markers sit 5 mm from where they belong,
+along the skin, and 0.3 mm above or below it. It makes a capture of touches and free motion before the 16
+cameras of "figure5"; labels are the truth's. The calibration begins with the size's mean hand and the glove
+as designed. Another capture of the same user holds the touches that the gaps are told for: of all frames in
+which the true flesh of thumb and finger meets, how far the flesh of the tracked hand is from touching, apart
+or dug in, and how far the distance of its skins is from that of the true hand's.
+
+The same capture is calibrated three times more: from the mean hand of the next size, farther from the truth;
+with 1 % of labels wrong, neighbours having exchanged their names for a while; and with flesh that moves every
+marker by 0.5 mm RMS as its digit bends.
+
+FOLDER holds labelled dense19 captures of real people, one sub-folder each (right hands, *_right.trc): the
+first half of each calibrates, the second is tracked. There the truth is not known, only what markers are off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+
+import numpy as np
+from machine import describe
+from people import right_hands
+
+from gloves.attach import attach
+from gloves.layout import MarkerLayout, load_layout
+from gloves.take import Take
+from handsim.model import HandModel, join_qpos
+from handsim.shape import SIZES, HandShape, sample_shape, shape_from_measures
+from handsim.topology import BONES, SIDES
+from handsim.transforms import quaternion_matrix
+from poses.touch import FINGERS, is_touching, thumb_contact
+from track.calibration import calibrate
+from track.calibration_picture import save_picture
+from track.contacts import meet, place_contacts
+from track.hand_errors import hand_errors
+from track.inverse_kinematics import PoseSolver
+from track.skin_walk import SkinPatch, slip
+from track.user import UserHand, usual_hand
+from train.calibration_take import CalibrationTakeConfig, simulate_calibration
+
+OFF, SLIP, LIFT = 0.08, 0.005, 0.0003
+WRONG, LASTING = 0.01, 30  # share of labels, frames that an exchange lasts on the average
+FLESH = 0.0005  # [m]
+EVERY = 5  # held-out frames
+
+
+def draw_shape(size: str, factor: float, rng: np.random.Generator) -> HandShape:
+    """A size's mean hand, scaled, with one person's own proportions."""
+    person = sample_shape(rng=rng)
+    mean = shape_from_measures(person.length, person.breadth)
+    hand = shape_from_measures(*(1e-3 * factor * measure for measure in SIZES[size]))
+    return dataclasses.replace(
+        hand,
+        bone_lengths=hand.bone_lengths * person.bone_lengths / mean.bone_lengths,
+        knuckles=hand.knuckles + person.knuckles - mean.knuckles,
+        base_angles=person.base_angles,
+        radii=hand.radii * person.radii / mean.radii,
+        palm_thickness=hand.palm_thickness * person.palm_thickness / mean.palm_thickness,
+    )
+
+
+def draw_user(
+    number: int, layout: MarkerLayout, rng: np.random.Generator
+) -> tuple[UserHand, UserHand, UserHand]:
+    """Somebody's hand in its glove, the hand that a calibration begins with, and one a size farther off."""
+    sizes, index, side = list(SIZES), 1 + number % 3, SIDES[1 - number % 2]
+    grown = 1 if number % 4 < 2 else -1
+    shape = draw_shape(sizes[index], 1.0 + OFF * grown, rng)
+    model = HandModel(shape)
+    worn = slip(attach(layout, model), shape, SLIP, LIFT, rng=rng)
+    starts = (usual_hand(layout, size, side) for size in (sizes[index], sizes[index - grown]))
+    return UserHand(model, worn).with_side(side), *starts
+
+
+def exchange_labels(markers: np.ndarray, true: UserHand, rng: np.random.Generator) -> np.ndarray:
+    """Markers of which neighbours exchange their names for a while, until `WRONG` of all labels are wrong."""
+    points, wrong = true.attachment.points, np.zeros(markers.shape[:2], dtype=bool)
+    apart = np.linalg.norm(points[:, None] - points, axis=2) + np.diag(np.full(len(points), np.inf))
+    markers = markers.copy()
+    while wrong.mean() < WRONG:
+        first = rng.integers(len(points))
+        begin, pair = rng.integers(len(markers)), [first, apart[first].argmin()]
+        frames = slice(begin, begin + int(rng.exponential(LASTING)))
+        markers[frames, pair] = markers[frames, pair[::-1]]
+        wrong[frames, pair] = True
+    return markers
+
+
+def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: UserHand, rng: np.random.Generator) -> np.ndarray:
+    """Markers moved with their digit's hinges, each in its own way; the palm's with the fingers' knuckles."""
+    turns, moved = quaternion_matrix(qpos[:, 3:7]), markers.copy()
+    for marker, bone in enumerate(true.attachment.bone_indices[:, 0]):
+        digit = BONES[bone].digit
+        angles = qpos[:, 7 + 4 * digit : 11 + 4 * digit] if digit >= 0 else qpos[:, 12::4]
+        way = (angles - angles.mean(axis=0)) @ rng.normal(size=(4, 3))
+        way *= FLESH / np.sqrt((way**2).sum(axis=1).mean())
+        moved[:, marker] += np.einsum("tij,tj->ti", turns, way)
+    return moved
+
+
+def held_out_gaps(hand: UserHand, true: UserHand, take: Take) -> np.ndarray:
+    """Means over each finger's touches (4, 2) [m]: flesh from touching, skins from the true ones."""
+    markers, qpos = take.observed(take.hand_labels[0]), take.hands[0].qpos
+    gaps = np.full((len(FINGERS), 2), np.nan)
+    for number, finger in enumerate(FINGERS):
+        touching = is_touching(true.model, qpos[:, 7:], finger)
+        enough = np.isfinite(markers[..., 0]).sum(axis=1) >= markers.shape[1] - 3
+        frames = np.flatnonzero(touching & enough)[::EVERY]
+        if len(frames):
+            tracked = PoseSolver(hand.model, hand.attachment).solve(markers[frames]).qpos
+            flesh = thumb_contact(hand.model, tracked[:, 7:], finger).overlap
+            off = skin_gaps(hand.model, tracked, finger) - skin_gaps(true.model, qpos[frames], finger)
+            gaps[number] = np.abs(flesh).mean(), np.abs(off).mean()
+    return gaps
+
+
+def skin_gaps(model: HandModel, qpos: np.ndarray, finger: str) -> np.ndarray:
+    """Distance [m] of the skins of thumb and finger; angles alone decide, so right hands will do."""
+    model = HandModel(model.shape.with_side("right"))
+    bones = model.forward_kinematics(join_qpos(qpos[:, 7:]))
+    contacts = place_contacts(model, [(frame, finger) for frame in range(len(qpos))], bones)
+    faces = np.concatenate([contacts.thumb_places.faces, contacts.finger_places.faces])
+    return meet(contacts, SkinPatch(faces).corners(model.shape), model, bones).gaps
+
+
+def tell(name: str, hand: UserHand, true: UserHand, held_out: Take) -> list[float]:
+    """Print how far a hand is from the truth; returns what is averaged over users."""
+    errors, gaps = hand_errors(hand, true), 1e3 * held_out_gaps(hand, true, held_out)
+    places, lengths = 1e3 * errors.places, 100.0 * np.abs(errors.lengths)
+    tips = 100.0 * np.abs(errors.tips)
+    flesh = " ".join(f"{gap:.2f}" for gap in gaps[:, 0])
+    print(f"  {name}: places {places.mean():.2f} mm (worst {places.max():.2f}; palm's in the wrist's frame: "
+          f"{1e3 * errors.wrist_places.mean():.2f}), bones {lengths.mean():.2f} % "
+          f"(worst {lengths.max():.1f}), tips {tips.mean():.1f} %, touches off by {flesh} mm, "
+          f"skins by {np.nanmean(gaps[:, 1]):.2f}")  # fmt: skip
+    return [places.mean(), places.max(), 1e3 * errors.wrist_places.mean(), lengths.mean(), lengths.max(),
+            tips.mean(), *np.nanmean(gaps, axis=0), np.nanmax(gaps[:, 0])]  # fmt: skip
+
+
+def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -> dict[str, list[float]]:
+    """Simulate a user, calibrate in every way, print; what is averaged over users, by the way."""
+    rng = np.random.default_rng((arguments.seed, number))
+    true, start, farther = draw_user(number, layout, rng)
+    worn = ((true.model, true.attachment),)
+    made = CalibrationTakeConfig(free=arguments.free, rounds=arguments.rounds)
+    take = simulate_calibration(worn, made, rng=rng)
+    held_out = simulate_calibration(worn, CalibrationTakeConfig(free=3.0, rounds=4), rng=rng)
+    markers = take.observed(take.hand_labels[0])
+    ways = {
+        "after": (markers, start),
+        "from the next size": (markers, farther),
+        "1 % wrong labels": (exchange_labels(markers, true, rng), start),
+        "flesh": (move_flesh(markers, take.hands[0].qpos, true, rng), start),
+    }
+    print(f"user {number}, {true.side}: {take.num_frames} frames")
+    rows = {"before": tell("before", start, true, held_out)}
+    for name, (seen, begin) in ways.items():
+        began = time.perf_counter()
+        result = calibrate(seen, begin, take.rate)
+        took = time.perf_counter() - began
+        within = (1e3 * hand_errors(result.hand, true).wrist_places < 2e3 * result.place_errors).mean()
+        rows[name] = tell(name, result.hand, true, held_out)
+        print(f"    {took:.1f} s, markers off by {1e3 * result.rms_before:.2f} mm, then "
+              f"{1e3 * result.rms_after:.2f}; {len(result.touches)} touches found; {within:.0%} of places "
+              f"within two standard errors; {' / '.join(result.advice()) or 'no advice'}",
+              flush=True)  # fmt: skip
+        if arguments.picture and number == 0 and name == "after":
+            save_picture(arguments.picture, result)
+    return rows
+
+
+def tell_people(captures: Path, layout: MarkerLayout) -> None:
+    """Print what markers are off by on captures that a calibration has not seen."""
+    for name, markers in right_hands(captures, layout.names).items():
+        half = len(markers) // 2
+        seen = markers[half:][np.isfinite(markers[half:, :, 0]).all(axis=1)][::EVERY]
+        result = calibrate(markers[:half], usual_hand(layout, "M", "right"), 120.0)
+        off = [
+            1e3 * PoseSolver(hand.model, hand.attachment).solve(seen).rms
+            for hand in (result.start, result.hand)
+        ]
+        print(f"{name}: {len(seen)} held-out frames, 3D RMS median {np.median(off[0]):.2f} mm before, "
+              f"{np.median(off[1]):.2f} mm after (p95 {np.percentile(off[1], 95):.2f}); "
+              f"{len(result.touches)} touches found")  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--users", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--layout", default="dense19")
+    parser.add_argument("--free", type=float, default=40.0)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--picture")
+    parser.add_argument("--captures", type=Path)
+    arguments = parser.parse_args()
+    print(describe("scipy", "numba"))
+    layout = load_layout(arguments.layout)
+    users = [run_user(number, arguments, layout) for number in range(arguments.users)]
+    for name in users[0]:
+        mean, worst = (by([user[name] for user in users], axis=0) for by in (np.mean, np.max))
+        print(f"{name}: places {mean[0]:.2f} mm (worst {worst[1]:.2f}; in the wrist's frame {mean[2]:.2f}), "
+              f"bones {mean[3]:.2f} % (worst {worst[4]:.1f}), tips {mean[5]:.1f} %, touches off by "
+              f"{mean[6]:.2f} mm (worst finger {worst[8]:.2f}), skins by {mean[7]:.2f} mm")  # fmt: skip
+    if arguments.captures:
+        tell_people(arguments.captures, layout)
+
+
+if __name__ == "__main__":
+    main()

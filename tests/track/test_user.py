@@ -1,0 +1,128 @@
+"""A user's file gives back the same hands to the last bit, and says in one sentence what is wrong with it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from gloves.layout import load_layout
+from handsim.errors import HandSimError
+from handsim.model import HandModel
+from handsim.shape import sample_shape
+from handsim.topology import SIDES
+from track.user import UserError, UserHand, load_user, save_user, usual_hand
+
+
+@pytest.fixture
+def hands(rng):
+    """Left and right hand of somebody, in gloves whose markers have slipped."""
+    layout = load_layout("dense19")
+    pair = []
+    for side in SIDES:
+        worn = usual_hand(layout, "M", side).attachment
+        worn = dataclasses.replace(worn, points=worn.points + rng.normal(scale=0.003, size=worn.points.shape))
+        pair.append(UserHand(HandModel(sample_shape(side=side, rng=rng)), worn))
+    return tuple(pair)
+
+
+def test_hands_come_back_exactly(hands, tmp_path):
+    save_user(tmp_path / "user.json", hands, "drawn at random")
+    again = load_user(tmp_path / "user.json")
+    assert [hand.side for hand in again] == ["left", "right"]
+    for first, second in zip(hands, again, strict=True):
+        assert first.attachment.layout == second.attachment.layout
+        for name in ("points", "normals", "bone_indices", "bone_weights"):
+            np.testing.assert_array_equal(getattr(first.attachment, name), getattr(second.attachment, name))
+        for field in dataclasses.fields(first.model.shape):
+            mine, other = (getattr(hand.model.shape, field.name) for hand in (first, second))
+            np.testing.assert_array_equal(mine, other)
+
+
+def test_what_cannot_be_saved_is_told(hands, tmp_path):
+    with pytest.raises(UserError, match="wanted a left hand, a right hand, or one of each"):
+        save_user(tmp_path / "user.json", (hands[0], hands[0]))
+    with pytest.raises(UserError, match="wanted a left hand"):
+        save_user(tmp_path / "user.json", ())
+    with pytest.raises(UserError, match="different gloves"):
+        save_user(tmp_path / "user.json", (hands[0], usual_hand(load_layout("sparse13"), "M", "right")))
+    with pytest.raises(UserError, match="cannot be written"):
+        save_user(tmp_path, hands)
+    assert not list(tmp_path.iterdir())
+
+
+def spoil_schema(content):
+    content["schema"] = 99
+
+
+def spoil_layout(content):
+    content["glove"]["markers"][0]["bone"] = "toe"
+
+
+def spoil_number(content):
+    content["hands"][0]["shape"]["length"] = "long"
+
+
+def spoil_nan(content):
+    content["hands"][0]["markers"]["points"][3][1] = float("nan")
+
+
+def spoil_count(content):
+    content["hands"][0]["markers"]["points"].pop()
+
+
+def spoil_bones(content):
+    content["hands"][0]["markers"]["bone_indices"][0][0] = 16
+
+
+def spoil_weights(content):
+    content["hands"][0]["markers"]["bone_weights"][0] = [0.5, 0.0, 0.0, 0.0]
+
+
+def spoil_key(content):
+    del content["hands"]
+
+
+def spoil_sides(content):
+    content["hands"][1] = content["hands"][0]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (spoil_schema, "schema 99, wanted 1"),
+        (spoil_layout, "unknown bone 'toe'"),
+        (spoil_number, "damaged"),
+        (spoil_nan, "points holds NaN"),
+        (spoil_count, "wanted \\(19, 3\\)"),
+        (spoil_bones, "whole numbers from 0 to 15"),
+        (spoil_weights, "sum to one"),
+        (spoil_key, "'hands' is missing"),
+        (spoil_sides, "two of one side"),
+    ],
+)
+def test_damage_is_told_in_one_sentence(spoil, told, hands, tmp_path):
+    path = tmp_path / "user.json"
+    save_user(path, hands)
+    content = json.loads(path.read_text("utf-8"))
+    spoil(content)
+    path.write_text(json.dumps(content), "utf-8")
+    with pytest.raises(UserError, match=told) as error:
+        load_user(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "{}", "{", "\u0000", "[" * 100_000])
+def test_other_files_are_told(text, tmp_path):
+    path = tmp_path / "user.json"
+    path.write_text(text, "utf-8")
+    with pytest.raises(HandSimError, match="not a user's file"):
+        load_user(path)
+
+
+def test_a_missing_file_is_told(tmp_path):
+    with pytest.raises(UserError, match="cannot be read"):
+        load_user(tmp_path / "nobody.json")
