@@ -19,14 +19,14 @@ from gloves.captures.markers import labelled_capture
 from gloves.layout import load_layout
 from gloves.take import SUFFIX
 from gloves.tracked_take import STATUSES, TrackedTake, save_tracked_take
-from handsim.errors import CaptureError, HandSimError
+from handsim.errors import CaptureError, HandSimError, choices
 from handsim.topology import Side
 from track.capture_tracking import TakeRecorder, follow, warm_up
 from track.capture_tracking import track as track_capture
 from track.streaming import StreamedFrame, open_stream
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
-from track.user import UserHand, usual_hand
+from track.user import UserHand, load_user, usual_hand
 from train.commands import progress_bar
 from train.labeler import labeler_for_glove
 
@@ -45,8 +45,9 @@ def track(
     live: str | None = None,
     seconds: float | None = None,
     glove: str = "dense19",
-    size: Size = "M",
-    hands: tuple[Side, ...] = BOTH,
+    size: Size | None = None,
+    shape: Path | None = None,
+    hands: tuple[Side, ...] | None = None,
     labeler: str | None = None,
     labelled: Path | None = None,
 ) -> None:
@@ -58,15 +59,19 @@ def track(
         live: Address of a NatNet server instead of a capture: natnet://host or natnet://host:port. Ctrl-C
             ends it, and what came until then is written.
         seconds: How long to listen to it.
-        glove: Marker layout: a shipped name or the path of a .toml file.
-        size: Size of the hands.
-        hands: Which hands there are.
+        glove: Marker layout: a shipped name or the path of a .toml file; its labeler is used.
+        size: Size of the hands; M when neither this nor --shape is given.
+        shape: The user's file from handsim calibrate: hands and gloves.
+        hands: Which hands there are; both, or those of --shape, when not given.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
         labelled: File for the labelled points, .trc or .c3d; markers are called right:ThumbTip and so on,
             points that are no markers Unlabeled1, Unlabeled2, ...
     """
     _check_options(capture, live, seconds, out, labelled)
-    user = users(glove, size, hands)
+    if shape is None:
+        user = users(glove, size or "M", BOTH if hands is None else hands)
+    else:
+        user = _calibrated(shape, glove, size, hands)
     source = None if capture is None else read_capture(capture)
     network = labeler_for_glove(glove, labeler)
     with Console(stderr=True).status("getting ready"):
@@ -86,16 +91,16 @@ def track(
     made = {
         "capture": live if capture is None else capture.name,
         "glove": glove,
-        "size": size,
+        "user": size or "M" if shape is None else shape.name,
         "labeler": labeler or glove,
     }
     take = dataclasses.replace(take, settings=made)
     save_tracked_take(out, take)
     if labelled is not None:
         write_capture(labelled, labelled_points(take))
-    _say(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
+    say(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
     for line in (*summary(take), *notes, f"{1e3 * np.median(watch.spent):.2f} ms a frame"):
-        _say(line)
+        say(line)
 
 
 def users(glove: str, size: Size, hands: Sequence[Side]) -> tuple[UserHand, ...]:
@@ -105,10 +110,36 @@ def users(glove: str, size: Size, hands: Sequence[Side]) -> tuple[UserHand, ...]
         LayoutError: The glove is unknown or does not fit.
         HandSimError: A hand is named twice, or none is.
     """
-    if not hands or len(set(hands)) < len(hands):
-        raise HandSimError(f"--hands is '{' '.join(hands)}', wanted right, left, or one of each")
+    check_hands(hands)
     layout = load_layout(glove)
     return tuple(usual_hand(layout, size, side) for side in hands)
+
+
+def check_hands(hands: Sequence[Side]) -> None:
+    """Raise a `HandSimError` unless each side is there once at most, and one is."""
+    if not hands or len(set(hands)) < len(hands):
+        raise HandSimError(f"--hands is '{' '.join(hands)}', wanted right, left, or one of each")
+
+
+def _calibrated(
+    shape: Path, glove: str, size: Size | None, hands: tuple[Side, ...] | None
+) -> tuple[UserHand, ...]:
+    """Hands of a user's file."""
+    if size is not None:
+        raise HandSimError(f"given --size {size} and --shape {shape}, wanted one of them")
+    known = {hand.side: hand for hand in load_user(shape)}
+    wanted_hands = tuple(known) if hands is None else hands
+    check_hands(wanted_hands)
+    for side in wanted_hands:
+        if side not in known:
+            raise HandSimError(f"{shape}: {choices(side, known, noun='hand')}")
+    names, wanted = known[next(iter(known))].attachment.layout.names, load_layout(glove).names
+    if names != wanted:
+        raise HandSimError(
+            f"{shape} is of a glove with the markers {', '.join(names)}, "
+            f"but glove '{glove}' has {', '.join(wanted)}"
+        )
+    return tuple(known[side] for side in wanted_hands)
 
 
 class Stopwatch:
@@ -216,5 +247,6 @@ def _word(frame: StreamedFrame, tracked: TrackedFrame) -> str:
     return f"frame {frame.number}: {', '.join(hands)}; Ctrl-C ends it and writes the take"
 
 
-def _say(line: str) -> None:
+def say(line: str) -> None:
+    """Print a line as it is."""
     Console().print(line, highlight=False, soft_wrap=True, markup=False)
