@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 import tyro
 from rich.console import Console
+from scipy.spatial.distance import cdist
 
 from gloves.captures import Capture, read_capture
 from gloves.tracked_take import FOUND, TRACKED, TrackedTake
 from handsim.errors import HandSimError
 from handsim.topology import Side
-from track.calibration import Calibration
-from track.calibration import calibrate as calibrate_hand
+from track.calibration import Calibration, calibrate_hands
 from track.capture_tracking import track
 from track.commands import BOTH, Size, say, users
 from track.tracker import Tracker
@@ -88,15 +88,16 @@ def _round(
         raise HandSimError(
             f"no {' and no '.join(take.sides)} hand was found in the capture; wanted half a minute of one"
         )
-    done = []
+    markers = {side: take.observed(side) for side in shown}
+    for side in shown:
+        markers[side][~_sure(take, side)] = np.nan
     with Console(stderr=True).status("calibrating") as status:
-        for hand in start:
-            if hand.side in shown:
-                status.update(f"calibrating the {hand.side} hand")
-                markers = take.observed(hand.side)
-                markers[~_sure(take, hand.side)] = np.nan
-                done.append(calibrate_hand(markers, hand, take.rate))
-    return take, tuple(done)
+        return take, calibrate_hands(
+            markers,
+            [hand for hand in start if hand.side in shown],
+            take.rate,
+            progress=lambda side, step, *_: status.update(f"calibrating the {side} hand, step {step}"),
+        )
 
 
 def _sure(take: TrackedTake, side: Side) -> Bool[np.ndarray, "T"]:
@@ -106,8 +107,16 @@ def _sure(take: TrackedTake, side: Side) -> Bool[np.ndarray, "T"]:
 
 
 def _leaves_out(take: TrackedTake, done: Sequence[Calibration]) -> bool:
-    """Whether markers of the calibrated hands have been left without a point."""
-    return any(take.filled[:, take.hand(one.hand.side)].mean() > _LEFT_OVER for one in done)
+    """Whether markers that lack a point had one nearby that nobody took."""
+    left, whole = 0, 0
+    for one in done:
+        hand = take.hand(one.hand.side)
+        whole += take.filled[:, hand].size
+        for frame in np.flatnonzero(take.filled[:, hand].any(axis=1) & _sure(take, one.hand.side)):
+            free = take.points[frame, take.labels[frame] < 0]
+            wanted = take.markers[frame, hand, take.filled[frame, hand]]
+            left += int((cdist(wanted, free[np.isfinite(free[:, 0])]) < _NEAR).any(axis=1).sum())
+    return left > _LEFT_OVER * whole
 
 
 def _tell(done: Calibration) -> list[str]:
