@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 NUM_FRAMES: Final = 160
 FEWEST_FRAMES: Final = 100
-_CANDIDATES: Final = 2000
+_CANDIDATES: Final = 800
 _SOLVABLE: Final = 6  # markers at least
 _SHARE: Final = 0.75  # of the markers
 _STEADY: Final = 3.0  # times the usual RMS
