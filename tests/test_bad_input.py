@@ -119,6 +119,10 @@ CASES = {
     "an unknown glove to track": ["track", "good.trc", "--glove", "dense91", "--out", "out.npz"],
     "millimetres said to be metres, to track": ["track", "millimetres.trc", "--out", "out.npz"],
     "a truncated capture to track": ["track", "truncated.trc", "--out", "out.npz"],
+    "an unknown user": ["track", "good.trc", "--shape", "missing.json", "--out", "out.npz"],
+    "a user's file that is none": ["track", "good.trc", "--shape", "good.trc", "--out", "out.npz"],
+    "a user in another kind of file": ["calibrate", "good.trc", "--out", "user.toml"],
+    "a capture without hands": ["calibrate", "good.trc", "--out", "user.json"],
     "a tracked take as truth": ["evaluate", "tracked.npz", "--json", "out.json"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }

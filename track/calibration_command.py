@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from jaxtyping import Bool
 
 _SHOWN: Final = 0.05  # of the frames that a hand must be in to be calibrated
-_LEFT_OVER: Final = (
-    0.02  # of markers without a point, or frames without a pose, from which it is worth a second go
-)
+_NEAR: Final = 0.015  # [m] that a hand of another size may have a marker off
+_LEFT_OVER: Final = 0.005  # of the markers that a first round may leave out
 
 
 def calibrate(

@@ -1,4 +1,4 @@
-"""`handsim track` through the command line, on captures and on a live stream."""
+"""`handsim track` and `handsim calibrate` through the command line, on captures and on a live stream."""
 
 from __future__ import annotations
 
@@ -13,12 +13,19 @@ import numpy as np
 import pytest
 import torch
 
-from gloves.captures import read_capture
+from gloves.attach import wear
+from gloves.captures import Capture, read_capture, write_capture
+from gloves.layout import load_layout
 from gloves.take import load_take
 from gloves.tracked_take import LOST, load_tracked_take
 from handsim.cli import main
+from handsim.model import HandModel
+from handsim.shape import sample_shape
+from track.hand_errors import hand_errors
 from track.natnet_server import ReplayServer
 from track.streaming import open_stream
+from track.user import UserHand, load_user, usual_hand
+from train.calibration_take import CalibrationTakeConfig, simulate_calibration
 
 FRAMES = 60
 
@@ -37,6 +44,53 @@ def capture(tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def user(tmp_path_factory):
+    """A user's capture for calibration, their hand and what the command made of it."""
+    folder, rng = tmp_path_factory.mktemp("user"), np.random.default_rng(4)
+    shape = sample_shape(side="right", rng=rng)
+    model = HandModel(shape)
+    worn = wear(load_layout("dense19"), model, along=0.05, around=0.2, rng=rng)
+    config = CalibrationTakeConfig(free=5.0, rounds=1)
+    take = simulate_calibration(((model, worn),), config, rng=rng)
+    columns = tuple(f"*{number}" for number in range(take.points.shape[1]))
+    write_capture(folder / "user.c3d", Capture(columns, take.points, take.rate))
+    arguments = [str(folder / "user.c3d"), "--size", "L", "--out", str(folder / "user.json")]
+    assert main(["calibrate", *arguments]) == 0
+    return folder, UserHand(model, worn)
+
+
+def test_a_user_is_calibrated_from_unlabelled_points(user, capsys):
+    folder, true = user
+    (found,) = load_user(folder / "user.json")
+    assert found.side == "right", "the left hand is not in the capture"
+    errors = hand_errors(found, true)
+    start = hand_errors(usual_hand(load_layout("dense19"), "L", "right"), true)
+    assert np.median(errors.places) < 0.5 * np.median(start.places)
+    assert main(["track", str(folder / "user.c3d"), "--shape", str(folder / "user.json"), "--out",
+                 str(folder / "take.npz")]) == 0  # fmt: skip
+    take = load_tracked_take(folder / "take.npz")
+    assert take.sides == ("right",) and take.settings["user"] == "user.json"
+    assert np.nanmedian(take.rms) < 0.0005
+    np.testing.assert_array_equal(take.hands[0].attachment.points, found.attachment.points)
+    assert "right hand: tracked" in capsys.readouterr().out
+
+
+def test_users_that_do_not_fit_are_told(user, capture, tmp_path, capsys):
+    shape, out = str(user[0] / "user.json"), str(tmp_path / "out.npz")
+    for arguments, words in (
+        (["--size", "M"], "wanted one of them"),
+        (["--hands", "left"], "unknown hand 'left'; valid names: right"),
+        (["--glove", "sparse13"], "but glove 'sparse13' has"),
+    ):
+        assert main(["track", str(capture), "--shape", shape, "--out", out, *arguments]) == 1
+        assert words in capsys.readouterr().err
+    assert main(["calibrate", str(capture), "--hands", "left", "--out", str(tmp_path / "user.json")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("handsim calibrate: ") and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     out, labelled = tmp_path / "new" / "tracked.npz", tmp_path / "labelled.trc"
     assert main(["track", str(capture), "--out", str(out), "--labelled", str(labelled), "--size", "L"]) == 0
@@ -47,7 +101,7 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     assert lines[3].endswith("points are no markers") and lines[4].endswith(" ms a frame")
     take, truth = load_tracked_take(out), load_take(capture.with_suffix(".truth.npz"))
     assert take.sides == ("right", "left")
-    assert take.settings["capture"] == "take.c3d" and take.settings["size"] == "L"
+    assert take.settings["capture"] == "take.c3d" and take.settings["user"] == "L"
     json.dumps(take.settings)
     true = np.where(truth.labels < 38, truth.labels, -1)
     assert np.mean(take.labels == true) > 0.95
