@@ -47,11 +47,11 @@ def capture(tmp_path_factory):
 @pytest.fixture(scope="module")
 def user(tmp_path_factory):
     """A user's capture for calibration, their hand and what the command made of it."""
-    folder, rng = tmp_path_factory.mktemp("user"), np.random.default_rng(4)
+    folder, rng = tmp_path_factory.mktemp("user"), np.random.default_rng(5)
     shape = sample_shape(side="right", rng=rng)
     model = HandModel(shape)
     worn = wear(load_layout("dense19"), model, along=0.05, around=0.2, rng=rng)
-    config = CalibrationTakeConfig(free=5.0, rounds=1)
+    config = CalibrationTakeConfig(free=2.0, rounds=0)
     take = simulate_calibration(((model, worn),), config, rng=rng)
     columns = tuple(f"*{number}" for number in range(take.points.shape[1]))
     write_capture(folder / "user.c3d", Capture(columns, take.points, take.rate))
