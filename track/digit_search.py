@@ -25,13 +25,14 @@ from track.gloved_hand import (
 )
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 _STEPS: Final = 10
 _LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
 _FREEDOM: Final = 4.0  # squared deviations of a prior from which on it loses its say
 _SLACK: Final = 0.006  # [m] that two markers may be nearer or farther than on any pose of the hand
-_OVER: Final = 1e9
+NEVER: Final = 1e9
+"""Score below zero of what cannot be."""
 
 
 class DigitRanges(NamedTuple):
@@ -57,6 +58,25 @@ def digit_ranges(hand: GlovedHand) -> DigitRanges:
     return DigitRanges(nearest - _SLACK, farthest + _SLACK)
 
 
+class DigitNamings(NamedTuple):
+    """The best naming of every set of points, a row a set: bit n is the digit's n-th candidate."""
+
+    scores: Float[np.ndarray, "S"]
+    """Log odds against all points being strays; far below zero where there is none."""
+    runners_up: Float[np.ndarray, "S"]
+    """The same of the next best naming of the same points."""
+    names: Int[np.ndarray, "S K"]
+    """Candidate of each of the digit's markers, -1 for none."""
+
+
+def digit_namings(num_candidates: int, num_markers: int) -> DigitNamings:
+    """Room for one digit's."""
+    sets = 1 << num_candidates
+    return DigitNamings(
+        np.full(sets, -NEVER), np.full(sets, -NEVER), np.full((sets, num_markers), -1, dtype=np.int64)
+    )
+
+
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def search_digit(
     hand: Any,
@@ -70,64 +90,51 @@ def search_digit(
     posed: Any,
     coming: Any,
     trust: Any,
-    best: Any,
-    hinges: Any,
-) -> Any:
-    """The best naming of points as markers of one digit.
+    namings: Any,
+) -> None:
+    """Try all namings of points as markers of one digit.
 
     Args:
         hand: The hand, its markers where their habits have them.
         ranges: See `digit_ranges`.
         digit: Which digit.
         markers: Its markers (K,).
-        points: Points (C, 3) [m] in the wrist's frame.
+        points: Candidates (C, 3) [m] in the wrist's frame.
         credit: What each name is worth to each point (C, K) beyond the fit, for the IDs' sake.
         variance: Of each marker (M,) around its place [m^2].
         worth: What naming a point is worth that lies where its marker is expected (M,).
         posed: Angles (20,) [rad] of the whole hand: skin between two fingers moves with both.
         coming: Angles (4,) [rad] that the hinges were coming to.
         trust: How surely (4, 4) [1/rad^2].
-        best: Point of each marker (K,), -1 for none; overwritten.
-        hinges: Angles (4,) of the best naming; overwritten.
-
-    Returns:
-        The score of the best naming, and by how much it is better than the best that gives any point or
-        marker of it another part.
+        namings: What is filled.
     """
     count, choices = len(markers), len(points) + 1
     work = workspace(len(hand.digits))
     place_markers(hand, posed, work)
     naming, angles = np.full(count, -1), np.empty(4)
-    first, second = -_OVER, -_OVER
     total = 1
     for _ in range(count):
         total *= choices
     for number in range(total):
-        rest = number
+        rest, chosen = number, 0
         for place in range(count):
             naming[place] = rest % choices - 1
             rest //= choices
+            if naming[place] >= 0:
+                chosen |= 1 << naming[place]
         most = _most(ranges, markers, points, credit, worth, naming)
-        if most <= second:
+        if most <= namings.runners_up[chosen] or most <= -NEVER:
             continue
-        score = -_OVER
+        score = -NEVER
         for start in range(2):
-            angles[:] = coming if start == 0 else hinges
-            if start == 1 and first == -_OVER:
-                break
-            misfit, open_ = _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
-            reached = most - misfit - open_
-            if reached > score:
-                score = reached
-                if score > first:
-                    kept = angles.copy()
-        if score > first:
-            first, second = score, first
-            best[:] = naming
-            hinges[:] = kept
-        elif score > second:
-            second = score
-    return first, first - second
+            angles[:] = coming if start == 0 else posed[4 * digit : 4 * digit + 4]
+            misfit, gap = _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
+            score = max(score, most - misfit - gap)
+        if score > namings.scores[chosen]:
+            namings.runners_up[chosen], namings.scores[chosen] = namings.scores[chosen], score
+            namings.names[chosen] = naming
+        elif score > namings.runners_up[chosen]:
+            namings.runners_up[chosen] = score
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -143,14 +150,14 @@ def _most(ranges: Any, markers: Any, points: Any, credit: Any, worth: Any, namin
             if naming[other] < 0:
                 continue
             if naming[other] == point:
-                return -_OVER
+                return -NEVER
             apart = 0.0
             for i in range(3):
                 apart += (points[point, i] - points[naming[other], i]) ** 2
             apart = np.sqrt(apart)
             one, two = markers[place], markers[other]
             if apart < ranges.nearest[one, two] or apart > ranges.farthest[one, two]:
-                return -_OVER
+                return -NEVER
     return total
 
 

@@ -15,7 +15,8 @@ import numpy as np
 from handsim.topology import NUM_QPOS
 from track.finding import MOST_RMS, HandFinder
 from track.hand_memory import Estimate, HandMemory
-from track.naming import fit_names, forget_surprises, name_new, targets_of
+from track.naming import fit_names, forget_surprises, targets_of
+from track.new_names import Following, name_new
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.user import UserHand
 from train.labeling import Labeler
@@ -57,13 +58,11 @@ class Tracker:
         names, credit = self._carry_over(ids)
         born = self._births(ids, time)
         sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
-        hands: list[TrackedHand] = []
-        for number, memory in enumerate(self._memories):
-            mine = names[number]
-            fit = None
-            if memory.qpos is not None:
-                fit = self._follow(number, points, names, credit, sure, born, time)
-            hands.append(self._judge(memory, points, mine, credit, fit, time))
+        following = self._follow(points, names, credit, sure, born, time)
+        hands = [
+            self._judge(memory, points, names[number], credit, following.get(number), time)
+            for number, memory in enumerate(self._memories)
+        ]
         self._find_lost(points, names, hands, time)
         labels = np.where(names >= 0, names + self._first[:-1, None], -1).max(axis=0, initial=-1)
         self._labels = {
@@ -88,28 +87,35 @@ class Tracker:
 
     def _follow(
         self,
-        number: int,
         points: NDArray[np.float64],
         names: NDArray[np.int64],
         credit: NDArray[np.float64],
         sure: NDArray[np.float64],
         born: NDArray[np.float64],
         time: float,
-    ) -> Estimate | None:
-        """The pose of a hand that was there before; its names (a row of H, N) and credits are overwritten."""
-        memory, mine = self._memories[number], names[number]
-        coming = memory.predict(time)
-        forget_surprises(memory, points, mine, coming)
-        fit = fit_names(memory, points, mine, coming)
-        if fit is None:
-            return None
-        free = np.logical_not((names >= 0).any(axis=0))
-        how_sure = name_new(memory, points, mine, free, credit, born, fit, coming)
+    ) -> dict[int, Estimate]:
+        """Poses of the hands that were there before; names (H, N) and credits are overwritten."""
+        hands = []
+        for number, memory in enumerate(self._memories):
+            if memory.qpos is None:
+                continue
+            coming = memory.predict(time)
+            forget_surprises(memory, points, names[number], coming)
+            estimate = fit_names(memory, points, names[number], coming)
+            if estimate is not None:
+                hands.append(Following(number, memory, coming, estimate))
+        before = names.copy()
+        how_sure = name_new(hands, points, names, credit, born)
         changed = np.isfinite(how_sure)
-        if changed.any():
-            credit[changed], sure[changed] = 0.0, how_sure[changed]
-            fit = fit_names(memory, points, mine, coming)
-        return fit
+        credit[changed], sure[changed] = 0.0, how_sure[changed]
+        fitted = {}
+        for hand in hands:
+            mine, estimate = names[hand.number], hand.estimate
+            if (mine != before[hand.number]).any():
+                estimate = fit_names(hand.memory, points, mine, hand.coming)
+            if estimate is not None:
+                fitted[hand.number] = estimate
+        return fitted
 
     def _judge(
         self,
