@@ -129,7 +129,7 @@ def skin_gaps(model: HandModel, qpos: np.ndarray, finger: str) -> np.ndarray:
     bones = model.forward_kinematics(join_qpos(qpos[:, 7:]))
     contacts = place_contacts(model, [(frame, finger) for frame in range(len(qpos))], bones)
     faces = np.concatenate([contacts.thumb_places.faces, contacts.finger_places.faces])
-    return meet(contacts, SkinPatch(faces).corners(model.shape), model, bones).gaps
+    return meet(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
 
 
 def tell(name: str, hand: UserHand, true: UserHand, held_out: Take) -> list[float]:

@@ -38,6 +38,7 @@ from track.skin_walk import (
     SkinPlaces,
     place_points,
     place_weights,
+    skin_of,
     slide,
     weight_slopes,
 )
@@ -139,7 +140,7 @@ class Problem:
         placed = np.einsum("ml,tmli->tmi", weights, carried, optimize=True)
         misses = np.where(self.there[..., None], placed - self.targets, 0.0)
         faces, count = self._faces(guess), len(guess.points)
-        corners = SkinPatch(faces).corners(model.shape)
+        corners = SkinPatch(faces).corners(model.surface.vertices)
         _, normals = place_points(guess.places, _part(corners, 0, count))
         design, _ = place_points(self.design, _part(corners, count, 2 * count))
         meeting = None
@@ -188,9 +189,9 @@ class Problem:
     def equations(self, guess: Guess, fit: Fit) -> Equations:
         """Gauss-Newton's equations, unknowns shared by all frames in the order parameters, markers."""
         count = len(guess.points)
-        skin = build_surface(fit.model.shape).vertices
+        skin = fit.model.surface.vertices
         patch = SkinPatch(self._faces(guess))
-        corners, rest = patch.corners_on(skin), self._rest_slopes(guess, patch, skin)
+        corners, rest = patch.corners(skin), self._rest_slopes(guess, patch, skin)
         raw = slopes_of(self.shape, guess.parameters, skeleton_numbers)
         by_pose, by_shared = self._marker_slopes(guess, fit, _part(corners, 0, count), rest[:count], raw)
         squares = (fit.misses**2).sum(axis=2)
@@ -219,11 +220,11 @@ class Problem:
             self._grown = slopes_of(self.shape, guess.parameters, lambda shape: build_surface(shape).vertices)
             self._grown_at = guess.parameters
         places = self._all_places(guess)
-        here, _ = place_points(places, patch.corners_on(skin))
+        here, _ = place_points(places, patch.corners(skin))
         columns = []
         for number in range(NUM_PARAMETERS):
             grown = skin + _STEP * self._grown[..., number]
-            columns.append((place_points(places, patch.corners_on(grown))[0] - here) / _STEP)
+            columns.append((place_points(places, patch.corners(grown))[0] - here) / _STEP)
         return np.stack(columns, axis=-1)
 
     def _all_places(self, guess: Guess) -> SkinPlaces:
@@ -284,7 +285,7 @@ class Problem:
         count = len(contacts.frames)
         places = self._all_places(guess)
         pads = SkinPlaces(*(values[len(values) - 2 * count :] for values in places))
-        points, _ = place_points(pads, SkinPatch(pads.faces).corners(fit.model.shape))
+        points, _ = place_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
         weights = place_weights(pads)
         say = trust(meeting, contacts.fingers) / CONTACT_SPREAD**2
         everywhere = np.tile(np.arange(NUM_BONES), (2, 1))
@@ -310,10 +311,11 @@ class Problem:
         """The guess after a step, its markers found again on the new hand's skin."""
         parameters = guess.parameters + shared_step[:NUM_PARAMETERS]
         shape = shape_at(self.shape, parameters)
-        carried, _ = place_points(guess.places, SkinPatch(guess.places.faces).corners(shape))
+        skin = skin_of(shape)
+        carried, _ = place_points(guess.places, skin.corners(guess.places.faces))
         points = carried + shared_step[NUM_PARAMETERS:].reshape(-1, 3)
         qpos = move(guess.qpos, np.clip(pose_step, -0.5, 0.5))
-        places = slide(guess.places, points, shape)
+        places = slide(guess.places, points, skin)
         return dataclasses.replace(guess, parameters=parameters, points=points, places=places, qpos=qpos)
 
 

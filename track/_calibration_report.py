@@ -59,8 +59,9 @@ def standard_errors(
     bones, patch = weights.argmax(axis=1), SkinPatch(guess.places.faces)
 
     def on_bones(shape: HandShape) -> NDArray[np.float64]:
-        rest = HandModel(shape).rest_transforms[bones]
-        points = place_points(guess.places, patch.corners(shape))[0]
+        model = HandModel(shape)
+        rest = model.rest_transforms[bones]
+        points = place_points(guess.places, patch.corners(model.surface.vertices))[0]
         local: NDArray[np.float64] = np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3])
         return local
 
@@ -84,7 +85,7 @@ def gaps_on(
     bones = model.forward_kinematics(qpos)
     contacts = place_contacts(model, touches, bones)
     faces = np.concatenate([contacts.thumb_places.faces, contacts.finger_places.faces])
-    return meet(contacts, SkinPatch(faces).corners(model.shape), model, bones).gaps
+    return meet(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
 
 
 def still_joints(

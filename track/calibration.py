@@ -278,7 +278,9 @@ def _touches(
     say = trust(fit.meeting, guess.contacts.fingers)
     sides: list[NDArray[np.float64]] = []
     for places in (guess.contacts.thumb_places, guess.contacts.finger_places):
-        sides.append(place_points(places, SkinPatch(places.faces).corners(fit.model.shape))[0] @ mirror)
+        sides.append(
+            place_points(places, SkinPatch(places.faces).corners(fit.model.surface.vertices))[0] @ mirror
+        )
     points, after = np.stack(sides, axis=1), fit.meeting.gaps
     return tuple(
         Touch(int(frames[frame]), finger, float(before[k]), float(after[k]), float(say[k]), points[k])

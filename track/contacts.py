@@ -12,10 +12,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from handsim.model import HandModel
-from handsim.shape import HandShape
 from handsim.topology import DIGITS, bones_of
 from poses.touch import FINGERS, thumb_contact
-from track.skin_walk import Corners, SkinPatch, SkinPlaces, nearest_places, place_points, place_weights, slide
+from track.skin_walk import (
+    Corners,
+    Skin,
+    SkinPlaces,
+    nearest_places,
+    place_points,
+    place_weights,
+    skin_of,
+    slide,
+)
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -157,15 +165,15 @@ def slide_contacts(
     Each goes to the place of its skin that is nearest to a point inside the other pad, not on it, so that the
     pair is found as well where skins press into each other.
     """
-    shape = model.shape
+    skin = skin_of(model.shape)
     sides = [contacts.thumb_places, contacts.finger_places]
     for _ in range(_SLIDES):
         for own, other in ((0, 1), (1, 0)):
             inner = sides[other]._replace(heights=np.full(len(contacts.frames), -_DEPTH))
-            target = _posed(inner, shape, model, T_world_bone)
+            target = _posed(inner, skin, model, T_world_bone)
             blend = _blends(sides[own], model, T_world_bone)
             rest = np.linalg.solve(blend[:, :, :3], (target - blend[:, :, 3])[..., None])[..., 0]
-            slid = slide(sides[own], rest, shape)
+            slid = slide(sides[own], rest, skin)
             sides[own] = slid._replace(heights=np.zeros(len(contacts.frames)))
     return contacts._replace(thumb_places=sides[0], finger_places=sides[1])
 
@@ -223,9 +231,9 @@ def trust(meeting: Meeting, fingers: Int[np.ndarray, "K"]) -> Float[np.ndarray, 
 
 
 def _posed(
-    places: SkinPlaces, shape: HandShape, model: HandModel, T_world_bone: NDArray[np.float64]
+    places: SkinPlaces, skin: Skin, model: HandModel, T_world_bone: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    rest, _ = place_points(places, SkinPatch(places.faces).corners(shape))
+    rest, _ = place_points(places, skin.corners(places.faces))
     blend = _blends(places, model, T_world_bone)
     posed: NDArray[np.float64] = np.einsum("kij,kj->ki", blend[:, :, :3], rest) + blend[:, :, 3]
     return posed

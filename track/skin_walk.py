@@ -60,6 +60,18 @@ class Corners(NamedTuple):
     normals: Float[np.ndarray, "P 3 3"]
 
 
+class Skin(NamedTuple):
+    """One hand's skin, subdivided, in the wrist's frame."""
+
+    points: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+
+    def corners(self, faces: Int[np.ndarray, "P"]) -> Corners:
+        """Corners of some triangles of `skin_mesh`."""
+        vertices = skin_mesh().faces[faces]
+        return Corners(self.points[vertices], self.normals[vertices])
+
+
 @cache
 def skin_mesh() -> SkinMesh:
     """Triangles and weights of the skin, subdivided once."""
@@ -109,14 +121,17 @@ class SkinPatch:
         self._faces = local.reshape(-1, 3)
         self._corners = np.searchsorted(vertices, mesh.faces[faces])
 
-    def corners(self, shape: HandShape) -> Corners:
-        """Corners of the triangles on a hand of this shape, in the wrist's frame [m]."""
-        return self.corners_on(build_surface(shape).vertices)
-
-    def corners_on(self, vertices: Float[np.ndarray, "C 3"]) -> Corners:
-        """The same for a skin whose coarse vertices are known [m]."""
+    def corners(self, vertices: Float[np.ndarray, "C 3"]) -> Corners:
+        """Corners of the triangles on a hand whose surface has these vertices [m]."""
         points = self._rows @ vertices
         return Corners(points[self._corners], vertex_normals(points, self._faces)[self._corners])
+
+
+def skin_of(shape: HandShape) -> Skin:
+    """The skin of a hand of this shape [m]."""
+    mesh = skin_mesh()
+    points = mesh.subdivide @ build_surface(shape).vertices
+    return Skin(points, vertex_normals(points, mesh.faces))
 
 
 def place_points(
@@ -140,7 +155,7 @@ def place_weights(places: SkinPlaces) -> Float[np.ndarray, "P 16"]:
 
 def wear_at(layout: MarkerLayout, places: SkinPlaces, shape: HandShape) -> Attachment:
     """A glove whose markers sit at these places of a right hand, each carried by its four strongest bones."""
-    points, normals = place_points(places, SkinPatch(places.faces).corners(shape))
+    points, normals = place_points(places, skin_of(shape).corners(places.faces))
     weights = place_weights(places)
     bones = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     shares = np.clip(np.take_along_axis(weights, bones, axis=1), 0.0, None)
@@ -162,7 +177,7 @@ def slip(
     ways = rng.normal(size=worn.points.shape)
     ways -= (ways * worn.normals).sum(axis=1, keepdims=True) * worn.normals
     ways *= distance / np.linalg.norm(ways, axis=1, keepdims=True)
-    places = slide(nearest_places(worn.points, shape), worn.points + ways, shape)
+    places = slide(nearest_places(worn.points, shape), worn.points + ways, skin_of(shape))
     heights = worn.layout.radius + rng.normal(scale=lift, size=len(ways))
     return wear_at(worn.layout, places._replace(heights=heights), shape)
 
@@ -189,7 +204,7 @@ def _frames(places: SkinPlaces, corners: Corners) -> NDArray[np.float64]:
     return np.stack([*columns, normal], axis=-1)
 
 
-def slide(places: SkinPlaces, targets: Float[np.ndarray, "P 3"], shape: HandShape) -> SkinPlaces:
+def slide(places: SkinPlaces, targets: Float[np.ndarray, "P 3"], skin: Skin) -> SkinPlaces:
     """The places above which points lie, walking from triangle to neighbour.
 
     A point far outside gets the place nearest to it, its distance being the height; where the skin folds and
@@ -198,18 +213,14 @@ def slide(places: SkinPlaces, targets: Float[np.ndarray, "P 3"], shape: HandShap
     Args:
         places: Where to begin.
         targets: The points, in the wrist's frame [m].
-        shape: Whose skin.
+        skin: A hand's.
     """
-    skin = build_surface(shape)
     mesh = skin_mesh()
-    vertices = mesh.subdivide @ skin.vertices
-    normals = vertex_normals(vertices, mesh.faces)
     faces, bary, heights = (values.copy() for values in places)
     busy = np.arange(len(faces))
     for _ in range(_MOST_STEPS):
-        corner = mesh.faces[faces[busy]]
         here = SkinPlaces(faces[busy], bary[busy], heights[busy])
-        corners = Corners(vertices[corner], normals[corner])
+        corners = skin.corners(here.faces)
         miss = targets[busy] - place_points(here, corners)[0]
         step = np.linalg.solve(_frames(here, corners), miss[..., None])[..., 0]
         moved = here.bary + np.column_stack([-step[:, 0] - step[:, 1], step[:, :2]])
@@ -250,9 +261,8 @@ def _cross(
 
 def nearest_places(points: Float[np.ndarray, "P 3"], shape: HandShape) -> SkinPlaces:
     """The places on the skin above which points lie, looked for over the whole hand."""
-    mesh = skin_mesh()
-    vertices = mesh.subdivide @ build_surface(shape).vertices
-    middles = vertices[mesh.faces].mean(axis=1)
+    skin = skin_of(shape)
+    middles = skin.points[skin_mesh().faces].mean(axis=1)
     faces = np.array([((middles - point) ** 2).sum(axis=1).argmin() for point in points], dtype=np.int64)
     start = SkinPlaces(faces, np.full((len(faces), 3), 1 / 3), np.zeros(len(faces)))
-    return slide(start, points, shape)
+    return slide(start, points, skin)

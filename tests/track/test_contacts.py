@@ -36,7 +36,7 @@ def meeting_of(model, touches, angles):
     bones = model.forward_kinematics(join_qpos(angles[[frame for frame, _ in touches]]))
     contacts = place_contacts(model, touches, bones)
     faces = np.concatenate([contacts.thumb_places.faces, contacts.finger_places.faces])
-    return contacts, meet(contacts, SkinPatch(faces).corners(model.shape), model, bones)
+    return contacts, meet(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones)
 
 
 def test_every_touch_is_found_once(model):

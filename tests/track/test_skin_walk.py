@@ -14,6 +14,7 @@ from track.skin_walk import (
     place_points,
     place_weights,
     skin_mesh,
+    skin_of,
     slide,
     slip,
     wear_at,
@@ -22,7 +23,7 @@ from track.skin_walk import (
 
 
 def points_of(places, shape):
-    return place_points(places, SkinPatch(places.faces).corners(shape))
+    return place_points(places, SkinPatch(places.faces).corners(HandModel(shape).surface.vertices))
 
 
 def dense_weights(worn):
@@ -56,7 +57,7 @@ def test_slides_end_under_their_points(rng):
     shape = sample_shape(rng=rng)
     worn = attach(load_layout("dense19"), HandModel(shape))
     moved = slip(worn, shape, 0.005, rng=rng)
-    places = slide(nearest_places(worn.points, shape), moved.points, shape)
+    places = slide(nearest_places(worn.points, shape), moved.points, skin_of(shape))
     np.testing.assert_allclose(points_of(places, shape)[0], moved.points, atol=1e-9)
     np.testing.assert_allclose(places.heights, worn.layout.radius, atol=1e-9)
     distance = np.linalg.norm(moved.points - worn.points, axis=1)
@@ -74,8 +75,8 @@ def test_places_go_with_the_skin():
 def test_weights_change_as_their_slopes_say(rng):
     shape = sample_shape(rng=rng)
     places = nearest_places(attach(load_layout("dense19"), HandModel(shape)).points, shape)
-    slopes = weight_slopes(places, SkinPatch(places.faces).corners(shape))
+    slopes = weight_slopes(places, skin_of(shape).corners(places.faces))
     points, step = points_of(places, shape)[0], 1e-7
     for axis in np.eye(3):
-        there = place_weights(slide(places, points + step * axis, shape))
+        there = place_weights(slide(places, points + step * axis, skin_of(shape)))
         np.testing.assert_allclose((there - place_weights(places)) / step, slopes @ axis, atol=0.1)
