@@ -4,32 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from gloves.archives import check_shapes, read_archive, write_archive
 from gloves.layout import MarkerLayout, stored_layout
-from handsim.errors import CaptureError, HandSimError
 from handsim.hand_records import HAND_DTYPE, pack_hand, unpack_hand
-from handsim.io import atomic_write
 from handsim.shape import HandShape
 from handsim.topology import NUM_QPOS
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
+KIND: Final = "take"
 SCHEMA: Final = 1
 SUFFIX: Final = ".truth.npz"
-_DAMAGE: Final = (
-    HandSimError, ValueError, KeyError, TypeError, AttributeError, EOFError, RuntimeError,
-    zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""What reading a damaged file may end in."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +92,6 @@ def save_take(path: Path, take: Take) -> None:
     """Write a take's `.truth.npz`, whole or not at all."""
     body = take.body
     header = {
-        "schema": SCHEMA,
         "units": "metres, radians, world frame",
         "rate": take.rate,
         "layouts": [dataclasses.asdict(hand.layout) for hand in take.hands],
@@ -108,7 +99,6 @@ def save_take(path: Path, take: Take) -> None:
         "settings": take.settings,
     }
     arrays = {
-        "header": np.array(json.dumps(header)),
         "points": take.points,
         "ids": take.ids.astype(np.int32),
         "labels": take.labels.astype(np.int16),
@@ -116,29 +106,16 @@ def save_take(path: Path, take: Take) -> None:
         "qpos": np.stack([hand.qpos for hand in take.hands]),
         "T_world_body": np.zeros((0, 4, 4)) if body is None else body.T_world_body,
     }
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+    write_archive(path, KIND, SCHEMA, header, arrays)
 
 
 def load_take(path: Path) -> Take:
     """Read a `.truth.npz`.
 
     Raises:
-        CaptureError: No such file, not a take, of another schema, or damaged.
+        CaptureError: No such file, of another kind or schema, or damaged.
     """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        header = json.loads(str(arrays["header"]))
-        if header["schema"] != SCHEMA:
-            raise CaptureError(f"{path}: a take of schema {header['schema']}, wanted {SCHEMA}")
-        return _unpack(header, arrays)
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except CaptureError:
-        raise
-    except _DAMAGE as error:
-        raise CaptureError(f"{path}: not a take, or a damaged one") from error
+    return read_archive(path, KIND, SCHEMA, _unpack)
 
 
 def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
@@ -171,8 +148,7 @@ def _check(take: Take) -> None:
     ]
     shapes += [(hand.qpos, (frames, NUM_QPOS)) for hand in take.hands]
     shapes += [] if take.body is None else [(take.body.T_world_body, (frames, 4, 4))]
-    if any(array.shape != shape for array, shape in shapes):
-        raise ValueError("the arrays of a take do not fit together")
+    check_shapes(shapes)
     known = sum(hand.layout.num_markers for hand in take.hands)
     known += 0 if take.body is None else len(take.body.marker_names)
     if not 0.0 < take.rate < np.inf or (take.labels < -1).any() or (take.labels >= known).any():

@@ -27,6 +27,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "export": ("train.commands:export", "Write a trained labeler as an ONNX file, which needs no torch."),
     "evaluate": ("train.commands:evaluate", "Measure a labeler on a labelled capture."),
     "simulate": ("train.take_commands:simulate", "Simulate a capture of two hands, with its truth."),
+    "calibrate": ("track.calibration_command:calibrate", "Fit hands and gloves to a user, from a capture."),
+    "track": ("track.commands:track", "Follow hands through a marker capture or a live stream."),
     "reproduce": ("track.table_commands:REPRODUCE", "Print a table of the paper with our figures beside."),
     "doctor": ("handsim.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gloves.archives import write_archive
 from gloves.captures import Capture, write_capture
 from gloves.layout import load_layout, save_layout
 from handsim.cli import main
@@ -63,6 +64,7 @@ def folder(tmp_path, monkeypatch):
     }
     for name, content in files.items():
         (tmp_path / name).write_text(content)
+    write_archive(tmp_path / "tracked.npz", "tracked take", 1, {}, {})
     save_layout(tmp_path / "copy.toml", load_layout("dense19"))
     return tmp_path
 
@@ -109,6 +111,23 @@ CASES = {
     "a tracking table without frames": ["reproduce", "table7", "--num-frames", "0", "--json", "out.json"],
     "a labeler of another glove in a tracking table": ["reproduce", "table5", "--labeler", "sparse13"],
     "an unknown rig of fewer cameras": ["reproduce", "cameras", "--rig", "figure6", "--json", "out.json"],
+    "nothing to track": ["track", "--out", "out.npz"],
+    "a capture and a stream": ["track", "good.trc", "--live", "natnet://localhost", "--out", "out.npz"],
+    "a time for a capture": ["track", "good.trc", "--seconds", "3", "--out", "out.npz"],
+    "no time for a stream": ["track", "--live", "natnet://localhost", "--seconds", "0", "--out", "out.npz"],
+    "an address that is none": ["track", "--live", "localhost:1510", "--out", "out.npz"],
+    "a tracked take in another kind of file": ["track", "good.trc", "--out", "out.c3d"],
+    "a tracked take in place of the truth": ["track", "good.trc", "--out", "good.truth.npz"],
+    "labels in another kind of file": ["track", "good.trc", "--labelled", "out.csv", "--out", "out.npz"],
+    "a hand twice": ["track", "good.trc", "--hands", "left", "left", "--out", "out.npz"],
+    "an unknown glove to track": ["track", "good.trc", "--glove", "dense91", "--out", "out.npz"],
+    "millimetres said to be metres, to track": ["track", "millimetres.trc", "--out", "out.npz"],
+    "a truncated capture to track": ["track", "truncated.trc", "--out", "out.npz"],
+    "an unknown user": ["track", "good.trc", "--shape", "missing.json", "--out", "out.npz"],
+    "a user's file that is none": ["track", "good.trc", "--shape", "good.trc", "--out", "out.npz"],
+    "a user in another kind of file": ["calibrate", "good.trc", "--out", "user.toml"],
+    "a capture without hands": ["calibrate", "good.trc", "--out", "user.json"],
+    "a tracked take as truth": ["evaluate", "tracked.npz", "--json", "out.json"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }
 
@@ -132,6 +151,8 @@ USAGE = {
     "frames that are no number": ["simulate", "--num-frames", "many", "--out", "out.c3d"],
     "no output": ["simulate", "--kind", "hand-pen"],
     "an unknown table": ["reproduce", "table9"],
+    "an unknown size": ["track", "good.trc", "--size", "XXL", "--out", "out.npz"],
+    "an unknown hand": ["track", "good.trc", "--hands", "middle", "--out", "out.npz"],
 }
 
 

@@ -117,7 +117,7 @@ def _settle(hand: Any, seen: Any, on_part: Any, mean: Any, precision: Any, work:
     if count == 0:
         return False
     matrix, rest = np.empty((count, count)), np.empty(count)
-    away = precision[:NUM_JOINTS, :NUM_JOINTS] @ (qpos[7:] - mean)
+    away = np.ascontiguousarray(precision[:NUM_JOINTS, :NUM_JOINTS]) @ (qpos[7:] - mean)
     for row in range(count):
         one = weak[row]
         rest[row] = -work.gradient[one] - away[one]

@@ -88,7 +88,7 @@ def name_new(
             if other is not one and len(young):
                 places = other.hand.estimate.places[other.missing]
                 contested[young[_near(points[young], places, _REACH_MISSING)]] = True
-    free: NDArray[np.bool_] = (names < 0).all(axis=0)
+    free = np.asarray((names < 0).all(axis=0), dtype=bool)
     searches = [
         search
         for one in digits

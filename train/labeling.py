@@ -66,7 +66,7 @@ def label_in_batches(
         ShapeError: A frame is not (N, 3), not finite, not in metres, or holds more than 512 points.
     """
     clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
-    _check_unit(clouds)
+    check_unit(clouds)
     order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
     results = [Labelling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
     for first in range(0, len(order), _BATCH):
@@ -117,8 +117,12 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
     return cloud
 
 
-def _check_unit(clouds: list[NDArray[np.float64]]) -> None:
-    """Millimetres are told, not guessed at; the median, because strays of a real system lie anywhere."""
+def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> None:
+    """Millimetres are told, not guessed at; the median, because strays of a real system lie anywhere.
+
+    Raises:
+        ShapeError: Most frames span more than a room does.
+    """
     spans = [
         float((cloud.max(axis=0) - cloud.min(axis=0)).max()) for cloud in clouds if len(cloud) >= _ENOUGH
     ]

@@ -30,7 +30,7 @@ def costs(model, glove, target, centre, pull, tightness):
         return np.concatenate(
             [
                 (miss / np.sqrt(1.0 + tightness * square)).ravel(),
-                np.sqrt(pull) * (angles - centre),
+                np.sqrt(pull[:20]) * (angles - centre[7:]),
                 beyond / np.deg2rad(2.0),
             ]
         )
@@ -49,7 +49,8 @@ def test_the_minimum_is_the_one_that_scipy_finds(tightness, rng):
     markers += rng.normal(scale=0.0005, size=markers.shape)
     markers[:, rng.choice(19, size=3, replace=False)] = np.nan
     for target, near in zip(markers, move(truth, 0.005 * rng.standard_normal((4, 26))), strict=True):
-        centre, pull = rng.normal(0.3, 0.2, size=20), rng.uniform(0.1, 30.0, size=20)
+        centre = np.concatenate([near[:7], rng.normal(0.3, 0.2, size=20)])
+        pull = np.concatenate([rng.uniform(0.1, 30.0, size=20), np.zeros(6)])
         pose = near.copy()
         cost, _ = descend(hand, target, pose, centre, pull, tightness, 50, work)
         residuals = costs(model, glove, target, centre, pull, tightness)
@@ -72,9 +73,9 @@ def test_no_steps_leave_the_pose_alone(rng):
     model = HandModel.named("M")
     glove = attach(load_layout("dense19"), model)
     pose = join_qpos(sample_valid_angles(model, 1, rng=rng))[0]
-    before, zeros = pose.copy(), np.zeros(20)
+    before, pull = pose.copy(), np.zeros(26)
     hand, work = gloved_hand(model, glove), workspace(19)
-    _, steps = descend(hand, glove.points, pose, zeros, zeros, 0.0, 0, work)
+    _, steps = descend(hand, glove.points, pose, pose.copy(), pull, 0.0, 0, work)
     assert steps == 0
     np.testing.assert_array_equal(pose, before)
 

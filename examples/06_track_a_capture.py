@@ -1,0 +1,54 @@
+"""Follow two hands through a capture of unlabelled points, and compare their motion with the truth.
+
+    python examples/06_track_a_capture.py
+
+Once with the hands and gloves as they are, and once with hands of size M in gloves put on as designed, which
+is what a tracker knows of a user who has not been calibrated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gloves.attach import attach
+from gloves.captures import Capture
+from gloves.layout import load_layout
+from gloves.take import Take
+from gloves.tracked_take import TrackedTake
+from handsim.model import HandModel
+from track.capture_tracking import track
+from track.tracker import Tracker
+from track.user import UserHand, usual_hand
+from train.labeler import load_labeler
+from train.twins import TwinConfig, simulate_twin
+
+
+def joints(hand: HandModel, qpos: np.ndarray) -> np.ndarray:
+    """Where the bones begin [m], (T, 16, 3)."""
+    return hand.forward_kinematics(qpos)[..., :3, 3]
+
+
+def tell(name: str, take: TrackedTake, truth: Take) -> None:
+    for number, true in enumerate(truth.hands):
+        motion = take.motion(true.shape.side)  # whole, also where the hand was lost for a while
+        ours = joints(HandModel(take.hands[number].shape), motion.qpos)
+        off = np.linalg.norm(ours - joints(HandModel(true.shape), true.qpos), axis=-1)
+        filled = 100 * take.filled[:, number].mean()
+        print(f"{name}, {true.shape.side}: joints {1e3 * off.mean():.2f} mm off, {filled:.1f} % filled in")
+
+
+def main() -> None:
+    truth = simulate_twin(TwinConfig(kind="hand-controller", num_frames=240))  # 2 s at 120 Hz
+    columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
+    capture = Capture(columns, truth.points, truth.rate)  # no names, many gaps, some ghosts
+    labeler = load_labeler("dense19")
+    models = [HandModel(hand.shape) for hand in truth.hands]
+    worn = [attach(hand.layout, model) for hand, model in zip(truth.hands, models, strict=True)]
+    known = [UserHand(*hand) for hand in zip(models, worn, strict=True)]
+    usual = [usual_hand(load_layout("dense19"), "M", hand.shape.side) for hand in truth.hands]
+    for name, hands in (("known hands", known), ("hands of size M", usual)):
+        tell(name, track(capture, Tracker(hands, labeler), hands), truth)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,188 @@
+"""Captures and streams led through the real tracker, against the truth of a simulated capture."""
+
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from gloves.attach import attach
+from gloves.captures import Capture, read_capture, write_capture
+from gloves.take import Take
+from gloves.tracked_take import LOST, STATUSES, TRACKED, TrackedTake, load_tracked_take, save_tracked_take
+from handsim.errors import CaptureError, ShapeError
+from handsim.model import HandModel
+from handsim.objects import named_object
+from track.capture_tracking import TakeRecorder, capture_frames, follow, track
+from track.natnet_server import ReplayServer
+from track.rigid_body import RigidTemplate
+from track.streaming import StreamedFrame, open_stream
+from track.tracked_frame import Status
+from track.tracker import Tracker
+from track.user import UserHand
+from train.labeler import load_labeler
+from train.twins import TwinConfig, simulate_twin
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module")
+def labeler():
+    return load_labeler("dense19")
+
+
+@pytest.fixture(scope="module")
+def truth() -> Take:
+    return simulate_twin(TwinConfig(kind="hand-controller", num_frames=FRAMES))
+
+
+@pytest.fixture(scope="module")
+def user(truth) -> list[UserHand]:
+    models = [HandModel(hand.shape) for hand in truth.hands]
+    return [UserHand(m, attach(hand.layout, m)) for m, hand in zip(models, truth.hands, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def capture(truth) -> Capture:
+    return Capture(tuple(f"*{n}" for n in range(truth.points.shape[1])), truth.points, truth.rate)
+
+
+@pytest.fixture(scope="module")
+def tracked(capture, user, labeler) -> TrackedTake:
+    return track(capture, Tracker(user, labeler), user)
+
+
+def mostly_right(take: TrackedTake, labels: np.ndarray, last: int) -> bool:
+    """Whether nearly all points of the hands have their true labels; others are nobody's."""
+    true = np.where(labels < last, labels, -1)
+    return np.mean(take.labels == true) > 0.99
+
+
+def test_a_capture_is_tracked_as_its_truth_says(tracked, truth, user, tmp_path):
+    assert tracked.sides == tuple(hand.shape.side for hand in truth.hands)
+    assert (tracked.num_frames, tracked.rate) == (FRAMES, truth.rate)
+    np.testing.assert_array_equal(tracked.points, truth.points)
+    np.testing.assert_array_equal(tracked.ids < 0, np.isnan(truth.points[..., 0]))
+    assert mostly_right(tracked, truth.labels, truth.hand_labels[-1].stop)
+    assert (tracked.status[1:] == TRACKED).all() and (tracked.status[0] == STATUSES.index("found")).all()
+    assert np.nanmedian(tracked.rms) < 0.0005
+    for hand, true in enumerate(truth.hands):
+        assert np.linalg.norm(tracked.qpos[:, hand, :3] - true.qpos[:, :3], axis=1).mean() < 0.0005
+        seen, labels = tracked.observed(true.shape.side), truth.hand_labels[hand]
+        there = np.isfinite(seen[..., 0])
+        wanted = truth.observed(labels)
+        assert np.mean(there == np.isfinite(wanted[..., 0])) > 0.99
+        assert np.nanmax(np.abs(seen - wanted)[there & np.isfinite(wanted[..., 0])]) < 1e-9
+        assert tracked.hands[hand].attachment is user[hand].attachment
+    path = tmp_path / "take.npz"
+    save_tracked_take(path, tracked)
+    again = load_tracked_take(path)
+    np.testing.assert_array_equal(again.markers, tracked.markers)
+    assert again.labels.dtype == tracked.labels.dtype and again.ids.dtype == tracked.ids.dtype
+
+
+@pytest.mark.parametrize("suffix", [".c3d", ".trc"])
+def test_file_formats_change_nothing(suffix, tracked, capture, user, labeler, tmp_path):
+    path = tmp_path / f"take{suffix}"
+    write_capture(path, capture)
+    again = track(read_capture(path), Tracker(user, labeler), user)
+    np.testing.assert_array_equal(again.labels, tracked.labels)
+    np.testing.assert_allclose(again.qpos, tracked.qpos, atol=1e-4)
+
+
+def test_a_column_is_an_id_until_its_point_is_lost(capture):
+    positions = np.full((5, 2, 3), np.nan)
+    positions[[0, 1, 3, 4], 0], positions[1:, 1] = 0.0, 1.0
+    frames = list(capture_frames(Capture(("a", "b"), positions, 100.0)))
+    assert [frame.ids.tolist() for frame in frames] == [[0], [0, 1], [1], [2, 1], [2, 1]]
+    assert [len(frame.points) for frame in frames] == [1, 2, 1, 2, 2]
+    np.testing.assert_allclose([frame.time for frame in frames], 0.01 * np.arange(5))
+
+
+def test_progress_is_told_frame_by_frame(capture, user, labeler):
+    short = Capture(capture.names, capture.positions[:5], capture.rate)
+    told = []
+    track(short, Tracker(user, labeler), user, progress=lambda *done: told.append(done))
+    assert told == [(n, 5) for n in range(1, 6)]
+
+
+def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler, rng):
+    positions = np.full((4, 3, 3), np.nan)
+    positions[2] = rng.normal(size=(3, 3))
+    take = track(Capture(("a", "b", "c"), positions, 120.0), Tracker(user, labeler), user)
+    assert (take.status == LOST).all() and (take.labels == -1).all()
+    assert np.isnan(take.qpos).all() and np.isnan(take.markers).all()
+    nothing = track(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), Tracker(user, labeler), user)
+    assert nothing.num_frames == 2
+
+
+def test_millimetres_are_told(capture, user, labeler):
+    large = Capture(capture.names, 1e3 * capture.positions, capture.rate)
+    with pytest.raises(ShapeError, match="millimetres"):
+        track(large, Tracker(user, labeler), user)
+
+
+def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
+    recorder, tracker = TakeRecorder(user), Tracker(user, labeler)
+    with ReplayServer.of_take(truth) as server, open_stream(server.url, silence=0.4) as stream:
+        for frame, one in follow(stream, tracker):
+            recorder.add(frame, one)
+            if frame.silent:
+                break
+    assert [hand.status for hand in one.hands] == [Status.LOST] * 2, "nothing came for too long to go on"
+    take = recorder.take()
+    assert take.num_frames == FRAMES, "a silence is no frame"
+    assert take.rate == pytest.approx(truth.rate, rel=1e-3)
+    assert take.points.shape[1] == np.isfinite(truth.points[..., 0]).sum(axis=1).max()
+    for frame in range(FRAMES):
+        ours, theirs = take.labels[frame], tracked.labels[frame]
+        assert sorted(ours[ours >= 0]) == sorted(theirs[theirs >= 0])
+    np.testing.assert_allclose(take.qpos, tracked.qpos, atol=1e-3)
+    there = np.isfinite(take.points[..., 0])
+    assert (take.ids[there] >= 0).all() and (take.ids[~there] == -1).all()
+
+
+class Echo:
+    """Says nothing but the time that it was told."""
+
+    def step(self, points, ids, time):
+        return time
+
+
+def test_time_goes_on_when_a_recording_begins_anew():
+    def frame(time: float) -> StreamedFrame:
+        return StreamedFrame(0, time, np.zeros((0, 3)), np.zeros(0, dtype=int))
+
+    frames = map(frame, [5.0, 5.1, 5.2, 0.1, 0.2, 0.1])
+    times = [told for _, told in follow(frames, Echo())]
+    np.testing.assert_allclose(times, [5.0, 5.1, 5.2, 5.21, 5.31, 5.32])
+
+
+def test_too_few_frames_have_no_rate(user, capture, labeler):
+    recorder = TakeRecorder(user)
+    with pytest.raises(CaptureError, match="0 frames came, wanted two or more"):
+        recorder.take()
+    for frame, one in itertools.islice(follow(capture_frames(capture), Tracker(user, labeler)), 2):
+        recorder.add(frame, one)
+        if recorder.num_frames == 1:
+            with pytest.raises(CaptureError, match="1 frames came"):
+                recorder.take()
+    assert recorder.take().rate == pytest.approx(capture.rate)
+
+
+def test_bodies_are_kept_beside_the_hands(user, labeler, capture):
+    thing = RigidTemplate.of(named_object("controller"))
+    recorder = TakeRecorder(user, (thing,))
+    lost = SimpleNamespace(status=Status.LOST, translation=np.full(3, np.nan), rotation=np.full(4, np.nan))
+    here = SimpleNamespace(status=Status.TRACKED, translation=np.arange(3.0), rotation=np.eye(4)[0])
+    lost.rms, here.rms = np.nan, 0.0001
+    for body, (frame, one) in zip((lost, here), follow(capture_frames(capture), Tracker(user, labeler))):  # noqa: B905
+        said = SimpleNamespace(hands=one.hands, labels=one.labels, confidence=one.confidence, bodies=(body,))
+        recorder.add(frame, said)
+    take = recorder.take()
+    np.testing.assert_array_equal(take.body_poses[1, 0], [0, 1, 2, 1, 0, 0, 0])
+    assert np.isnan(take.body_poses[0]).all()
+    assert take.body_status.tolist() == [[LOST], [TRACKED]] and take.body_rms[1, 0] == 0.0001
+    assert take.label_names[-1] == f"{thing.name}:{thing.marker_names[-1]}"
