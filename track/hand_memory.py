@@ -23,9 +23,11 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from numpy.typing import NDArray
 
-_FIRST_SPREAD: Final = 0.003  # [m] of a marker around where a hand not yet known has it
+_FIRST_SHARE, _FIRST_SPREAD = 1.2, (0.0015, 0.006)
+"""Spread of a marker around where a hand just found has it: share of the fit's RMS; least and most [m]."""
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
 _UNEVEN: Final = 0.3  # of the hand's usual miss: so much it changes as the hand moves
+_DOUBT: Final = 0.5  # [s] unseen after which a marker may miss its place by the hand's usual miss again
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
 _WRIST: Final = ((0.001, 10.0), (np.deg2rad(1.5), 100.0))
@@ -91,7 +93,10 @@ class HandMemory:
         self.digits = np.array([BONES[bone].digit for bone in bones])
         self._speed = np.zeros(6 + NUM_JOINTS)
         self._habit = np.zeros((count, 3))
-        self.variance = np.full(count, _FIRST_SPREAD**2)
+        self._variance = np.full(count, _FIRST_SPREAD[1] ** 2)
+        self._usual_miss = 0.0
+        self.variance = self._variance.copy()
+        """Of each marker around its place [m^2], as `predict` last had it."""
         self._learned = np.zeros(count)
         self._seen = np.zeros(count)
         self.adapted = self.solver.hand
@@ -107,6 +112,8 @@ class HandMemory:
         """
         assert self.qpos is not None
         span = time - self.time
+        doubt = self._usual_miss * np.minimum((time - self._seen) / _DOUBT, 1.0)
+        self.variance = self._variance + doubt**2
         moved: NDArray[np.float64] = move(self.qpos[None], min(span, _LONGEST_GLIDE) * self._speed[None])[0]
         shift, turn = (at_once + 0.5 * gain * span**2 for at_once, gain in _WRIST)
         return Coming(moved, foresee(moved[7:], self._hinges, span), (shift, turn))
@@ -149,6 +156,9 @@ class HandMemory:
         nothing = Coming(qpos, foresee(qpos[7:], resting_covariance(), 0.0), (1.0, 1.0))
         estimate = self.fit(targets, qpos, nothing)
         self._take(estimate, time)
+        self._habit[:], self._learned[:] = 0.0, 0.0
+        self._variance[:] = np.clip(_FIRST_SHARE * estimate.rms, *_FIRST_SPREAD) ** 2
+        self._adapt()
         return estimate
 
     def carry_on(self, estimate: Estimate, firm: Bool[np.ndarray, "M"], time: float) -> None:
@@ -179,9 +189,12 @@ class HandMemory:
         self._learned[there] = np.minimum(self._learned[there] + 1.0, _MEMORY)
         rate = np.where(there, 1.0 / np.maximum(self._learned, 1.0), 0.0)
         self._habit += rate[:, None] * off
-        known = np.maximum(rate, 1.0 / _MEMORY) * there * (self._learned > 1.0)
-        self.variance += known * ((off**2).sum(axis=1) - self.variance)
-        usual = (self._habit[self._learned > 0.0] ** 2).sum(axis=1)
-        least = _LEAST_SPREAD**2 + _UNEVEN**2 * (usual.mean() if len(usual) else 0.0)
-        np.maximum(self.variance, least, out=self.variance)
+        known = np.maximum(rate, 1.0 / _MEMORY) * there
+        self._variance += known * ((off**2).sum(axis=1) - self._variance)
+        self._adapt()
+
+    def _adapt(self) -> None:
+        missed = (self._habit**2).sum(axis=1)[self._learned > 0.0]
+        self._usual_miss = float(np.sqrt(missed.mean())) if len(missed) else 0.0
+        np.maximum(self._variance, _LEAST_SPREAD**2 + (_UNEVEN * self._usual_miss) ** 2, out=self._variance)
         self.adapted.places[:, 0] = self._designed - self._habit
