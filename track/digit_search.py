@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _STEPS: Final = 10
 _LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
 _FREEDOM: Final = 20.0  # squared deviations of a prior from which on it loses its say
-_SLACK: Final = 0.006  # [m] that two markers may be nearer or farther than on any pose of the hand
+_SLACK: Final = 0.003  # [m] that two markers may be nearer or farther than on any pose of the hand
 NEVER: Final = 1e9
 """Score below zero of what cannot be."""
 
@@ -43,7 +43,7 @@ class DigitRanges(NamedTuple):
 
 
 def digit_ranges(hand: GlovedHand) -> DigitRanges:
-    """The distances of a hand's markers over a grid of its hinges, with some slack."""
+    """The distances of a hand's markers over a grid of its hinges."""
     work = workspace(len(hand.digits))
     shares = np.linspace(0.0, 1.0, 5)
     grid = np.stack(np.meshgrid(*[shares] * 4, indexing="ij"), axis=-1).reshape(-1, 4)
@@ -55,7 +55,7 @@ def digit_ranges(hand: GlovedHand) -> DigitRanges:
         place_markers(hand, posed, work)
         apart = np.linalg.norm(work.markers[:, None] - work.markers[None], axis=-1)
         nearest, farthest = np.minimum(nearest, apart), np.maximum(farthest, apart)
-    return DigitRanges(nearest - _SLACK, farthest + _SLACK)
+    return DigitRanges(nearest, farthest)
 
 
 class DigitNamings(NamedTuple):
@@ -87,6 +87,7 @@ def search_digit(
     credit: Any,
     variance: Any,
     worth: Any,
+    slack: Any,
     posed: Any,
     coming: Any,
     trust: Any,
@@ -103,6 +104,7 @@ def search_digit(
         credit: What each name is worth to each point (C, K) beyond the fit, for the IDs' sake.
         variance: Of each marker (M,) around its place [m^2].
         worth: What naming a point is worth that lies where its marker is expected (M,).
+        slack: How far each marker may be off its place on the hand of the ranges (M,) [m].
         posed: Angles (20,) [rad] of the whole hand: skin between two fingers moves with both.
         coming: Angles (4,) [rad] that the hinges were coming to.
         trust: How surely (4, 4) [1/rad^2].
@@ -122,7 +124,7 @@ def search_digit(
             rest //= choices
             if naming[place] >= 0:
                 chosen |= 1 << naming[place]
-        most = _most(ranges, markers, points, credit, worth, naming)
+        most = _most(ranges, markers, points, credit, worth, slack, naming)
         if most <= namings.runners_up[chosen] or most <= -NEVER:
             continue
         score = -NEVER
@@ -138,7 +140,7 @@ def search_digit(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _most(ranges: Any, markers: Any, points: Any, credit: Any, worth: Any, naming: Any) -> Any:
+def _most(ranges: Any, markers: Any, points: Any, credit: Any, worth: Any, slack: Any, naming: Any) -> Any:
     """What a naming is worth if every point lies where it should; far below zero if they cannot."""
     total = 0.0
     for place in range(len(markers)):
@@ -156,7 +158,8 @@ def _most(ranges: Any, markers: Any, points: Any, credit: Any, worth: Any, namin
                 apart += (points[point, i] - points[naming[other], i]) ** 2
             apart = np.sqrt(apart)
             one, two = markers[place], markers[other]
-            if apart < ranges.nearest[one, two] or apart > ranges.farthest[one, two]:
+            loose = _SLACK + slack[one] + slack[two]
+            if apart < ranges.nearest[one, two] - loose or apart > ranges.farthest[one, two] + loose:
                 return -NEVER
     return total
 

@@ -140,6 +140,12 @@ class HandMemory:
         covariances = expected.covariances + (self.variance + bend**2)[:, None, None] * np.eye(3)
         return Estimate(expected.qpos, rms, residuals, covariances, expected)
 
+    @property
+    def slack(self) -> Float[np.ndarray, "M"]:
+        """How far each marker may be off where the hand as it was given has it [m]."""
+        slack: NDArray[np.float64] = 2.5 * np.sqrt(self.variance) + np.linalg.norm(self._habit, axis=1)
+        return slack
+
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
         """Log chance of each marker to come back when it did, were it the point that was born then [s]."""
         gap = born[:, None] - self._seen

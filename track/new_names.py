@@ -161,6 +161,7 @@ def _search(
         kept,
         memory.variance,
         worth_of(memory.variance),
+        memory.slack,
         estimate.qpos[7:].copy(),
         believed,
         trust,
