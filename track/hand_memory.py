@@ -36,7 +36,7 @@ _ARC: Final = 0.04  # [m] radius of the arcs that markers move on
 _FADING: Final = 0.7  # of the speed of a digit that lacks markers, from frame to frame
 _SMOOTHING: Final = 0.6  # share of the newest speed
 _RETURN: Final = 0.01  # [s] over the time for which a marker was hidden: its chance to be back in a frame
-_MOST_RETURN: Final = 0.65
+_RETURNS: Final = (0.01, 0.65)  # least and most of that chance
 _ELSEWHERE: Final = -7.0  # log chance of a marker that was seen while the point was there already
 _LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
 
@@ -149,7 +149,7 @@ class HandMemory:
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
         """Log chance of each marker to come back when it did, were it the point that was born then [s]."""
         gap = born[:, None] - self._seen
-        chance: NDArray[np.float64] = np.log(np.minimum(_RETURN / np.maximum(gap, 1e-3), _MOST_RETURN))
+        chance: NDArray[np.float64] = np.log(np.clip(_RETURN / np.maximum(gap, 1e-3), *_RETURNS))
         chance[gap < 0.0] = _ELSEWHERE
         return chance
 
