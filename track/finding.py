@@ -29,6 +29,7 @@ MOST_RMS: Final = 0.008
 _LINK: Final = 0.085  # [m] between neighbouring markers of one hand, at most
 _SHARE: Final = 0.6  # of a hand's markers that must be found
 _STRAYS: Final = 6  # points more than a hand has, from which on a cloud is cut
+_MOST_POINTS: Final = 100  # that hang together: more are nobody's hands
 _CUTS: Final = 12
 _TRIES: Final = 6  # labelled clouds that are fitted, the surest first
 _LOOSE: Final = (0.012, 0.006)  # [m] around a fitted hand, in which its points are looked for, then again
@@ -84,7 +85,8 @@ class HandFinder:
             return []
         cluster = fclusterdata(points, _LINK, criterion="distance", method="single")
         groups = [np.flatnonzero(cluster == number) for number in np.unique(cluster)]
-        return sorted((group for group in groups if len(group) >= least), key=len, reverse=True)
+        groups = [group for group in groups if least <= len(group) <= _MOST_POINTS]
+        return sorted(groups, key=len, reverse=True)
 
     def _least(self, number: int) -> int:
         return max(_FEWEST_POINTS, int(np.ceil(_SHARE * self._memories[number].num_markers)))

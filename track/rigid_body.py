@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -31,12 +31,12 @@ from track.constellation import (
     write_labels,
     write_transform,
 )
+from track.tracked_frame import Status
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-Status = Literal["found", "tracked", "coasting", "lost"]
 GATE: Final = 0.003
 """How far a labelled point may be from its marker [m], ten times the noise of a good system."""
 _TIGHT: Final = 0.001  # [m], the same for those that make the pose, and for a body that is looked for
@@ -195,7 +195,7 @@ class BodyTracker:
 
     def _step(self, points: Any, ids: Any, time: float) -> BodyFrame:
         elapsed = time - self._time
-        if self._status != "lost":
+        if self._status != Status.LOST:
             frame = self._follow(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
             if frame is not None:
                 return frame
@@ -208,7 +208,7 @@ class BodyTracker:
         self._lose()
 
     def _lose(self) -> None:
-        self._status: Status = "lost"
+        self._status: Status = Status.LOST
         self._known = np.full(len(self._places), -1)  # IDs of the last frame
         self._candidate, self._waited = np.full(7, np.nan), 0
 
@@ -226,8 +226,8 @@ class BodyTracker:
             other, others = np.empty(7), np.empty_like(owners)
             more, spread = self._search(points, None, np.inf, others, other)
             if more > FEWEST:
-                return self._keep("found", other, spread, others, ids, time)
-        return self._keep("tracked", pose, rms, owners, ids, time)
+                return self._keep(Status.FOUND, other, spread, others, ids, time)
+        return self._keep(Status.TRACKED, pose, rms, owners, ids, time)
 
     def _coast(self, points: Any, ids: Any, elapsed: float) -> BodyFrame | None:
         """The body where its motion says that it is, for as long as that may be trusted."""
@@ -237,7 +237,7 @@ class BodyTracker:
         owners = np.empty(len(self._places), dtype=np.int64)
         carry(points, ids, self._known, owners)
         _, rms = lean_on(points, owners, pose, put(self._places, pose), GATE)
-        self._status = "coasting"
+        self._status = Status.COASTING
         return self._frame(pose, rms, owners, ids)
 
     def _find(self, points: Any, ids: Any, time: float, elapsed: float) -> BodyFrame:
@@ -247,17 +247,17 @@ class BodyTracker:
             reach, predicted = self._reach(elapsed), advance(self._pose, self._velocity, elapsed)
             count, rms = self._search(points, predicted, reach, owners, pose)
             if count > FEWEST or (count == FEWEST and reach <= _NEAR):
-                return self._keep("found", pose, rms, owners, ids, time)
+                return self._keep(Status.FOUND, pose, rms, owners, ids, time)
         count, rms = self._search(points, None, np.inf, owners, pose)
         if count >= FEWEST:
             moved = np.linalg.norm(put(self._places, pose) - put(self._places, self._candidate), axis=1).max()
             self._waited = self._waited + 1 if moved < _STILL else 1
             self._candidate = pose
             if self._waited >= _frames_to_wait(count, len(self._places)):
-                return self._keep("found", pose, rms, owners, ids, time)
+                return self._keep(Status.FOUND, pose, rms, owners, ids, time)
         else:
             self._waited = 0
-        return BodyFrame("lost", None, np.full(len(points), -1), np.nan)
+        return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
 
     def _reach(self, elapsed: float) -> float:
         """How far a marker may be from where the last fit and its motion put it [m]."""
@@ -281,7 +281,7 @@ class BodyTracker:
     def _keep(self, status: Status, pose: Any, rms: float, owners: Any, ids: Any, time: float) -> BodyFrame:
         """Remember a fit."""
         elapsed = time - self._time
-        if status == "found":
+        if status == Status.FOUND:
             self._velocity, self._most, self._fits = np.zeros(6), 0, 0
         elif 0.0 < elapsed <= _NEARBY:
             ease = _EASE if self._fits > 1 else 1.0

@@ -49,14 +49,29 @@ class TrackedHand:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TrackedBody:
+    """One rigid body in one frame."""
+
+    name: str
+    status: Status
+    translation: Float[np.ndarray, "3"]
+    """Of the body's frame in the world [m]; NaN where it is lost."""
+    rotation: Float[np.ndarray, "4"]
+    """Its orientation, wxyz; NaN where it is lost."""
+    rms: float
+    """RMS distance of its labelled points from its markers [m]; NaN without any."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class TrackedFrame:
-    """A frame's hands and points."""
+    """A frame's hands, bodies and points."""
 
     time: float
     hands: tuple[TrackedHand, ...]
     labels: Int[np.ndarray, "N"]
-    """Marker of each point, counted through the hands in their order; -1 for what is none."""
+    """Marker of each point, counted through the hands in their order, then the bodies; -1 for none."""
     confidence: Float[np.ndarray, "N"]
     """How sure each label is, 0 to 1."""
+    bodies: tuple[TrackedBody, ...] = ()
     notes: tuple[str, ...] = ()
     """What was wrong with the frame itself, in words; most frames have nothing to say."""

@@ -13,11 +13,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.topology import NUM_QPOS
-from track.finding import MOST_RMS, HandFinder
+from handsim.transforms import rotation_quaternions
+from track.finding import MOST_RMS, Found, HandFinder
 from track.hand_memory import Estimate, HandMemory
+from track.intake import Incoming, Intake
 from track.naming import fit_names, forget_surprises, targets_of
 from track.new_names import YOUNG, Following, name_new
-from track.tracked_frame import Status, TrackedFrame, TrackedHand
+from track.rigid_body import BodyTracker, RigidTemplate
+from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
 from track.user import UserHand
 from train.labeling import Labeler
 
@@ -27,34 +30,75 @@ if TYPE_CHECKING:
 
 _FEWEST: Final = 5  # named points that a pose can be relied on for
 _LONGEST_COAST: Final = 0.1  # [s] that a pose is carried on without them
+_SHARE: Final = 0.6  # of a hand's markers; with fewer named it is doubted
+_AROUND, _PATIENCE = 0.2, 0.15  # [m] where its points must be, [s] for which that must last
+_MORE: Final = 3.0  # markers that a hand must explain beyond those it has, to be taken anew
 _MOST_CREDIT: Final = 12.0
 _INCOME: Final = 2.0  # credit of a name in each frame, less half the squared deviations it is off
 
 
 class Tracker:
-    """Follows the user's hands from frame to frame.
+    """Follows the user's hands, and things with markers of their own, from frame to frame.
 
     Args:
         hands: The user's hands, each side at most once.
         labeler: Knows the markers of the hands' glove.
+        bodies: Rigid bodies that are there beside the hands.
     """
 
-    def __init__(self, hands: Sequence[UserHand], labeler: Labeler) -> None:
+    def __init__(
+        self, hands: Sequence[UserHand], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
+    ) -> None:
+        self.hands = tuple(hands)
+        self.bodies = tuple(bodies)
+        self._intake = Intake()
+        self._bodies = [BodyTracker(body) for body in bodies]
         self._memories = [HandMemory(hand) for hand in hands]
         self._finder = HandFinder(self._memories, labeler)
         sizes = [memory.num_markers for memory in self._memories]
-        self._first = np.cumsum([0, *sizes])
+        self._first = np.cumsum([0, *sizes, *(len(body.marker_names) for body in bodies)])
         self._labels: dict[int, tuple[int, float]] = {}
         self._born: dict[int, float] = {}
+        self._trusted = np.zeros(len(hands))
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Take in the next frame.
+        """Take in the next frame; whatever a stream may bring ends in a status or a note.
 
         Args:
-            points: Points [m], none of them missing.
+            points: Points [m]; those that are no finite places are left alone.
             ids: The system's IDs: a point keeps its own for as long as it is seen; -1 where there is none.
             time: Time of the frame [s].
+
+        Raises:
+            ShapeError: `points` and `ids` do not fit together.
         """
+        frame = self._intake.take(points, ids, time)
+        bodies, labels = self._track_bodies(frame)
+        sure, free = np.ones(len(labels)), labels < 0
+        hands, labels[free], sure[free] = self._track_hands(frame.points[free], frame.ids[free], frame.time)
+        all_labels, all_sure = np.full(len(points), -1), np.ones(len(points))
+        all_labels[frame.kept], all_sure[frame.kept] = labels, sure
+        return TrackedFrame(time, hands, all_labels, all_sure, bodies, frame.notes)
+
+    def _track_bodies(self, frame: Incoming) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
+        """Every body, and the labels (P,) of their points."""
+        labels, bodies = np.full(len(frame.points), -1), []
+        for number, tracker in enumerate(self._bodies, start=len(self._memories)):
+            found = tracker.step(frame.points, frame.ids, frame.time)
+            labels[found.labels >= 0] = self._first[number] + found.labels[found.labels >= 0]
+            place, turn = np.full(3, np.nan), np.full(4, np.nan)
+            if found.T_world_body is not None:
+                place, turn = (
+                    found.T_world_body[:3, 3],
+                    rotation_quaternions(found.T_world_body[None, :3, :3])[0],
+                )
+            bodies.append(TrackedBody(tracker.template.name, found.status, place, turn, found.rms))
+        return tuple(bodies), labels
+
+    def _track_hands(
+        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float
+    ) -> tuple[tuple[TrackedHand, ...], NDArray[np.int64], NDArray[np.float64]]:
+        """Every hand, and the labels (P,) of points and how sure they are."""
         names, credit = self._carry_over(ids)
         born = self._births(ids, time)
         sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
@@ -64,20 +108,23 @@ class Tracker:
             for number, memory in enumerate(self._memories)
         ]
         self._find_lost(points, names, hands, time)
-        labels = np.where(names >= 0, names + self._first[:-1, None], -1).max(axis=0, initial=-1)
+        self._doubt(points, names, hands, time)
+        first = self._first[: len(hands), None]
+        labels = np.where(names >= 0, names + first, -1).max(axis=0, initial=-1)
         self._labels = {
             point: (label, worth)
             for point, label, worth in zip(ids.tolist(), labels.tolist(), credit.tolist(), strict=True)
             if label >= 0 and point >= 0
         }
-        return TrackedFrame(time, tuple(hands), labels, sure)
+        return tuple(hands), labels, sure
 
     def _carry_over(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Names (H, N) that the IDs carry, and what they are worth (N,)."""
         known = [self._labels.get(point, (-1, 0.0)) for point in ids.tolist()]
         labels = np.array([label for label, _ in known], dtype=np.int64)
-        names = labels - self._first[:-1, None]
-        names[(names < 0) | (labels >= self._first[1:, None])] = -1
+        first = self._first[: len(self._memories) + 1, None]
+        names = labels - first[:-1]
+        names[(names < 0) | (labels >= first[1:])] = -1
         return names, np.array([worth for _, worth in known])
 
     def _births(self, ids: NDArray[np.int64], time: float) -> NDArray[np.float64]:
@@ -97,7 +144,10 @@ class Tracker:
         """Poses of the hands that were there before; names (H, N) and credits are overwritten."""
         hands = []
         for number, memory in enumerate(self._memories):
+            if (names[number] >= 0).sum() < _FEWEST and time - memory.time > _LONGEST_COAST:
+                memory.qpos = None
             if memory.qpos is None:
+                names[number] = -1
                 continue
             coming = memory.predict(time)
             forget_surprises(memory, points, names[number], coming)
@@ -155,13 +205,48 @@ class Tracker:
         others = np.delete(names, lost, axis=0)
         free = np.flatnonzero((others < 0).all(axis=0))
         for found in self._finder.find(points[free], lost):
-            memory = self._memories[found.number]
-            names[found.number] = -1
-            names[found.number, free] = found.names
-            fit = memory.begin(
-                found.fit.qpos[0], targets_of(points, names[found.number], memory.num_markers), time
-            )
-            hands[found.number] = _tracked(memory, Status.FOUND, points, names[found.number], fit)
+            hands[found.number] = self._take_up(found, free, points, names, time)
+
+    def _doubt(
+        self,
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        hands: list[TrackedHand],
+        time: float,
+    ) -> None:
+        """Look again for a hand that leaves most of its markers open while there are points around it.
+
+        A hand can be followed in the wrong place on a few points; it must not stay there.
+        """
+        for number, hand in enumerate(hands):
+            named = int((names[number] >= 0).sum())
+            markers = self._memories[number].num_markers
+            open_points = np.flatnonzero((np.delete(names, number, axis=0) < 0).all(axis=0))
+            around = np.linalg.norm(points[open_points] - hand.qpos[:3], axis=1) < _AROUND
+            enough = hand.status is not Status.TRACKED or named >= _SHARE * markers
+            if enough or around.sum() < _SHARE * markers:
+                self._trusted[number] = time
+            if time - self._trusted[number] < _PATIENCE:
+                continue
+            self._trusted[number] = time
+            for found in self._finder.find(points[open_points], [number]):
+                if found.score > named + _MORE:
+                    hands[number] = self._take_up(found, open_points, points, names, time)
+
+    def _take_up(
+        self,
+        found: Found,
+        among: NDArray[np.int64],
+        points: NDArray[np.float64],
+        names: NDArray[np.int64],
+        time: float,
+    ) -> TrackedHand:
+        """Go on with a hand as it was found among some of the points; its names (H, N) are overwritten."""
+        memory, mine = self._memories[found.number], names[found.number]
+        mine[:] = -1
+        mine[among] = found.names
+        estimate = memory.begin(found.fit.qpos[0], targets_of(points, mine, memory.num_markers), time)
+        return _tracked(memory, Status.FOUND, points, mine, estimate)
 
 
 def _tracked(

@@ -16,6 +16,7 @@ from handsim.objects import named_object
 from handsim.transforms import quaternion_matrix, random_quaternions
 from track.constellation import advance, put, velocity_between
 from track.rigid_body import BodyFrame, BodyTracker, RigidTemplate
+from track.tracked_frame import Status
 from train.twins import TwinConfig, simulate_twin
 
 NAMES = ("controller", "ball", "box", "mug")
@@ -69,7 +70,7 @@ def test_every_frame_of_a_twin_is_right():
     errors = []
     for number, (points, ids, labels) in enumerate(frames(take)):
         frame = tracker.step(points, ids, number / take.rate)
-        assert frame.status == ("tracked" if number else "found")
+        assert frame.status == (Status.TRACKED if number else Status.FOUND)
         np.testing.assert_array_equal(frame.labels, labels)
         assert frame.rms < 0.0015
         errors.append(apart(frame.T_world_body, take.body.T_world_body[number]))
@@ -83,7 +84,7 @@ def test_the_same_without_ids():
     for number, (points, ids, labels) in enumerate(frames(twin())):
         frame = tracker.step(points, np.full(len(ids), -1), number * STEP)
         assert not ((frame.labels >= 0) & (frame.labels != labels)).any()
-        assert frame.status in ("found", "tracked")
+        assert frame.status in (Status.FOUND, Status.TRACKED)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -91,7 +92,7 @@ def test_a_body_is_not_found_among_hands_that_do_not_hold_it(name):
     tracker = BodyTracker(template(name))
     for number, (points, ids, labels) in enumerate(frames(twin())):
         frame = tracker.step(points[labels < 0], ids[labels < 0], number * STEP)
-        assert frame.status == "lost" and frame.T_world_body is None
+        assert frame.status == Status.LOST and frame.T_world_body is None
         assert (frame.labels == -1).all() and np.isnan(frame.rms)
 
 
@@ -102,7 +103,7 @@ def test_bodies_are_found_at_once_in_any_pose_and_order(name, seed):
     body, pose = template(name), transform(rng)
     points, labels = seen(body, pose, rng)
     frame = BodyTracker(body).step(points, np.arange(len(points)), 0.0)
-    assert frame.status == "found"
+    assert frame.status == Status.FOUND
     np.testing.assert_array_equal(frame.labels[labels >= 0], labels[labels >= 0])
     assert (frame.labels[labels < 0] == -1).all()
     away, turned = apart(frame.T_world_body, pose)
@@ -114,13 +115,13 @@ def test_three_of_more_markers_follow_a_body_but_do_not_find_it(rng):
     tracker = BodyTracker(body)
     for number in range(30):
         points, _ = seen(body, pose, rng, without=(1,), strays=0)
-        assert tracker.step(points, np.arange(3), number * STEP).status == "lost"
+        assert tracker.step(points, np.arange(3), number * STEP).status == Status.LOST
     points, labels = seen(body, pose, rng)
-    assert tracker.step(points, labels, 30 * STEP).status == "found"
+    assert tracker.step(points, labels, 30 * STEP).status == Status.FOUND
     for number in range(31, 60):
         points, labels = seen(body, pose, rng, without=(1,))
         frame = tracker.step(points, labels, number * STEP)
-        assert frame.status == "tracked"
+        assert frame.status == Status.TRACKED
         np.testing.assert_array_equal(frame.labels, labels)
 
 
@@ -129,7 +130,7 @@ def test_markers_that_lie_like_others_are_not_enough(rng):
     for number in range(5):  # four on a circle, two by two
         points, labels = seen(body, pose, rng, without=(2, 5), strays=0)
         tracker = BodyTracker(body)
-        assert tracker.step(points, labels, number * STEP).status == "lost"
+        assert tracker.step(points, labels, number * STEP).status == Status.LOST
 
 
 def test_a_body_of_three_markers_is_believed_after_a_while(rng):
@@ -140,7 +141,7 @@ def test_a_body_of_three_markers_is_believed_after_a_while(rng):
         points, labels = seen(body, pose, rng, strays=3)
         frame = tracker.step(points, np.arange(len(points)), number * STEP)
         words.append(frame.status)
-    assert words == ["lost"] * 9 + ["found"] + ["tracked"] * 2
+    assert words == [Status.LOST] * 9 + [Status.FOUND] + [Status.TRACKED] * 2
     np.testing.assert_array_equal(frame.labels, labels)
 
 
@@ -158,7 +159,8 @@ def test_a_body_coasts_a_little_and_is_found_again_where_it_was(rng):
             assert apart(words[-1].T_world_body, pose)[0] < 0.003
         assert not ((words[-1].labels >= 0) & (words[-1].labels != labels)).any()
     assert [frame.status for frame in words] == [
-        "found", *["tracked"] * 9, *["coasting"] * 3, *["lost"] * 7, *["lost"] * 10, "found", *["tracked"] * 9
+        Status.FOUND, *[Status.TRACKED] * 9, *[Status.COASTING] * 3, *[Status.LOST] * 7,
+        *[Status.LOST] * 10, Status.FOUND, *[Status.TRACKED] * 9
     ]  # fmt: skip
     assert (words[10].labels >= 0).sum() == 1, "the marker that is left"
 
@@ -172,7 +174,7 @@ def test_three_markers_near_where_it_was_find_it_again(rng):
         points, labels = seen(body, pose, rng, without=without)
         ids = np.where(labels >= 0, labels + (100 if number >= 14 else 0), -1)
         words.append(tracker.step(points, ids, number * STEP).status)
-    assert words[13:16] == ["lost", "found", "tracked"]
+    assert words[13:16] == [Status.LOST, Status.FOUND, Status.TRACKED]
 
 
 def test_ids_that_change_places_or_are_used_again_do_not_mislead(rng):
@@ -187,7 +189,7 @@ def test_ids_that_change_places_or_are_used_again_do_not_mislead(rng):
         if number >= 20:  # a stray takes the ID of a marker that is gone
             ids[np.flatnonzero(labels < 0)[0]] = 3
         frame = tracker.step(points, ids, number * STEP)
-        assert frame.status != "lost"
+        assert frame.status != Status.LOST
         np.testing.assert_array_equal(frame.labels, labels)
 
 
@@ -204,7 +206,7 @@ def test_ghosts_that_drift_off_where_markers_were_take_nothing_along(rng, gone):
             points, labels = np.vstack([points, ghosts]), np.append(labels, np.full(len(gone), -1))
             ids = np.append(ids, 100 + np.arange(len(gone)))
         frame = tracker.step(points, ids, number * STEP)
-        assert frame.status != "lost" and apart(frame.T_world_body, pose)[0] < 0.002
+        assert frame.status != Status.LOST and apart(frame.T_world_body, pose)[0] < 0.002
         np.testing.assert_array_equal(frame.labels[labels >= 0], labels[labels >= 0])
         if number >= 15:
             assert (frame.labels[labels < 0] == -1).all()
@@ -226,7 +228,7 @@ def test_two_markers_and_a_ghost_that_turns_about_them_are_no_body(rng):
             labels, ids = np.append(labels, -1), np.append(ids, 100)
         frame = tracker.step(points, ids, number * STEP)
         assert not ((frame.labels >= 0) & (frame.labels != labels)).any()
-    assert frame.status == "coasting"
+    assert frame.status == Status.COASTING
 
 
 @pytest.mark.parametrize(
@@ -252,8 +254,8 @@ def test_a_mirrored_constellation_is_another_one(rng):
     body = RigidTemplate("thing", ("a", "b", "c", "d"), places)
     mirrored = RigidTemplate("mirrored", body.marker_names, places * (1, 1, -1))
     points, _ = seen(mirrored, transform(rng), rng, strays=0)
-    assert BodyTracker(mirrored).step(points, np.arange(4), 0.0).status == "found"
-    assert BodyTracker(body).step(points, np.arange(4), 0.0).status == "lost"
+    assert BodyTracker(mirrored).step(points, np.arange(4), 0.0).status == Status.FOUND
+    assert BodyTracker(body).step(points, np.arange(4), 0.0).status == Status.LOST
 
 
 def test_mistakes_of_the_caller_are_told():
@@ -285,12 +287,12 @@ def test_no_stream_content_raises(data):
         assert frame.labels.shape == (len(points),)
         given_out = frame.labels[frame.labels >= 0]
         assert len(np.unique(given_out)) == len(given_out) and (given_out < 4).all()
-        assert (frame.T_world_body is None) == (frame.status == "lost")
+        assert (frame.T_world_body is None) == (frame.status == Status.LOST)
         if frame.T_world_body is not None:
             np.testing.assert_allclose(
                 frame.T_world_body[:3, :3] @ frame.T_world_body[:3, :3].T, np.eye(3), atol=1e-9
             )
-        if frame.status in ("found", "tracked"):
+        if frame.status in (Status.FOUND, Status.TRACKED):
             assert len(given_out) >= 3 and frame.rms <= 0.003
 
 
@@ -298,11 +300,11 @@ def test_a_crowd_of_points_is_not_searched_but_a_body_in_it_is_followed(rng):
     body, pose = template("ball"), transform(rng)
     tracker = BodyTracker(body)
     points, labels = seen(body, pose, rng, strays=2000)
-    assert tracker.step(points, labels, 0.0).status == "lost"
+    assert tracker.step(points, labels, 0.0).status == Status.LOST
     points, labels = seen(body, pose, rng)
-    assert tracker.step(points, labels, STEP).status == "found"
+    assert tracker.step(points, labels, STEP).status == Status.FOUND
     points, labels = seen(body, pose, rng, strays=2000)
-    assert tracker.step(points, labels, 2 * STEP).status == "tracked"
+    assert tracker.step(points, labels, 2 * STEP).status == Status.TRACKED
 
 
 def test_velocities_carry_poses_on(rng):
