@@ -248,4 +248,8 @@ def _owned(
             point, marker = np.unravel_index(off.argmin(), off.shape)
             owned[frame, point] = labels[missing[marker]]
             off[point], off[:, marker] = np.inf, np.inf
+    runs = number_runs(np.isfinite(found.false_points[..., 0]))
+    for run in np.unique(runs[owned >= 0]):  # an ID is one marker's for as long as it lasts, or none's
+        if len(np.unique(owned[runs == run])) > 1:
+            owned[runs == run] = -1
     return owned

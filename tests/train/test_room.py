@@ -166,11 +166,14 @@ def test_an_id_lasts_as_long_as_its_point_and_a_column_holds_one_a_stretch(rng):
     begins = there & np.vstack([there[:1], ~there[:-1]])
     new = take.ids[begins]
     assert len(np.unique(new)) == len(new) == take.ids.max() + 1, "a new ID after every gap"
+    handed_over = []
     for label in range(38):
         frames = np.flatnonzero((take.labels == label).any(axis=1))
         ids = np.array([take.ids[frame][take.labels[frame] == label].item() for frame in frames])
-        kept = ids[1:] == ids[:-1]
-        np.testing.assert_array_equal(kept, np.diff(frames) == 1)
+        kept, follows = ids[1:] == ids[:-1], np.diff(frames) == 1
+        assert not (kept & ~follows).any()
+        handed_over.append((follows & ~kept).sum())  # to a false point on the marker, or from it
+    assert sum(handed_over) <= 0.02 * len(new)
     assert len(new) > 100, "the test needs gaps"
 
 
