@@ -20,6 +20,7 @@ from track.natnet import Kind, MarkerFrame, ServerInfo
 from track.natnet_server import ReplayServer
 from track.rigid_body import BodyTracker, RigidTemplate
 from track.streaming import open_stream
+from track.tracked_frame import Status
 from train.twins import TwinConfig, simulate_twin
 
 LOOPBACK = "127.0.0.1"
@@ -101,7 +102,7 @@ def test_a_body_is_tracked_live():
             tracker.step(one.points, one.ids, one.time).status
             for one in itertools.islice(stream, take.num_frames)
         ]
-    assert words == ["found"] + ["tracked"] * (take.num_frames - 1)
+    assert words == [Status.FOUND] + [Status.TRACKED] * (take.num_frames - 1)
 
 
 def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
