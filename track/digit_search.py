@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _STEPS: Final = 10
+_APART: Final = np.deg2rad(5.0)  # between two starts, or one will do
 _LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
 _FREEDOM: Final = 20.0  # squared deviations of a prior from which on it loses its say
 _SLACK: Final = 0.003  # [m] that two markers may be nearer or farther than on any pose of the hand
@@ -114,6 +115,7 @@ def search_digit(
     work = workspace(len(hand.digits))
     place_markers(hand, posed, work)
     naming, angles = np.full(count, -1), np.empty(4)
+    apart = np.abs(coming - posed[4 * digit : 4 * digit + 4]).max()
     total = 1
     for _ in range(count):
         total *= choices
@@ -128,7 +130,7 @@ def search_digit(
         if most <= namings.runners_up[chosen] or most <= -NEVER:
             continue
         score = -NEVER
-        for start in range(2):
+        for start in range(2 if apart > _APART else 1):
             angles[:] = coming if start == 0 else posed[4 * digit : 4 * digit + 4]
             misfit, gap = _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
             score = max(score, most - misfit - gap)

@@ -80,15 +80,21 @@ def name_new(
     sure = np.full(len(points), np.nan)
     for hand in hands:
         _name_palm(hand, points, names, born, sure)
+    young = (names >= 0).any(axis=0) & (credit < YOUNG)
+    free = np.asarray((names < 0).all(axis=0), dtype=bool)
+    everywhere = [hand.estimate.places for hand in hands]
+    if not young.any() and not any(
+        _near(points[free], places, _REACH_MISSING).any() for places in everywhere
+    ):
+        return sure
     digits = [_digit(hand, digit, names) for hand in hands for digit in range(len(DIGITS))]
     contested = np.zeros(len(points), dtype=bool)
     for one in digits:
-        young = one.own[credit[one.own] < YOUNG]
+        rivals = one.own[young[one.own]]
         for other in digits:
-            if other is not one and len(young):
+            if other is not one and len(rivals) and len(other.missing):
                 places = other.hand.estimate.places[other.missing]
-                contested[young[_near(points[young], places, _REACH_MISSING)]] = True
-    free = np.asarray((names < 0).all(axis=0), dtype=bool)
+                contested[rivals[_near(points[rivals], places, _REACH_MISSING)]] = True
     searches = [
         search
         for one in digits
@@ -121,8 +127,11 @@ def _name_palm(
 
 def _digit(hand: Following, digit: int, names: NDArray[np.int64]) -> _Digit:
     markers = np.flatnonzero(hand.memory.digits == digit)
-    own = np.flatnonzero(np.isin(names[hand.number], markers))
-    return _Digit(hand, digit, markers, own, np.setdiff1d(markers, names[hand.number, own]))
+    mine = names[hand.number]
+    own = np.flatnonzero((mine >= 0) & (hand.memory.digits[mine] == digit))
+    there = set(mine[own].tolist())
+    missing = np.array([marker for marker in markers.tolist() if marker not in there], dtype=np.int64)
+    return _Digit(hand, digit, markers, own, missing)
 
 
 def _search(
