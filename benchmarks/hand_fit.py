@@ -25,7 +25,8 @@ from handsim.jacobian import skinned_jacobian
 from handsim.model import HandModel
 from handsim.shape import HandShape, shape_from_measures
 from handsim.topology import JOINTS
-from track.inverse_kinematics import PoseFit, move, solve_poses
+from track.inverse_kinematics import PoseFit, solve_poses
+from track.pose_motion import move
 
 ROUNDS = 12
 STEP = 1e-5

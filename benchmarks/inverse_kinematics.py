@@ -33,7 +33,8 @@ from handsim.topology import SIDES
 from handsim.transforms import random_quaternions
 from poses.motions import sample_motion
 from poses.validity import resting_angles, sample_valid_angles
-from track.inverse_kinematics import PoseSolver, move
+from track.inverse_kinematics import PoseSolver
+from track.pose_motion import move
 
 Solver = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 SMALL = 1e-12  # [m^2] by which the summed squares may still fall when a solver stops

@@ -31,7 +31,7 @@ from track.hand_parameters import (
     skinned_shape_slopes,
     slopes_of,
 )
-from track.inverse_kinematics import move
+from track.pose_motion import move
 from track.skin_walk import (
     Corners,
     SkinPatch,

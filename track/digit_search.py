@@ -23,6 +23,7 @@ from track.gloved_hand import (
     place_markers,
     workspace,
 )
+from track.small_systems import eliminate, solve_positive
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -32,6 +33,7 @@ _APART: Final = np.deg2rad(5.0)  # between two starts, or one will do
 _LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
 _FREEDOM: Final = 20.0  # squared deviations of a prior from which on it loses its say
 _SLACK: Final = 0.003  # [m] that two markers may be nearer or farther than on any pose of the hand
+_CLEAR: Final = 7.0  # log odds behind another naming from which on a naming is not looked at
 NEVER: Final = 1e9
 """Score below zero of what cannot be."""
 
@@ -115,30 +117,74 @@ def search_digit(
     work = workspace(len(hand.digits))
     place_markers(hand, posed, work)
     naming, angles = np.full(count, -1), np.empty(4)
-    apart = np.abs(coming - posed[4 * digit : 4 * digit + 4]).max()
-    total = 1
-    for _ in range(count):
-        total *= choices
+    own = posed[4 * digit : 4 * digit + 4]
+    starts = 2 if np.abs(coming - own).max() > _APART else 1
+    total = choices**count
+    misfits, poses = np.zeros(total), np.empty((total, 4))
+    below = np.full(len(namings.scores), -NEVER)
+    poses[0] = coming
     for number in range(total):
-        rest, chosen = number, 0
-        for place in range(count):
-            naming[place] = rest % choices - 1
-            rest //= choices
-            if naming[place] >= 0:
-                chosen |= 1 << naming[place]
+        chosen = _read_naming(number, choices, naming)
+        smaller = _worst_part(number, choices, naming, misfits)
+        misfits[number], poses[number] = misfits[smaller], poses[smaller]
+        if number > 0 and misfits[smaller] >= NEVER:
+            continue
         most = _most(ranges, markers, points, credit, worth, slack, naming)
-        if most <= namings.runners_up[chosen] or most <= -NEVER:
+        if most <= -NEVER:
+            misfits[number] = NEVER
+            continue
+        best = most - misfits[smaller]
+        beaten = _best_below(chosen, namings.scores, below)
+        if best <= max(namings.runners_up[chosen], max(namings.scores[chosen], beaten) - _CLEAR):
             continue
         score = -NEVER
-        for start in range(2 if apart > _APART else 1):
-            angles[:] = coming if start == 0 else posed[4 * digit : 4 * digit + 4]
+        for start in range(starts):
+            angles[:] = poses[smaller] if start == 0 else own
             misfit, gap = _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
-            score = max(score, most - misfit - gap)
+            if most - misfit - gap > score:
+                score = most - misfit - gap
+                misfits[number], poses[number] = misfit, angles
         if score > namings.scores[chosen]:
             namings.runners_up[chosen], namings.scores[chosen] = namings.scores[chosen], score
             namings.names[chosen] = naming
         elif score > namings.runners_up[chosen]:
             namings.runners_up[chosen] = score
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _read_naming(number: Any, choices: Any, naming: Any) -> Any:
+    """The naming with a number, and the set of points that it uses."""
+    chosen = 0
+    for place in range(len(naming)):
+        naming[place] = number % choices - 1
+        number //= choices
+        if naming[place] >= 0:
+            chosen |= 1 << naming[place]
+    return chosen
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _worst_part(number: Any, choices: Any, naming: Any, misfits: Any) -> Any:
+    """Of the namings with one name less that which misses most: with one more it cannot miss less."""
+    worst, radix = 0, 1
+    for place in range(len(naming)):
+        part = number - (naming[place] + 1) * radix
+        radix *= choices
+        if naming[place] >= 0 and misfits[part] >= misfits[worst]:
+            worst = part
+    return worst
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _best_below(chosen: Any, scores: Any, below: Any) -> Any:
+    """Best score so far of any part of a set of points."""
+    bit = 1
+    while bit <= chosen:
+        if chosen & bit:
+            part = chosen ^ bit
+            below[chosen] = max(below[chosen], scores[part], below[part])
+        bit <<= 1
+    return below[chosen]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -196,7 +242,7 @@ def _fit(
             for column in range(4):
                 factor[row, column] = normal[row, column]
             factor[row, row] *= 1.0 + damping
-        _solve_four(factor, rest)
+        solve_positive(factor, rest)
         for row in range(4):
             trial[row] = angles[row] + rest[row]
         tried = _gather(
@@ -273,26 +319,10 @@ def _gather(
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _solve_four(matrix: Any, rest: Any) -> None:
-    """Solve a small positive system in place by elimination."""
-    for row in range(4):
-        scale = 1.0 / matrix[row, row]
-        for other in range(row + 1, 4):
-            share = matrix[other, row] * scale
-            for column in range(row, 4):
-                matrix[other, column] -= share * matrix[row, column]
-            rest[other] -= share * rest[row]
-    for row in range(3, -1, -1):
-        for column in range(row + 1, 4):
-            rest[row] -= matrix[row, column] * rest[column]
-        rest[row] /= matrix[row, row]
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _log_determinant(matrix: Any) -> Any:
     """Of a small positive matrix, by elimination."""
     factor, total = matrix.copy(), 0.0
-    _solve_four(factor, np.zeros(4))
+    eliminate(factor, np.zeros(4), 0, 4)
     for row in range(4):
         total += np.log(factor[row, row])
     return total

@@ -14,12 +14,14 @@ import numpy as np
 from handsim.topology import NUM_JOINTS
 from track.gloved_hand import NUM_UNKNOWNS, gather, place_markers, workspace
 from track.pose_descent import find_misses
+from track.small_systems import invert_positive, solve_positive
 from track.starting_poses import write_rotation
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 _FEWEST_ON_A_DIGIT: Final = 3  # markers that tell its four hinges also when it is straight
+_ARC: Final = 0.04  # [m] radius of the arcs that markers move on
 
 
 class Expectation(NamedTuple):
@@ -30,7 +32,7 @@ class Expectation(NamedTuple):
     places: Float[np.ndarray, "M 3"]
     """[m] in the world."""
     covariances: Float[np.ndarray, "M 3 3"]
-    """What the fit leaves open [m^2], in the world."""
+    """How far they may be from there [m^2], in the world: what the fit leaves open, and how they tremble."""
     turns: Float[np.ndarray, "M 3 3"]
     """Rotations of the bones that carry most of each marker, in the world."""
     hinges: Float[np.ndarray, "20 20"]
@@ -56,7 +58,15 @@ def expectation(num_markers: int) -> Expectation:
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def expect_markers(
-    hand: Any, on_part: Any, pose: Any, target: Any, mean: Any, precision: Any, weight: Any, out: Any
+    hand: Any,
+    on_part: Any,
+    pose: Any,
+    target: Any,
+    belief: Any,
+    wrist_spread: Any,
+    variance: Any,
+    noise: Any,
+    out: Any,
 ) -> None:
     """Fill an `Expectation`.
 
@@ -65,9 +75,10 @@ def expect_markers(
         on_part: Markers on each digit, and the palm (6,).
         pose: The fitted pose (27,).
         target: The markers it was fitted to (M, 3) [m]; NaN where missing.
-        mean: Angles (20,) that the hinges were believed to have [rad].
-        precision: How surely, and how surely the wrist was where the pose has it (26, 26).
-        weight: Inverse variance of the markers [1/m^2].
+        belief: What was believed of the hinges before that, a `HingeBelief`.
+        wrist_spread: How far the wrist may be from where the pose has it, [m] and [rad].
+        variance: Of each marker around its place on the hand (M,) [m^2].
+        noise: Standard deviation of the markers around the pose's [m].
         out: What is filled.
     """
     count = len(target)
@@ -78,31 +89,69 @@ def expect_markers(
     seen = np.zeros(len(on_part), dtype=np.int64)
     for marker in range(count):
         if not np.isnan(work.misses[marker, 0]):
-            weights[marker] = weight
+            weights[marker] = 1.0 / noise**2
             seen[hand.digits[marker]] += 1
     gather(hand, weights, work)
-    if _settle(hand, seen, on_part, mean, precision, work, out.qpos):
+    if _settle(hand, seen, on_part, belief, work, out.qpos):
         find_misses(hand, target, out.qpos, work)
         gather(hand, weights, work)
-    normal = work.normal
+    posterior = work.factor
     for row in range(NUM_UNKNOWNS):
-        normal[row, row] += 1e-9 * weight
-        for column in range(row):
-            normal[row, column] = normal[column, row]
-    out.told[:] = normal[:NUM_JOINTS, :NUM_JOINTS]
-    out.pull[:] = out.told @ out.qpos[7:] - work.gradient[:NUM_JOINTS]
-    normal += precision
-    inverse = np.linalg.inv(normal)
-    out.hinges[:] = inverse[:NUM_JOINTS, :NUM_JOINTS]
+        for column in range(row + 1):
+            posterior[row, column] = work.normal[column, row]
+        posterior[row, row] += 1e-9 / noise**2
+        if row >= NUM_JOINTS:
+            posterior[row, row] += wrist_spread[(row - NUM_JOINTS) // 3] ** -2.0
+    for row in range(NUM_JOINTS):
+        out.pull[row] = -work.gradient[row]
+        for column in range(NUM_JOINTS):
+            out.told[row, column] = posterior[max(row, column), min(row, column)]
+            out.pull[row] += out.told[row, column] * out.qpos[7 + column]
+    posterior[:NUM_JOINTS, :NUM_JOINTS] += belief.precision
+    invert_positive(posterior)
+    out.hinges[:] = posterior[:NUM_JOINTS, :NUM_JOINTS]
     for marker in range(count):
-        slopes = wrist @ work.slopes[marker]
-        out.covariances[marker] = slopes @ inverse @ slopes.T
-        out.turns[marker] = wrist @ work.rotations[hand.bones[marker, 0]]
-        out.places[marker] = pose[:3] + wrist @ work.markers[marker]
+        _spread(hand, marker, posterior, wrist, variance[marker], work, out.covariances[marker])
+        bone = work.rotations[hand.bones[marker, 0]]
+        for i in range(3):
+            out.places[marker, i] = pose[i]
+            for j in range(3):
+                out.places[marker, i] += wrist[i, j] * work.markers[marker, j]
+                out.turns[marker, i, j] = 0.0
+                for k in range(3):
+                    out.turns[marker, i, j] += wrist[i, k] * bone[k, j]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _settle(hand: Any, seen: Any, on_part: Any, mean: Any, precision: Any, work: Any, qpos: Any) -> Any:
+def _spread(
+    hand: Any, marker: Any, posterior: Any, wrist: Any, variance: Any, work: Any, covariance: Any
+) -> None:
+    """How far a marker may be from where the pose has it, in the world."""
+    first, last = hand.reach[marker, 0], hand.reach[marker, 1]
+    count = last - first + 6
+    slopes, turned = work.slopes[marker], np.zeros((3, count))
+    for number in range(count):
+        unknown = first + number if number < last - first else NUM_JOINTS + number - (last - first)
+        for i in range(3):
+            for j in range(3):
+                turned[i, number] += wrist[i, j] * slopes[j, unknown]
+    covariance[:] = 0.0
+    for one in range(count):
+        row = first + one if one < last - first else NUM_JOINTS + one - (last - first)
+        for other in range(count):
+            column = first + other if other < last - first else NUM_JOINTS + other - (last - first)
+            share = posterior[row, column]
+            for i in range(3):
+                for j in range(3):
+                    covariance[i, j] += turned[i, one] * share * turned[j, other]
+    # An arc leaves its tangent: open along it means open across it, by the square over twice its radius.
+    bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC)
+    for i in range(3):
+        covariance[i, i] += variance + bend**2
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _settle(hand: Any, seen: Any, on_part: Any, belief: Any, work: Any, qpos: Any) -> Any:
     """Move the hinges of digits that lack markers to where belief and markers balance; whether any did.
 
     The others' are given: what is seen of one finger tells of the next.
@@ -117,19 +166,20 @@ def _settle(hand: Any, seen: Any, on_part: Any, mean: Any, precision: Any, work:
     if count == 0:
         return False
     matrix, rest = np.empty((count, count)), np.empty(count)
-    away = np.ascontiguousarray(precision[:NUM_JOINTS, :NUM_JOINTS]) @ (qpos[7:] - mean)
     for row in range(count):
         one = weak[row]
-        rest[row] = -work.gradient[one] - away[one]
+        rest[row] = -work.gradient[one]
+        for hinge in range(NUM_JOINTS):
+            rest[row] -= belief.precision[one, hinge] * (qpos[7 + hinge] - belief.angles[hinge])
         for column in range(count):
             other = weak[column]
             told = work.normal[min(one, other), max(one, other)]
-            matrix[row, column] = told + precision[one, other]
-    step = np.linalg.solve(matrix, rest)
+            matrix[row, column] = told + belief.precision[one, other]
+    solve_positive(matrix, rest)
     for row in range(count):
         hinge = weak[row]
         low, high = hand.ranges[hinge, 0], hand.ranges[hinge, 1]
-        qpos[7 + hinge] = min(max(qpos[7 + hinge] + step[row], low), high)
+        qpos[7 + hinge] = min(max(qpos[7 + hinge] + rest[row], low), high)
     return True
 
 

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from handsim.topology import BONES, DIGITS, NUM_JOINTS
-from handsim.transforms import multiply_quaternions, quaternion_vectors
 from track.digit_search import digit_ranges
 from track.expectation import Expectation
 from track.hinge_belief import HingeBelief, foresee, resting_covariance
-from track.inverse_kinematics import FEWEST_MARKERS, PoseSolver, Prediction, move
+from track.inverse_kinematics import FEWEST_MARKERS, PoseSolver
+from track.pose_motion import move, velocity_of
 from track.user import UserHand
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ _MEMORY: Final = 120.0  # frames that a habit is averaged over
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
 _WRIST: Final = ((0.001, 10.0), (np.deg2rad(1.5), 100.0))
 """Of its place and its orientation: spread at once [m, rad], unforeseen acceleration [m/s^2, rad/s^2]."""
-_ARC: Final = 0.04  # [m] radius of the arcs that markers move on
 _FADING: Final = 0.7  # of the speed of a digit that lacks markers, from frame to frame
 _SMOOTHING: Final = 0.6  # share of the newest speed
 _RETURN: Final = 0.01  # [s] over the time for which a marker was hidden: its chance to be back in a frame
@@ -49,14 +48,6 @@ class Coming(NamedTuple):
     wrist_spread: tuple[float, float]
     """Standard deviations of the wrist's place [m] and orientation [rad]."""
 
-    @property
-    def precision(self) -> Float[np.ndarray, "26 26"]:
-        """How surely the hinges and the wrist are there, as a step's unknowns go."""
-        precision = np.zeros((NUM_JOINTS + 6, NUM_JOINTS + 6))
-        precision[:NUM_JOINTS, :NUM_JOINTS] = self.hinges.precision
-        precision[NUM_JOINTS:, NUM_JOINTS:] = np.diag(np.repeat(self.wrist_spread, 3) ** -2.0)
-        return precision
-
 
 class Estimate(NamedTuple):
     """A pose that was fitted to a frame's markers."""
@@ -66,14 +57,17 @@ class Estimate(NamedTuple):
     """3D RMS distance over the markers that are there [m]."""
     residuals: Float[np.ndarray, "M 3"]
     """Model minus marker [m], NaN where a marker is missing."""
-    covariances: Float[np.ndarray, "M 3 3"]
-    """How far the markers may be from where the pose has them [m^2]."""
     expected: Expectation
 
     @property
     def places(self) -> Float[np.ndarray, "M 3"]:
         """Where the pose has the markers [m]."""
         return self.expected.places
+
+    @property
+    def covariances(self) -> Float[np.ndarray, "M 3 3"]:
+        """How far the markers may be from there [m^2]."""
+        return self.expected.covariances
 
 
 class HandMemory:
@@ -127,18 +121,19 @@ class HandMemory:
         """
         qpos, rms, residuals = coming.qpos, np.nan, np.full_like(targets, np.nan)
         if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
-            prediction = Prediction(
-                coming.hinges.angles, coming.hinges.spread, coming.qpos[:7], coming.wrist_spread
+            fit = self.solver.follow(
+                targets, start, coming.hinges.angles, coming.hinges.spread, coming.qpos[:7], coming.wrist_spread
             )
-            fit = self.solver.solve(targets[None], start[None], prediction=prediction)
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
         expected = self.solver.expect(
-            qpos, targets, angles=coming.hinges.angles, precision=coming.precision, noise=_NOISE
+            qpos,
+            targets,
+            coming.hinges,
+            wrist_spread=coming.wrist_spread,
+            variance=self.variance,
+            noise=_NOISE,
         )
-        # An arc leaves its tangent: open along it means open across it, by the square over twice its radius.
-        bend = np.trace(expected.covariances, axis1=1, axis2=2) / (2.0 * _ARC)
-        covariances = expected.covariances + (self.variance + bend**2)[:, None, None] * np.eye(3)
-        return Estimate(expected.qpos, rms, residuals, covariances, expected)
+        return Estimate(expected.qpos, rms, residuals, expected)
 
     @property
     def slack(self) -> Float[np.ndarray, "M"]:
@@ -172,10 +167,7 @@ class HandMemory:
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
-            back = self.qpos[3:7] * np.array([1.0, -1.0, -1.0, -1.0])
-            turn = quaternion_vectors(multiply_quaternions(back[None], qpos[None, 3:7]))[0]
-            speed = np.concatenate([qpos[:3] - self.qpos[:3], turn, qpos[7:] - self.qpos[7:]]) / span
-            self._speed += _SMOOTHING * (speed - self._speed)
+            self._speed += _SMOOTHING * (velocity_of(self.qpos, qpos, span) - self._speed)
         self._take(estimate, time)
         self._learn(estimate, firm)
 

@@ -8,13 +8,14 @@ those that are seen tell of those that are not.
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import numba
 import numpy as np
 
 from handsim.topology import NUM_JOINTS
 from poses.library import LIBRARIES, gestures_of
-from track.expectation import Expectation
+from track.small_systems import eliminate, invert_positive, solve_positive
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -60,18 +61,52 @@ def foresee(
         covariance: How well they were known [rad^2].
         span: The time since then [s].
     """
-    kept = np.exp(-2.0 * max(span, 0.0) / _WANDERING)
-    spread = kept * covariance + (1.0 - kept) * resting_covariance() + _LEAST**2 * np.eye(NUM_JOINTS)
-    return HingeBelief(angles, spread, np.linalg.inv(spread))
+    belief = HingeBelief(angles, np.empty_like(covariance), np.empty_like(covariance))
+    _foresee(covariance, resting_covariance(), np.exp(-2.0 * max(span, 0.0) / _WANDERING), belief)
+    return belief
 
 
-def belief_of_digit(
-    belief: HingeBelief, seen: Expectation, digit: int
-) -> tuple[Float[np.ndarray, "4"], Float[np.ndarray, "4 4"]]:
-    """What the other digits say of one: its angles [rad] and their precision [1/rad^2]."""
-    hinges = slice(4 * digit, 4 * digit + 4)
-    told, pull = seen.told.copy(), seen.pull - seen.told @ belief.angles
-    told[hinges], told[:, hinges], pull[hinges] = 0.0, 0.0, 0.0
-    covariance = np.linalg.inv(belief.precision + told)
-    angles = belief.angles[hinges] + covariance[hinges] @ pull
-    return angles, np.linalg.inv(covariance[hinges, hinges])
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _foresee(known: Any, resting: Any, kept: Any, belief: Any) -> None:
+    for row in range(len(known)):
+        for column in range(len(known)):
+            belief.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
+        belief.covariance[row, row] += _LEAST**2
+    belief.precision[:] = belief.covariance
+    invert_positive(belief.precision)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def believe_digit(belief: Any, told: Any, pull: Any, digit: Any, angles: Any, trust: Any) -> None:
+    """What the other digits say of one.
+
+    Args:
+        belief: What was believed of the hinges before the markers were asked.
+        told: What the markers tell of the hinges, see `Expectation.told`.
+        pull: See `Expectation.pull`.
+        digit: Which digit.
+        angles: Its angles (4,) [rad], filled.
+        trust: Their precision (4, 4) [1/rad^2], filled.
+    """
+    count = len(pull)
+    order, system, rest = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
+    place = 0
+    for hinge in range(count):  # the digit's own hinges last, so that the others are eliminated from them
+        own = hinge // 4 == digit
+        order[count - 4 + hinge % 4 if own else place] = hinge
+        place += not own
+    for row in range(count):
+        one = order[row]
+        for column in range(count):
+            system[row, column] = belief.precision[one, order[column]]
+        if row < count - 4:
+            rest[row] = pull[one]
+            for column in range(count):
+                rest[row] -= told[one, order[column]] * belief.angles[order[column]]
+            for column in range(count - 4):
+                system[row, column] += told[one, order[column]]
+    eliminate(system, rest, 0, count - 4)
+    trust[:] = system[count - 4 :, count - 4 :]
+    solve_positive(system[count - 4 :, count - 4 :], rest[count - 4 :])
+    for row in range(4):
+        angles[row] = belief.angles[4 * digit + row] + rest[count - 4 + row]

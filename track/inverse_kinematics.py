@@ -18,9 +18,9 @@ from handsim._checks import check_array
 from handsim.errors import ShapeError
 from handsim.model import HandModel
 from handsim.topology import DIGITS, NUM_JOINTS, NUM_QPOS
-from handsim.transforms import multiply_quaternions, vector_quaternions
 from track.expectation import Expectation, carry_markers, expect_markers, expectation
 from track.gloved_hand import NUM_UNKNOWNS, GlovedHand, gloved_hand, workspace
+from track.hinge_belief import HingeBelief
 from track.pose_descent import MARKER_NOISE, descend, find_misses
 from track.starting_poses import RESTING, StartingShapes, lay_shapes, starting_shapes
 
@@ -35,6 +35,7 @@ FEWEST_MARKERS: Final = 4
 """Markers without which no pose is solved."""
 _EASING: Final = (1 / 64, 1 / 8, 1.0)  # of the tightness of a robust loss, so that a start may be far off
 _EASY_STEPS: Final = 8
+_MOST_STEPS: Final = 30
 _GOOD: Final = 0.0005  # [m] RMS, limits and prior included, from which on no further start is tried
 
 
@@ -99,7 +100,7 @@ class PoseSolver:
         initial: Float[np.ndarray, "T 27"] | None = None,
         *,
         prediction: Prediction | None = None,
-        iterations: int = 30,
+        iterations: int = _MOST_STEPS,
     ) -> PoseFit:
         """Poses whose markers come nearest to labelled ones, each frame by itself.
 
@@ -130,7 +131,49 @@ class PoseSolver:
             if starts.shape != (len(targets), NUM_QPOS):
                 raise ShapeError(f"initial has shape {starts.shape}, wanted ({len(targets)}, {NUM_QPOS})")
         angles, trust = _rows(prediction, len(targets))
-        wrong, qpos, rms, residuals, steps = _fit_frames(
+        wrong, fit = self._run(targets, starts, angles, trust, wrist, iterations)
+        if wrong >= 0:
+            there = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
+            if there < FEWEST_MARKERS:
+                raise ShapeError(f"frame {wrong} has {there} markers, wanted at least {FEWEST_MARKERS}")
+            raise ShapeError(
+                f"initial has a quaternion of length zero in frame {wrong}, wanted an orientation"
+            )
+        return fit
+
+    def follow(
+        self,
+        target: Float[np.ndarray, "M 3"],
+        start: Float[np.ndarray, "27"],
+        angles: Float[np.ndarray, "20"],
+        spread: Float[np.ndarray, "20"],
+        wrist: Float[np.ndarray, "7"],
+        wrist_spread: tuple[float, float],
+    ) -> PoseFit:
+        """`solve` for one frame from a start near by, with nothing checked: for loops that run all the time.
+
+        Args:
+            target: Labelled markers [m], four at least; NaN where missing.
+            start: A pose near theirs.
+            angles: See `Prediction`.
+            spread: See `Prediction`.
+            wrist: See `Prediction`.
+            wrist_spread: See `Prediction`.
+        """
+        trust = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
+        return self._run(target[None], start[None], angles[None], spread[None] ** -2.0, trust, _MOST_STEPS)[1]
+
+    def _run(
+        self,
+        targets: NDArray[np.float64],
+        starts: NDArray[np.float64],
+        angles: NDArray[np.float64],
+        trust: NDArray[np.float64],
+        wrist: NDArray[np.float64],
+        iterations: int,
+    ) -> tuple[int, PoseFit]:
+        """First frame that cannot be solved (or -1), and the fits."""
+        wrong, *arrays = _fit_frames(
             self.hand,
             self._shapes,
             self._on_part,
@@ -142,14 +185,7 @@ class PoseSolver:
             self._tightness,
             iterations,
         )
-        if wrong >= 0:
-            there = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
-            if there < FEWEST_MARKERS:
-                raise ShapeError(f"frame {wrong} has {there} markers, wanted at least {FEWEST_MARKERS}")
-            raise ShapeError(
-                f"initial has a quaternion of length zero in frame {wrong}, wanted an orientation"
-            )
-        return PoseFit(qpos, rms, residuals, steps)
+        return wrong, PoseFit(*arrays)
 
     def place(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Where a pose has its markers [m]."""
@@ -160,31 +196,17 @@ class PoseSolver:
     def expect(
         self,
         qpos: Float[np.ndarray, "27"],
-        targets: Float[np.ndarray, "M 3"],
+        target: Float[np.ndarray, "M 3"],
+        belief: HingeBelief,
         *,
-        angles: Float[np.ndarray, "20"],
-        precision: Float[np.ndarray, "26 26"],
+        wrist_spread: tuple[float, float],
+        variance: Float[np.ndarray, "M"],
         noise: float,
     ) -> Expectation:
-        """Where a fitted pose has its markers, and how far they may be from there.
-
-        Args:
-            qpos: The pose.
-            targets: The markers that it was fitted to [m]; NaN where missing.
-            angles: Where its hinges were believed to be before the fit [rad].
-            precision: How surely, and after them the wrist where the pose has it.
-            noise: Standard deviation of those markers around the pose's [m].
-        """
+        """Where a fitted pose has its markers, and how far they may be from there; see `expect_markers`."""
         expected = expectation(len(self.hand.digits))
         expect_markers(
-            self.hand,
-            self._on_part,
-            np.array(qpos, dtype=np.float64),
-            np.array(targets, dtype=np.float64, order="C"),
-            np.array(angles, dtype=np.float64),
-            np.array(precision, dtype=np.float64, order="C"),
-            noise**-2,
-            expected,
+            self.hand, self._on_part, qpos, target, belief, wrist_spread, variance, noise, expected
         )
         return expected
 
@@ -195,19 +217,10 @@ def solve_poses(
     targets: Float[np.ndarray, "T M 3"],
     *,
     initial: Float[np.ndarray, "T 27"] | None = None,
-    iterations: int = 30,
+    iterations: int = _MOST_STEPS,
 ) -> PoseFit:
     """`PoseSolver.solve` for one use of a hand and its glove."""
     return PoseSolver(model, attachment).solve(targets, initial, iterations=iterations)
-
-
-def move(qpos: Float[np.ndarray, "T 27"], step: Float[np.ndarray, "T 26"]) -> Float[np.ndarray, "T 27"]:
-    """Poses after a step along MuJoCo's velocities: the wrist turns in its own frame."""
-    moved = np.empty_like(qpos)
-    moved[:, :3] = qpos[:, :3] + step[:, :3]
-    moved[:, 3:7] = multiply_quaternions(qpos[:, 3:7], vector_quaternions(step[:, 3:6]))
-    moved[:, 7:] = qpos[:, 7:] + step[:, 6:]
-    return moved
 
 
 def _rows(prediction: Prediction | None, frames: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

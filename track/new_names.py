@@ -16,7 +16,7 @@ from handsim.topology import DIGITS
 from track.combining import combine
 from track.digit_search import NEVER, DigitNamings, digit_namings, search_digit
 from track.hand_memory import Coming, Estimate, HandMemory
-from track.hinge_belief import belief_of_digit
+from track.hinge_belief import believe_digit
 from track.matching import gains, match, worth_of
 from track.starting_poses import write_rotation
 
@@ -159,7 +159,8 @@ def _search(
     kept[np.arange(len(own)), np.searchsorted(markers, names[hand.number, own])] = credit[own]
     turn = np.empty((3, 3))
     write_rotation(estimate.qpos[3:7], turn)
-    believed, trust = belief_of_digit(hand.coming.hinges, estimate.expected, digit)
+    believed, trust = np.empty(4), np.empty((4, 4))
+    believe_digit(hand.coming.hinges, estimate.expected.told, estimate.expected.pull, digit, believed, trust)
     namings = digit_namings(len(candidates), len(markers))
     search_digit(
         memory.adapted,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.topology import NUM_QPOS
-from handsim.transforms import multiply_quaternions, quaternion_vectors
 from track.inverse_kinematics import PoseFit, PoseSolver
 from track.tracked_frame import Status, TrackedHand
 from track.user import UserHand
@@ -79,13 +78,3 @@ class PlainHand:
         return TrackedHand(
             self.hand.side, Status.LOST, np.full(NUM_QPOS, np.nan), np.nan, nowhere, np.arange(0)
         )
-
-
-def velocity_of(
-    before: Float[np.ndarray, "27"], after: Float[np.ndarray, "27"], span: float
-) -> Float[np.ndarray, "26"]:
-    """How fast a hand went from one pose to another in a time [s], as `move` counts."""
-    back = before[3:7] * np.array([1.0, -1.0, -1.0, -1.0])
-    turn = quaternion_vectors(multiply_quaternions(back[None], after[None, 3:7]))[0]
-    speed: NDArray[np.float64] = np.concatenate([after[:3] - before[:3], turn, after[7:] - before[7:]]) / span
-    return speed

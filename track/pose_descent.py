@@ -9,6 +9,7 @@ import numpy as np
 
 from handsim.topology import NUM_JOINTS
 from track.gloved_hand import FAST, NUM_UNKNOWNS, gather, place_markers
+from track.pose_motion import turn_by
 
 MARKER_NOISE: Final = 0.001  # [m] one standard deviation, which everything else is weighed against
 _MARKER_WEIGHT: Final = MARKER_NOISE**-2
@@ -171,17 +172,7 @@ def move_wrist(qpos: Any, step: Any, moved: Any) -> None:
     moved[0] = qpos[0] + a + 2.0 * (w * i + y * k - z * j)
     moved[1] = qpos[1] + b + 2.0 * (w * j + z * i - x * k)
     moved[2] = qpos[2] + c + 2.0 * (w * k + x * j - y * i)
-    a, b, c = step[NUM_JOINTS + 3], step[NUM_JOINTS + 4], step[NUM_JOINTS + 5]
-    angle = np.sqrt(a * a + b * b + c * c)
-    share = 0.5 if angle < 1e-8 else np.sin(0.5 * angle) / angle
-    e, a, b, c = np.cos(0.5 * angle), share * a, share * b, share * c
-    moved[3] = w * e - x * a - y * b - z * c
-    moved[4] = w * a + x * e + y * c - z * b
-    moved[5] = w * b - x * c + y * e + z * a
-    moved[6] = w * c + x * b - y * a + z * e
-    scale = 1.0 / np.sqrt(moved[3] ** 2 + moved[4] ** 2 + moved[5] ** 2 + moved[6] ** 2)
-    for n in range(3, 7):
-        moved[n] *= scale
+    turn_by(qpos[3:7], step[NUM_JOINTS + 3 : NUM_JOINTS + 6], moved[3:7])
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -262,6 +262,8 @@ def _tracked(
         return TrackedHand(memory.hand.side, status, np.full(NUM_QPOS, np.nan), np.nan, nothing, np.arange(0))
     markers, mine = memory.places.copy(), names >= 0
     markers[names[mine]] = points[mine]
-    filled = np.setdiff1d(np.arange(count), names[mine])
+    there = np.zeros(count, dtype=bool)
+    there[names[mine]] = True
+    filled = np.flatnonzero(~there)
     rms = np.nan if fit is None else fit.rms
     return TrackedHand(memory.hand.side, status, memory.qpos, rms, markers, filled)

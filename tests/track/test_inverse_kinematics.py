@@ -16,7 +16,8 @@ from handsim.topology import SIDES
 from handsim.transforms import multiply_quaternions, quaternion_matrix, random_quaternions
 from poses.motions import sample_motion
 from poses.validity import resting_angles, sample_valid_angles
-from track.inverse_kinematics import PoseSolver, Prediction, move, solve_poses
+from track.inverse_kinematics import PoseSolver, Prediction, solve_poses
+from track.pose_motion import move
 
 INDEX = slice(11, 15)  # of qpos
 
