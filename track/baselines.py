@@ -13,9 +13,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from handsim.errors import ShapeError
-from track.pose_motion import move
 from track.plain_hand import MOST_RMS, PlainHand
-from track.pose_motion import velocity_of
+from track.pose_motion import move, velocity_of
 from track.proposals import name_by_proximity
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.user import UserHand

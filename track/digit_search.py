@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from handsim.topology import DIGITS
+from track.expectation import Expectation
 from track.gloved_hand import (
     FAST,
     GlovedHand,
@@ -23,7 +24,9 @@ from track.gloved_hand import (
     place_markers,
     workspace,
 )
+from track.hinge_belief import HingeBelief, believe_digit
 from track.small_systems import eliminate, solve_positive
+from track.starting_poses import write_rotation
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -62,57 +65,95 @@ def digit_ranges(hand: GlovedHand) -> DigitRanges:
 
 
 class DigitNamings(NamedTuple):
-    """The best naming of every set of points, a row a set: bit n is the digit's n-th candidate."""
+    """For each digit the best naming of every set of points, a row a set: bit n is its n-th candidate."""
 
-    scores: Float[np.ndarray, "S"]
+    scores: Float[np.ndarray, "D S"]
     """Log odds against all points being strays; far below zero where there is none."""
-    runners_up: Float[np.ndarray, "S"]
+    runners_up: Float[np.ndarray, "D S"]
     """The same of the next best naming of the same points."""
-    names: Int[np.ndarray, "S K"]
+    names: Int[np.ndarray, "D S K"]
     """Candidate of each of the digit's markers, -1 for none."""
 
 
-def digit_namings(num_candidates: int, num_markers: int) -> DigitNamings:
-    """Room for one digit's."""
-    sets = 1 << num_candidates
-    return DigitNamings(
-        np.full(sets, -NEVER), np.full(sets, -NEVER), np.full((sets, num_markers), -1, dtype=np.int64)
-    )
+def digit_namings(num_digits: int, num_candidates: int, num_markers: int) -> DigitNamings:
+    """Room for the namings of some digits."""
+    sets = num_digits, 1 << num_candidates
+    return DigitNamings(np.full(sets, -NEVER), np.full(sets, -NEVER), np.full((*sets, num_markers), -1))
+
+
+class DigitTrust(NamedTuple):
+    """What a digit's points are measured by."""
+
+    belief: HingeBelief
+    """What was believed of the hand's hinges before its markers were asked."""
+    seen: Expectation
+    """What they said."""
+    variance: Float[np.ndarray, "M"]
+    """Of each marker around its place [m^2]."""
+    worth: Float[np.ndarray, "M"]
+    """What naming a point is worth that lies where its marker is expected."""
+    slack: Float[np.ndarray, "M"]
+    """How far each marker may be off its place on the hand of the ranges [m]."""
+    ranges: DigitRanges
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def search_digit(
     hand: Any,
-    ranges: Any,
+    trusted: Any,
     digit: Any,
     markers: Any,
     points: Any,
-    credit: Any,
-    variance: Any,
-    worth: Any,
-    slack: Any,
-    posed: Any,
-    coming: Any,
-    trust: Any,
-    namings: Any,
+    candidates: Any,
+    odds: Any,
+    scores: Any,
+    runners_up: Any,
+    names: Any,
 ) -> None:
     """Try all namings of points as markers of one digit.
 
     Args:
         hand: The hand, its markers where their habits have them.
-        ranges: See `digit_ranges`.
+        trusted: See `DigitTrust`.
         digit: Which digit.
         markers: Its markers (K,).
-        points: Candidates (C, 3) [m] in the wrist's frame.
-        credit: What each name is worth to each point (C, K) beyond the fit, for the IDs' sake.
-        variance: Of each marker (M,) around its place [m^2].
-        worth: What naming a point is worth that lies where its marker is expected (M,).
-        slack: How far each marker may be off its place on the hand of the ranges (M,) [m].
-        posed: Angles (20,) [rad] of the whole hand: skin between two fingers moves with both.
-        coming: Angles (4,) [rad] that the hinges were coming to.
-        trust: How surely (4, 4) [1/rad^2].
-        namings: What is filled.
+        points: The frame's points (N, 3) [m].
+        candidates: Those that the digit may take (C,).
+        odds: What each name is worth to each point (N, M) beyond the fit, for the IDs' sake.
+        scores: The digit's row of `DigitNamings`, filled, as are the next two.
+        runners_up: See there.
+        names: See there.
     """
+    posed, wrist = trusted.seen.qpos, np.empty((3, 3))
+    write_rotation(posed[3:7], wrist)
+    near, credit = np.zeros((len(candidates), 3)), np.empty((len(candidates), len(markers)))
+    for number, point in enumerate(candidates):
+        for i in range(3):
+            for j in range(3):
+                near[number, i] += (points[point, j] - posed[j]) * wrist[j, i]
+        for place, marker in enumerate(markers):
+            credit[number, place] = odds[point, marker]
+    coming, trust = np.empty(4), np.empty((4, 4))
+    believe_digit(trusted.belief, trusted.seen.told, trusted.seen.pull, digit, coming, trust)
+    _try_all(hand, trusted, digit, markers, near, credit, posed[7:], coming, trust, scores, runners_up, names)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _try_all(
+    hand: Any,
+    trusted: Any,
+    digit: Any,
+    markers: Any,
+    points: Any,
+    credit: Any,
+    posed: Any,
+    coming: Any,
+    trust: Any,
+    scores: Any,
+    runners_up: Any,
+    names: Any,
+) -> None:
+    """Fit all namings that may be the best of their points, those with fewer names before those with more."""
     count, choices = len(markers), len(points) + 1
     work = workspace(len(hand.digits))
     place_markers(hand, posed, work)
@@ -121,7 +162,7 @@ def search_digit(
     starts = 2 if np.abs(coming - own).max() > _APART else 1
     total = choices**count
     misfits, poses = np.zeros(total), np.empty((total, 4))
-    below = np.full(len(namings.scores), -NEVER)
+    below = np.full(len(scores), -NEVER)
     poses[0] = coming
     for number in range(total):
         chosen = _read_naming(number, choices, naming)
@@ -129,26 +170,28 @@ def search_digit(
         misfits[number], poses[number] = misfits[smaller], poses[smaller]
         if number > 0 and misfits[smaller] >= NEVER:
             continue
-        most = _most(ranges, markers, points, credit, worth, slack, naming)
+        most = _most(trusted, markers, points, credit, naming)
         if most <= -NEVER:
             misfits[number] = NEVER
             continue
         best = most - misfits[smaller]
-        beaten = _best_below(chosen, namings.scores, below)
-        if best <= max(namings.runners_up[chosen], max(namings.scores[chosen], beaten) - _CLEAR):
+        beaten = _best_below(chosen, scores, below)
+        if best <= max(runners_up[chosen], max(scores[chosen], beaten) - _CLEAR):
             continue
         score = -NEVER
         for start in range(starts):
             angles[:] = poses[smaller] if start == 0 else own
-            misfit, gap = _fit(hand, digit, markers, points, variance, naming, coming, trust, angles, work)
+            misfit, gap = _fit(
+                hand, digit, markers, points, trusted.variance, naming, coming, trust, angles, work
+            )
             if most - misfit - gap > score:
                 score = most - misfit - gap
                 misfits[number], poses[number] = misfit, angles
-        if score > namings.scores[chosen]:
-            namings.runners_up[chosen], namings.scores[chosen] = namings.scores[chosen], score
-            namings.names[chosen] = naming
-        elif score > namings.runners_up[chosen]:
-            namings.runners_up[chosen] = score
+        if score > scores[chosen]:
+            runners_up[chosen], scores[chosen] = scores[chosen], score
+            names[chosen, :count] = naming
+        elif score > runners_up[chosen]:
+            runners_up[chosen] = score
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -188,14 +231,14 @@ def _best_below(chosen: Any, scores: Any, below: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _most(ranges: Any, markers: Any, points: Any, credit: Any, worth: Any, slack: Any, naming: Any) -> Any:
+def _most(trusted: Any, markers: Any, points: Any, credit: Any, naming: Any) -> Any:
     """What a naming is worth if every point lies where it should; far below zero if they cannot."""
-    total = 0.0
+    ranges, slack, total = trusted.ranges, trusted.slack, 0.0
     for place in range(len(markers)):
         point = naming[place]
         if point < 0:
             continue
-        total += worth[markers[place]] + credit[point, place]
+        total += trusted.worth[markers[place]] + credit[point, place]
         for other in range(place):
             if naming[other] < 0:
                 continue

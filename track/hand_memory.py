@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from handsim.topology import BONES, DIGITS, NUM_JOINTS
-from track.digit_search import digit_ranges
+from track.digit_search import DigitTrust, digit_ranges
 from track.expectation import Expectation
 from track.hinge_belief import HingeBelief, foresee, resting_covariance
 from track.inverse_kinematics import FEWEST_MARKERS, PoseSolver
+from track.matching import worth_of
 from track.pose_motion import move, velocity_of
 from track.user import UserHand
 
@@ -95,7 +96,7 @@ class HandMemory:
         self._seen = np.zeros(count)
         self.adapted = self.solver.hand
         self._designed = self.adapted.places[:, 0].copy()
-        self.ranges = digit_ranges(self.adapted)
+        self._ranges = digit_ranges(self.adapted)
         self._hinges = resting_covariance()
         self.places = np.full((count, 3), np.nan)
 
@@ -122,7 +123,12 @@ class HandMemory:
         qpos, rms, residuals = coming.qpos, np.nan, np.full_like(targets, np.nan)
         if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
             fit = self.solver.follow(
-                targets, start, coming.hinges.angles, coming.hinges.spread, coming.qpos[:7], coming.wrist_spread
+                targets,
+                start,
+                coming.hinges.angles,
+                coming.hinges.spread,
+                coming.qpos[:7],
+                coming.wrist_spread,
             )
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
         expected = self.solver.expect(
@@ -135,11 +141,11 @@ class HandMemory:
         )
         return Estimate(expected.qpos, rms, residuals, expected)
 
-    @property
-    def slack(self) -> Float[np.ndarray, "M"]:
-        """How far each marker may be off where the hand as it was given has it [m]."""
-        slack: NDArray[np.float64] = 2.5 * np.sqrt(self.variance) + np.linalg.norm(self._habit, axis=1)
-        return slack
+    def trust(self, coming: Coming, estimate: Estimate) -> DigitTrust:
+        """What new points of a digit are measured by."""
+        slack = 2.5 * np.sqrt(self.variance) + np.sqrt((self._habit**2).sum(axis=1))
+        worth = worth_of(self.variance)
+        return DigitTrust(coming.hinges, estimate.expected, self.variance, worth, slack, self._ranges)
 
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
         """Log chance of each marker to come back when it did, were it the point that was born then [s]."""

@@ -8,26 +8,20 @@ same points, of one hand or of two that touch, the best of all their namings tog
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from handsim.topology import DIGITS
-from track.combining import combine
-from track.digit_search import NEVER, DigitNamings, digit_namings, search_digit
+from track.combining import elect
+from track.digit_search import DigitNamings, digit_namings, search_digit
 from track.hand_memory import Coming, Estimate, HandMemory
-from track.hinge_belief import believe_digit
-from track.matching import gains, match, worth_of
-from track.starting_poses import write_rotation
+from track.matching import gains, match
+from track.reaching import MOST_CANDIDATES, Crowd, Reach, find_reach
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
-
-_REACH_WHOLE, _REACH_MISSING = 0.012, 0.05  # [m] around a marker seen or not: points that may be its
-_MOST_CANDIDATES: Final = 7  # points that are tried on a digit
-YOUNG: Final = 4.0
-"""Credit below which a name stands for re-election."""
 
 
 class Following(NamedTuple):
@@ -37,25 +31,6 @@ class Following(NamedTuple):
     memory: HandMemory
     coming: Coming
     estimate: Estimate
-
-
-class _Digit(NamedTuple):
-    """A digit and the points that are named its markers."""
-
-    hand: Following
-    digit: int
-    markers: NDArray[np.int64]
-    own: NDArray[np.int64]
-    missing: NDArray[np.int64]
-
-
-class _Search(NamedTuple):
-    """A digit, the points it may have, and what they are worth to it."""
-
-    number: int
-    markers: NDArray[np.int64]
-    candidates: NDArray[np.int64]
-    namings: DigitNamings
 
 
 def name_new(
@@ -78,30 +53,28 @@ def name_new(
         How sure each name is that has changed; NaN for those that have not.
     """
     sure = np.full(len(points), np.nan)
+    if not hands:
+        return sure
     for hand in hands:
         _name_palm(hand, points, names, born, sure)
-    young = (names >= 0).any(axis=0) & (credit < YOUNG)
-    free = np.asarray((names < 0).all(axis=0), dtype=bool)
-    everywhere = [hand.estimate.places for hand in hands]
-    if not young.any() and not any(
-        _near(points[free], places, _REACH_MISSING).any() for places in everywhere
-    ):
+    crowd = _crowd(hands, names)
+    reach = find_reach(points, credit, crowd, len(hands) * len(DIGITS))
+    if not reach.counts.any():
         return sure
-    digits = [_digit(hand, digit, names) for hand in hands for digit in range(len(DIGITS))]
-    contested = np.zeros(len(points), dtype=bool)
-    for one in digits:
-        rivals = one.own[young[one.own]]
-        for other in digits:
-            if other is not one and len(rivals) and len(other.missing):
-                places = other.hand.estimate.places[other.missing]
-                contested[rivals[_near(points[rivals], places, _REACH_MISSING)]] = True
-    searches = [
-        search
-        for one in digits
-        if (search := _search(one, points, names, free, contested, credit, born)) is not None
-    ]
-    for group in _groups(searches):
-        _elect(group, names, sure)
+    markers = _markers_of_digits(crowd.parts, len(reach.counts))
+    namings = digit_namings(len(reach.counts), MOST_CANDIDATES, markers.shape[1])
+    first = 0
+    for place, hand in enumerate(hands):
+        digits = slice(place * len(DIGITS), (place + 1) * len(DIGITS))
+        part = Reach(*(values[digits] for values in reach))
+        rows = DigitNamings(*(values[digits] for values in namings))
+        _search(hand, points, names[hand.number], part, markers[digits] - first, credit, born, rows)
+        first += hand.memory.num_markers
+    before, margins = crowd.owners.copy(), np.full(len(points), np.nan)
+    elect(reach, namings, markers, crowd.owners, margins)
+    changed = before != crowd.owners
+    sure[changed] = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
+    _write_names(hands, crowd.owners, names)
     return sure
 
 
@@ -125,107 +98,59 @@ def _name_palm(
     mine[chosen], sure[chosen] = palm[found[found >= 0]], how_sure[found >= 0]
 
 
-def _digit(hand: Following, digit: int, names: NDArray[np.int64]) -> _Digit:
-    markers = np.flatnonzero(hand.memory.digits == digit)
-    mine = names[hand.number]
-    own = np.flatnonzero((mine >= 0) & (hand.memory.digits[mine] == digit))
-    there = set(mine[own].tolist())
-    missing = np.array([marker for marker in markers.tolist() if marker not in there], dtype=np.int64)
-    return _Digit(hand, digit, markers, own, missing)
+def _crowd(hands: Sequence[Following], names: NDArray[np.int64]) -> Crowd:
+    owners, parts, first = np.full(names.shape[1], -1), [], 0
+    for place, hand in enumerate(hands):
+        mine, digits = names[hand.number], hand.memory.digits
+        owners[mine >= 0] = first + mine[mine >= 0]
+        parts.append(np.where(digits >= 0, place * len(DIGITS) + digits, -1))
+        first += hand.memory.num_markers
+    places = np.concatenate([hand.estimate.places for hand in hands])
+    return Crowd(places, np.concatenate(parts), owners)
+
+
+def _markers_of_digits(parts: NDArray[np.int64], num_digits: int) -> NDArray[np.int64]:
+    """Markers of each digit (D, K), -1 where there are fewer."""
+    found = [np.flatnonzero(parts == digit) for digit in range(num_digits)]
+    markers = np.full((num_digits, max(map(len, found))), -1)
+    for row, mine in zip(markers, found, strict=True):
+        row[: len(mine)] = mine
+    return markers
 
 
 def _search(
-    one: _Digit,
+    hand: Following,
     points: NDArray[np.float64],
     names: NDArray[np.int64],
-    free: NDArray[np.bool_],
-    contested: NDArray[np.bool_],
+    reach: Reach,
+    markers: NDArray[np.int64],
     credit: NDArray[np.float64],
     born: NDArray[np.float64],
-) -> _Search | None:
-    """Everything a digit may take, if there is anything to decide."""
-    hand, digit, markers, own, missing = one
-    memory, estimate, places = hand.memory, hand.estimate, hand.estimate.places
-    near = free & _near(points, places[markers], _REACH_WHOLE)
-    near |= (free | contested) & _near(points, places[missing], _REACH_MISSING)
-    near[own] = False
-    rivals = np.flatnonzero(near)
-    if not (len(rivals) or contested[own].any() or (len(missing) and (credit[own] < YOUNG).any())):
-        return None
-    apart = np.linalg.norm(points[rivals, None] - places[markers], axis=-1).min(axis=1)
-    rivals = rivals[np.argsort(apart)[: _MOST_CANDIDATES - len(own)]]
-    candidates = np.concatenate([own, rivals])
-    kept = memory.chances(born[candidates])[:, markers]
-    kept[np.arange(len(own)), np.searchsorted(markers, names[hand.number, own])] = credit[own]
-    turn = np.empty((3, 3))
-    write_rotation(estimate.qpos[3:7], turn)
-    believed, trust = np.empty(4), np.empty((4, 4))
-    believe_digit(hand.coming.hinges, estimate.expected.told, estimate.expected.pull, digit, believed, trust)
-    namings = digit_namings(len(candidates), len(markers))
-    search_digit(
-        memory.adapted,
-        memory.ranges,
-        digit,
-        markers,
-        np.ascontiguousarray((points[candidates] - estimate.qpos[:3]) @ turn),
-        kept,
-        memory.variance,
-        worth_of(memory.variance),
-        memory.slack,
-        estimate.qpos[7:].copy(),
-        believed,
-        trust,
-        namings,
-    )
-    return _Search(hand.number, markers, candidates, namings)
+    namings: DigitNamings,
+) -> None:
+    """Try the points that one hand's digits may take."""
+    if not reach.counts.any():
+        return
+    memory, estimate = hand.memory, hand.estimate
+    odds, named = memory.chances(born), np.flatnonzero(names >= 0)
+    odds[named, names[named]] = credit[named]
+    trusted = memory.trust(hand.coming, estimate)
+    for digit in np.flatnonzero(reach.counts):
+        search_digit(
+            memory.adapted,
+            trusted,
+            digit,
+            markers[digit, markers[digit] >= 0],
+            points,
+            reach.candidates[digit, : reach.counts[digit]],
+            odds,
+            *(values[digit] for values in namings),
+        )
 
 
-def _near(points: NDArray[np.float64], places: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
-    near: NDArray[np.bool_] = (np.linalg.norm(points[:, None] - places, axis=-1) < reach).any(axis=1)
-    return near
-
-
-def _groups(searches: list[_Search]) -> list[list[_Search]]:
-    """Searches that reach for the same points, directly or through others."""
-    groups: list[list[_Search]] = []
-    for search in searches:
-        apart, joined = [], [search]
-        for group in groups:
-            if any(np.isin(other.candidates, search.candidates).any() for other in group):
-                joined += group
-            else:
-                apart.append(group)
-        groups = [*apart, joined]
-    return groups
-
-
-def _elect(group: list[_Search], names: NDArray[np.int64], sure: NDArray[np.float64]) -> None:
-    """Take the best of a group's namings together; a digit is as sure as its next best is worse."""
-    everyone = np.unique(np.concatenate([search.candidates for search in group]))
-    rows = [np.flatnonzero(search.namings.scores > -NEVER) for search in group]
-    rows = [row[np.argsort(-search.namings.scores[row])] for row, search in zip(rows, group, strict=True)]
-    counts = np.array([len(row) for row in rows])
-    scores, sets = np.full((len(group), counts.max()), -NEVER), np.zeros((len(group), counts.max()), np.int64)
-    for place, (row, search) in enumerate(zip(rows, group, strict=True)):
-        scores[place, : len(row)] = search.namings.scores[row]
-        bits = 1 << np.searchsorted(everyone, search.candidates)
-        sets[place, : len(row)] = ((row[:, None] >> np.arange(len(bits))) & 1) @ bits
-    best, other = np.zeros((2, len(group)), dtype=np.int64)
-    banned = np.full(len(group), -1)
-    total = combine(scores, sets, counts, banned, best)
-    before = names[:, everyone].max(axis=0), names[:, everyone].argmax(axis=0)
-    names[:, everyone] = -1
-    margins = np.full(len(everyone), np.inf)
-    for place, search in enumerate(group):
-        row = rows[place][best[place]]
-        chosen = search.namings.names[row]
-        names[search.number, search.candidates[chosen[chosen >= 0]]] = search.markers[chosen >= 0]
-        banned[place] = best[place]
-        rival = combine(scores, sets, counts, banned, other)
-        banned[place] = -1
-        rival = max(rival, total - scores[place, best[place]] + search.namings.runners_up[row])
-        touched = np.searchsorted(everyone, search.candidates)
-        margins[touched] = np.minimum(margins[touched], total - rival)
-    after = names[:, everyone].max(axis=0), names[:, everyone].argmax(axis=0)
-    changed = (before[0] != after[0]) | ((after[0] >= 0) & (before[1] != after[1]))
-    sure[everyone[changed]] = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
+def _write_names(hands: Sequence[Following], owners: NDArray[np.int64], names: NDArray[np.int64]) -> None:
+    first = 0
+    for hand in hands:
+        last = first + hand.memory.num_markers
+        names[hand.number] = np.where((owners >= first) & (owners < last), owners - first, -1)
+        first = last

@@ -18,7 +18,8 @@ from track.finding import MOST_RMS, Found, HandFinder
 from track.hand_memory import Estimate, HandMemory
 from track.intake import Incoming, Intake
 from track.naming import fit_names, forget_surprises, targets_of
-from track.new_names import YOUNG, Following, name_new
+from track.new_names import Following, name_new
+from track.reaching import YOUNG
 from track.rigid_body import BodyTracker, RigidTemplate
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
 from track.user import UserHand

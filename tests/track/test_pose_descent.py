@@ -13,8 +13,8 @@ from handsim.model import HandModel, join_qpos
 from handsim.transforms import random_quaternions
 from poses.validity import sample_valid_angles
 from track.gloved_hand import gloved_hand, workspace
-from track.pose_motion import move
 from track.pose_descent import MARKER_NOISE, descend, move_wrist
+from track.pose_motion import move
 
 
 def costs(model, glove, target, centre, pull, tightness):
