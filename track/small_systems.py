@@ -12,7 +12,7 @@ from track.gloved_hand import FAST
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def invert_positive(matrix: Any) -> None:
-    """Overwrite a symmetric positive-definite matrix (N, N), of which the lower triangle is read, by its inverse."""
+    """Overwrite a symmetric positive-definite matrix (N, N) by its inverse; its lower triangle is read."""
     count = len(matrix)
     for row in range(count):
         for column in range(row + 1):
