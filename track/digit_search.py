@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 _STEPS: Final = 10
+_SMALL_GAIN: Final = 0.01  # of a misfit
 _APART: Final = np.deg2rad(5.0)  # between two starts, or one will do
 _LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
 _FREEDOM: Final = 20.0  # squared deviations of a prior from which on it loses its say
@@ -174,15 +175,15 @@ def _try_all(
         if most <= -NEVER:
             misfits[number] = NEVER
             continue
-        best = most - misfits[smaller]
         beaten = _best_below(chosen, scores, below)
-        if best <= max(runners_up[chosen], max(scores[chosen], beaten) - _CLEAR):
+        hopeless = most - max(runners_up[chosen], max(scores[chosen], beaten) - _CLEAR)
+        if misfits[smaller] >= hopeless:
             continue
         score = -NEVER
         for start in range(starts):
             angles[:] = poses[smaller] if start == 0 else own
             misfit, gap = _fit(
-                hand, digit, markers, points, trusted.variance, naming, coming, trust, angles, work
+                hand, digit, markers, points, trusted.variance, naming, coming, trust, hopeless, angles, work
             )
             if most - misfit - gap > score:
                 score = most - misfit - gap
@@ -265,36 +266,58 @@ def _fit(
     naming: Any,
     coming: Any,
     trust: Any,
+    hopeless: Any,
     angles: Any,
     work: Any,
 ) -> Any:
     """Bring four hinges to a minimum; returns the misfit of named points and hinges, and what it leaves open.
 
     That is half the logarithm of how much surer the hinges are than before (Laplace): a naming that any pose
-    would fit says little.
+    would fit says little. A misfit that is `hopeless` and would stay so is left where it is.
     """
-    trial, factor, rest = angles.copy(), np.empty((4, 4)), np.empty(4)
+    trial, factor, step = angles.copy(), np.empty((4, 4)), np.empty(4)
     normal, gradient = np.empty((4, 4)), np.empty(4)
+    new_normal, new_gradient = np.empty((4, 4)), np.empty(4)
     cost = _gather(
         hand, digit, markers, points, variance, naming, coming, trust, angles, work, normal, gradient
     )
     damping = 1e-3
     for _ in range(_STEPS):
         for row in range(4):
-            rest[row] = -gradient[row]
+            step[row] = -gradient[row]
             for column in range(4):
                 factor[row, column] = normal[row, column]
             factor[row, row] *= 1.0 + damping
-        solve_positive(factor, rest)
+        solve_positive(factor, step)
+        gain = 0.0
         for row in range(4):
-            trial[row] = angles[row] + rest[row]
+            gain -= gradient[row] * step[row]
+            trial[row] = angles[row] + step[row]
+        if gain < _SMALL_GAIN:
+            break
+        if cost - 2.0 * gain > hopeless:
+            cost -= 2.0 * gain
+            break
         tried = _gather(
-            hand, digit, markers, points, variance, naming, coming, trust, trial, work, normal, gradient
+            hand,
+            digit,
+            markers,
+            points,
+            variance,
+            naming,
+            coming,
+            trust,
+            trial,
+            work,
+            new_normal,
+            new_gradient,
         )
         if tried < cost:
-            small = cost - tried < 0.01
+            small = cost - tried < _SMALL_GAIN
             cost = tried
             angles[:] = trial
+            normal[:] = new_normal
+            gradient[:] = new_gradient
             damping = max(damping * 0.1, 1e-9)
             if small:
                 break
@@ -302,9 +325,6 @@ def _fit(
             damping *= 30.0
             if damping > 1e5:
                 break
-            _gather(
-                hand, digit, markers, points, variance, naming, coming, trust, angles, work, normal, gradient
-            )
     return cost, 0.5 * (_log_determinant(normal) - _log_determinant(trust))
 
 
@@ -334,14 +354,19 @@ def _gather(
         marker, point = markers[place], points[naming[place]]
         place_marker(hand, marker, work)
         find_slopes(hand, marker, work)
-        weight, slopes = 1.0 / variance[marker], work.slopes[marker]
-        for i in range(3):
-            miss = work.markers[marker, i] - point[i]
-            cost += 0.5 * weight * miss * miss
-            for row in range(4):
-                gradient[row] += weight * slopes[i, first + row] * miss
-                for column in range(4):
-                    normal[row, column] += weight * slopes[i, first + row] * slopes[i, first + column]
+        weight, slopes, placed = 1.0 / variance[marker], work.slopes[marker], work.markers[marker]
+        x, y, z = placed[0] - point[0], placed[1] - point[1], placed[2] - point[2]
+        cost += 0.5 * weight * (x * x + y * y + z * z)
+        for row in range(4):
+            a, b, c = slopes[0, first + row], slopes[1, first + row], slopes[2, first + row]
+            a, b, c = weight * a, weight * b, weight * c
+            gradient[row] += a * x + b * y + c * z
+            for column in range(row + 1):
+                other = first + column
+                normal[row, column] += a * slopes[0, other] + b * slopes[1, other] + c * slopes[2, other]
+    for row in range(4):
+        for column in range(row):
+            normal[column, row] = normal[row, column]
     away = 0.0
     for row in range(4):
         for column in range(4):

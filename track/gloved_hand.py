@@ -187,26 +187,24 @@ def _turn(own: Any, axis: Any, angle: Any, outside: Any) -> None:
 def find_slopes(hand: Any, marker: Any, work: Any) -> None:
     """Derivatives of one marker by all unknowns, in the wrist's frame."""
     slopes = work.slopes[marker]
-    for i in range(3):
-        for hinge in range(hand.reach[marker, 0], hand.reach[marker, 1]):
-            slopes[i, hinge] = 0.0
-    for slot in range(4):
-        bone = hand.bones[marker, slot]
-        if bone < 0:
-            break
-        if bone == 0:
-            continue
-        digit, place = (bone - 1) // 3, (bone - 1) % 3
-        share = hand.shares[marker, slot]
-        for number in range(place + 2):
-            hinge, anchor = 4 * digit + number, 1 + 3 * digit + max(0, number - 1)
-            x = work.carried[marker, slot, 0] - share * work.origins[anchor, 0]
-            y = work.carried[marker, slot, 1] - share * work.origins[anchor, 1]
-            z = work.carried[marker, slot, 2] - share * work.origins[anchor, 2]
-            a, b, c = work.axes[hinge, 0], work.axes[hinge, 1], work.axes[hinge, 2]
-            slopes[0, hinge] += b * z - c * y
-            slopes[1, hinge] += c * x - a * z
-            slopes[2, hinge] += a * y - b * x
+    for digit in range(hand.reach[marker, 0] // 4, hand.reach[marker, 1] // 4):
+        x, y, z, share = 0.0, 0.0, 0.0, 0.0
+        for place in range(2, -1, -1):  # a hinge moves what hangs on its own bone and on those beyond
+            bone = 1 + 3 * digit + place
+            for slot in range(4):
+                if hand.bones[marker, slot] == bone:
+                    x += work.carried[marker, slot, 0]
+                    y += work.carried[marker, slot, 1]
+                    z += work.carried[marker, slot, 2]
+                    share += hand.shares[marker, slot]
+            p = x - share * work.origins[bone, 0]
+            q = y - share * work.origins[bone, 1]
+            r = z - share * work.origins[bone, 2]
+            for hinge in range(4 * digit + (place + 1 if place > 0 else 0), 4 * digit + place + 2):
+                a, b, c = work.axes[hinge, 0], work.axes[hinge, 1], work.axes[hinge, 2]
+                slopes[0, hinge] = b * r - c * q
+                slopes[1, hinge] = c * p - a * r
+                slopes[2, hinge] = a * q - b * p
     x, y, z = work.markers[marker, 0], work.markers[marker, 1], work.markers[marker, 2]
     slopes[1, _TURN], slopes[2, _TURN] = -z, y
     slopes[0, _TURN + 1], slopes[2, _TURN + 1] = z, -x

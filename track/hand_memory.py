@@ -7,8 +7,9 @@ which is nearly as sharp for an uncalibrated hand as for a calibrated one.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import numba
 import numpy as np
 
 from handsim.topology import BONES, DIGITS, NUM_JOINTS
@@ -168,6 +169,11 @@ class HandMemory:
         self._adapt()
         return estimate
 
+    def rms_as_designed(self, estimate: Estimate) -> float:
+        """RMS distance of the markers from where the hand as it was given would have them [m]."""
+        expected = estimate.expected
+        return float(_rms_without_habits(estimate.residuals, expected.turns, self._habit))
+
     def carry_on(self, estimate: Estimate, firm: Bool[np.ndarray, "M"], time: float) -> None:
         """Take over the pose of the next frame, and what it says of the habits of firmly named markers."""
         assert self.qpos is not None
@@ -186,19 +192,59 @@ class HandMemory:
         self._seen[there] = time
 
     def _learn(self, estimate: Estimate, firm: Bool[np.ndarray, "M"]) -> None:
-        there = np.isfinite(estimate.residuals[:, 0]) & firm
-        off = np.einsum(
-            "mji,mj->mi", estimate.expected.turns, np.where(there[:, None], estimate.residuals, 0.0)
-        )
-        self._learned[there] = np.minimum(self._learned[there] + 1.0, _MEMORY)
-        rate = np.where(there, 1.0 / np.maximum(self._learned, 1.0), 0.0)
-        self._habit += rate[:, None] * off
-        known = np.maximum(rate, 1.0 / _MEMORY) * there
-        self._variance += known * ((off**2).sum(axis=1) - self._variance)
+        expected = estimate.expected
+        _learn_habits(estimate.residuals, expected.turns, firm, self._learned, self._habit, self._variance)
         self._adapt()
 
     def _adapt(self) -> None:
-        missed = (self._habit**2).sum(axis=1)[self._learned > 0.0]
-        self._usual_miss = float(np.sqrt(missed.mean())) if len(missed) else 0.0
-        np.maximum(self._variance, _LEAST_SPREAD**2 + (_UNEVEN * self._usual_miss) ** 2, out=self._variance)
-        self.adapted.places[:, 0] = self._designed - self._habit
+        self._usual_miss = _adapt_places(
+            self._learned, self._habit, self._variance, self._designed, self.adapted.places
+        )
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _learn_habits(residuals: Any, turns: Any, firm: Any, learned: Any, habit: Any, variance: Any) -> None:
+    """Average what firmly named markers are off by, as their bones see it, and how much that varies."""
+    off = np.empty(3)
+    for marker in range(len(residuals)):
+        if not firm[marker] or np.isnan(residuals[marker, 0]):
+            continue
+        learned[marker] = min(learned[marker] + 1.0, _MEMORY)
+        square = 0.0
+        for i in range(3):
+            off[i] = 0.0
+            for j in range(3):
+                off[i] += turns[marker, j, i] * residuals[marker, j]
+            habit[marker, i] += off[i] / learned[marker]
+            square += off[i] ** 2
+        variance[marker] += (square - variance[marker]) / learned[marker]
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _adapt_places(learned: Any, habit: Any, variance: Any, designed: Any, places: Any) -> Any:
+    """Move the hand's markers to where their habits have them; returns how far they are off usually."""
+    square, count = 0.0, 0
+    for marker in range(len(learned)):
+        for i in range(3):
+            places[marker, 0, i] = designed[marker, i] - habit[marker, i]
+            square += habit[marker, i] ** 2 if learned[marker] > 0.0 else 0.0
+        count += learned[marker] > 0.0
+    square /= max(count, 1)
+    for marker in range(len(learned)):
+        variance[marker] = max(variance[marker], _LEAST_SPREAD**2 + _UNEVEN**2 * square)
+    return np.sqrt(square)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _rms_without_habits(residuals: Any, turns: Any, habit: Any) -> Any:
+    square, count = 0.0, 0
+    for marker in range(len(residuals)):
+        if np.isnan(residuals[marker, 0]):
+            continue
+        count += 1
+        for i in range(3):
+            off = residuals[marker, i]
+            for j in range(3):
+                off += turns[marker, i, j] * habit[marker, j]
+            square += off * off
+    return np.sqrt(square / count)

@@ -58,10 +58,11 @@ class Intake:
             notes.append(f"{np.sum(~usable)} of {len(points)} points are nowhere and left out")
         kept = np.flatnonzero(usable)
         points, ids = points[kept], ids[kept]
-        known, counts = np.unique(ids[ids >= 0], return_counts=True)
-        if (counts > 1).any():
-            notes.append(f"IDs of several points at once: {', '.join(map(str, known[counts > 1][:5]))}")
-            ids = np.where(np.isin(ids, known[counts > 1]), -1, ids)
+        known = [number for number in ids.tolist() if number >= 0]
+        if len(set(known)) < len(known):
+            several = sorted({number for number in known if known.count(number) > 1})
+            notes.append(f"IDs of several points at once: {', '.join(map(str, several[:5]))}")
+            ids = np.where(np.isin(ids, several), -1, ids)
         return Incoming(points, np.maximum(ids, -1), kept, self._clock, tuple(notes))
 
     def _tick(self, time: float) -> list[str]:

@@ -86,11 +86,12 @@ def _name_palm(
     sure: NDArray[np.float64],
 ) -> None:
     mine = names[hand.number]
-    missing = np.ones(hand.memory.num_markers, dtype=bool)
+    missing = hand.memory.digits < 0
     missing[mine[mine >= 0]] = False
-    palm = np.flatnonzero(missing & (hand.memory.digits < 0))
-    free = np.flatnonzero((names < 0).all(axis=0))
-    if len(palm) == 0 or len(free) == 0:
+    if not missing.any():
+        return
+    palm, free = np.flatnonzero(missing), np.flatnonzero((names < 0).all(axis=0))
+    if len(free) == 0:
         return
     odds = gains(points[free], hand.estimate.places[palm], hand.estimate.covariances[palm])
     found, how_sure = match(odds + hand.memory.chances(born[free])[:, palm])

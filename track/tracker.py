@@ -221,11 +221,13 @@ class Tracker:
         """
         for number, hand in enumerate(hands):
             named = int((names[number] >= 0).sum())
-            markers = self._memories[number].num_markers
+            fewest = _SHARE * self._memories[number].num_markers
+            if hand.status is not Status.TRACKED or named >= fewest:
+                self._trusted[number] = time
+                continue
             open_points = np.flatnonzero((np.delete(names, number, axis=0) < 0).all(axis=0))
             around = np.linalg.norm(points[open_points] - hand.qpos[:3], axis=1) < _AROUND
-            enough = hand.status is not Status.TRACKED or named >= _SHARE * markers
-            if enough or around.sum() < _SHARE * markers:
+            if around.sum() < fewest:
                 self._trusted[number] = time
             if time - self._trusted[number] < _PATIENCE:
                 continue
@@ -266,5 +268,5 @@ def _tracked(
     there = np.zeros(count, dtype=bool)
     there[names[mine]] = True
     filled = np.flatnonzero(~there)
-    rms = np.nan if fit is None else fit.rms
+    rms = np.nan if fit is None else memory.rms_as_designed(fit)
     return TrackedHand(memory.hand.side, status, memory.qpos, rms, markers, filled)
