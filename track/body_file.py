@@ -13,6 +13,7 @@ from handsim.errors import HandSimError, ShapeError, choices
 from handsim.io import atomic_write, read_toml
 from handsim.objects import named_object, object_names
 from handsim.topology import SIDES
+from track.constellation import FEWEST
 from track.rigid_body import RigidTemplate
 
 SUFFIX: Final = ".toml"
@@ -31,7 +32,8 @@ def load_body(name_or_path: str | Path) -> RigidTemplate:
     if str(name_or_path) in object_names():
         return RigidTemplate.of(named_object(str(name_or_path)))
     if path.suffix.lower() != SUFFIX:
-        unknown = choices(str(name_or_path), object_names(), noun="body")
+        ours = [name for name in object_names() if len(named_object(name).markers) >= FEWEST]
+        unknown = choices(str(name_or_path), ours, noun="body")
         raise ShapeError(f"{unknown}, or the path of a .toml file")
     table = read_toml(path, error=ShapeError)
     try:
