@@ -49,29 +49,26 @@ def learn_body(capture: Capture, name: str) -> RigidTemplate:
         )
     chosen = np.flatnonzero(counts == count)
     chosen = chosen[np.linspace(0, len(chosen) - 1, _BEGINNINGS).round().astype(int)]
-    found, said = [], None
+    found, said = [], ShapeError(f"{name}: no body")
     for number in np.unique(chosen):
         try:
             body = _body(name, frames[number].points)
         except ShapeError as error:
             said = error
             continue
-        found.append((_named(tracked := _follow(body, frames)), body, tracked))
+        tracked = _follow(body, frames)
+        found.append((sum(int((frame.labels >= 0).sum()) for frame in tracked), body, tracked))
     if not found:
-        assert said is not None
         raise said
-    _, body, tracked = max(found, key=lambda one: one[0])
+    named, body, tracked = max(found, key=lambda one: one[0])
+    if named < _ITS_OWN * counts.sum():
+        raise ShapeError(
+            f"{100.0 * named / counts.sum():.0f} % of the points keep their places on one rigid body, wanted "
+            "a capture with nothing else in it"
+        )
     for _ in range(_ROUNDS):
-        if not _named(tracked):
-            break
         body = _body(name, _places(body, frames, tracked))
         tracked = _follow(body, frames)
-    if _named(tracked) < _ITS_OWN * counts.sum():
-        share = 100.0 * _named(tracked) / counts.sum()
-        raise ShapeError(
-            f"{share:.0f} % of the points keep their places on one rigid body, wanted a capture with nothing "
-            "else in it"
-        )
     return body
 
 
@@ -84,11 +81,6 @@ def _body(name: str, places: NDArray[np.float64]) -> RigidTemplate:
 def _follow(body: RigidTemplate, frames: Sequence[StreamedFrame]) -> list[BodyFrame]:
     tracker = BodyTracker(body)
     return [tracker.step(frame.points, frame.ids, frame.time) for frame in frames]
-
-
-def _named(tracked: Sequence[BodyFrame]) -> int:
-    """Points that are the body's, in all frames."""
-    return sum(int((frame.labels >= 0).sum()) for frame in tracked)
 
 
 def _places(
