@@ -47,7 +47,7 @@ def main() -> None:
     known = [UserHand(*hand) for hand in zip(models, worn, strict=True)]
     usual = [usual_hand(load_layout("dense19"), "M", hand.shape.side) for hand in truth.hands]
     for name, hands in (("known hands", known), ("hands of size M", usual)):
-        tell(name, track(capture, Tracker(hands, labeler), hands), truth)
+        tell(name, track(capture, Tracker(hands, labeler)), truth)
 
 
 if __name__ == "__main__":

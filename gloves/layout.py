@@ -7,7 +7,6 @@ the file and metres in memory.
 
 from __future__ import annotations
 
-import json
 import math
 import textwrap
 from collections.abc import Mapping
@@ -15,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from handsim.errors import LayoutError, choices
+from handsim._toml import check_keys, number_of, quoted, tables_of, text_of, written
+from handsim.errors import HandSimError, LayoutError, choices
 from handsim.io import atomic_write, read_toml
 from handsim.topology import BONE_NAMES, BONES, DIGITS, PALM
 
@@ -25,7 +25,6 @@ _RADIUS_RANGE: Final = (0.0005, 0.015)  # [m]
 _ALONG_RANGE: Final = (-0.3, 1.3)
 _AROUND_RANGE: Final = (-180.0, 180.0)  # [deg]
 _ACROSS_RANGE: Final = (-1.0, 1.0)
-_LARGEST: Final = 1e6  # in any unit of the file; also keeps out NaN, infinity and integers beyond float
 _SHIPPED: Final = Path(__file__).parent / "layouts"
 _LAYOUT_KEYS: Final = ("name", "description", "radius_mm", "marker")
 _MARKER_KEYS: Final = ("name", "bone", "along", "around", "across")
@@ -149,7 +148,7 @@ def load_layout(name_or_path: str | Path) -> MarkerLayout:
     table = read_toml(path, error=LayoutError)
     try:
         return _parse_layout(table)
-    except LayoutError as error:
+    except HandSimError as error:
         raise LayoutError(f"{path}: {error}") from error
 
 
@@ -159,7 +158,7 @@ def save_layout(path: str | Path, layout: MarkerLayout) -> None:
     Raises:
         LayoutError: The file cannot be written.
     """
-    lines = [f"name = {_quote(layout.name)}", f"radius_mm = {_number(layout.radius * 1e3)}"]
+    lines = [f"name = {quoted(layout.name)}", f"radius_mm = {written(layout.radius * 1e3)}"]
     for marker in layout.markers:
         lines += _marker_lines(marker)
     try:
@@ -197,68 +196,29 @@ def starter_layout() -> str:
 
 def _marker_lines(marker: MarkerPlace) -> list[str]:
     """The lines of one [[marker]] table, after a blank one."""
-    lines = ["", "[[marker]]", f"name = {_quote(marker.name)}", f"bone = {_quote(marker.bone)}"]
-    lines += [f"along = {_number(marker.along)}", f"around = {_number(math.degrees(marker.around))}"]
-    return [*lines, f"across = {_number(marker.across)}"] if marker.across else lines
+    lines = ["", "[[marker]]", f"name = {quoted(marker.name)}", f"bone = {quoted(marker.bone)}"]
+    lines += [f"along = {written(marker.along)}", f"around = {written(math.degrees(marker.around))}"]
+    return [*lines, f"across = {written(marker.across)}"] if marker.across else lines
 
 
 def _parse_layout(table: Mapping[str, object]) -> MarkerLayout:
-    _check_keys(table, "the file", _LAYOUT_KEYS, optional={"description", "marker"})
-    _string(table, "description", default="")
-    tables = table.get("marker", [])
-    if not isinstance(tables, list) or not all(isinstance(entry, dict) for entry in tables):
-        raise LayoutError("marker is not a list of tables; wanted one [[marker]] table a marker")
-    markers = tuple(_parse_marker(entry, number) for number, entry in enumerate(tables, 1))
-    radius = _real(table, "radius_mm") * 1e-3
-    return MarkerLayout(_string(table, "name"), markers, radius)
+    check_keys(table, "the file", _LAYOUT_KEYS, optional=("description", "marker"))
+    text_of(table, "description", default="")
+    markers = tuple(
+        _parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)
+    )
+    radius = number_of(table, "radius_mm") * 1e-3
+    return MarkerLayout(text_of(table, "name"), markers, radius)
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
     name = table.get("name")
     owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
-    _check_keys(table, owner, _MARKER_KEYS, optional={"across"})
+    check_keys(table, owner, _MARKER_KEYS, optional=("across",))
     return MarkerPlace(
-        _string(table, "name", f"{owner}: "),
-        _string(table, "bone", f"{owner}: "),
-        along=_real(table, "along", f"{owner}: "),
-        around=math.radians(_real(table, "around", f"{owner}: ")),
-        across=_real(table, "across", f"{owner}: ", default=0.0),
+        text_of(table, "name", f"{owner}: "),
+        text_of(table, "bone", f"{owner}: "),
+        along=number_of(table, "along", f"{owner}: "),
+        around=math.radians(number_of(table, "around", f"{owner}: ")),
+        across=number_of(table, "across", f"{owner}: ", default=0.0),
     )
-
-
-def _check_keys(table: Mapping[str, object], owner: str, valid: tuple[str, ...], optional: set[str]) -> None:
-    for key in table:
-        if key not in valid:
-            raise LayoutError(f"{owner} has an {choices(key, valid, noun='key')}")
-    for key in valid:
-        if key not in table and key not in optional:
-            raise LayoutError(f"{owner} lacks the key '{key}'")
-
-
-def _string(table: Mapping[str, object], key: str, prefix: str = "", *, default: str | None = None) -> str:
-    value = table.get(key, default)
-    if not isinstance(value, str):
-        raise LayoutError(f"{prefix}{key} is {_shown(value)}, wanted text in quotes")
-    return value
-
-
-def _real(table: Mapping[str, object], key: str, prefix: str = "", *, default: float | None = None) -> float:
-    value = table.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
-        raise LayoutError(f"{prefix}{key} is {_shown(value)}, wanted a number")
-    return float(value)
-
-
-def _shown(value: object) -> str:
-    text = json.dumps(value, default=str, ensure_ascii=False)
-    return text if len(text) <= 40 else text[:40] + "..."
-
-
-def _quote(text: str) -> str:
-    """A TOML basic string, which escapes as JSON does."""
-    return json.dumps(text, ensure_ascii=False)
-
-
-def _number(value: float) -> str:
-    """A TOML float without the noise of unit conversion; never '-0.0'."""
-    return repr(round(value, 9) + 0.0)

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from gloves.archives import check_shapes, read_archive, write_archive
 from gloves.attach import Attachment
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.errors import ShapeError, choices
 from handsim.hand_records import HAND_DTYPE, pack_hand, unpack_hand
-from handsim.motion import HandMotion
+from handsim.motion import HandMotion, bridge_gaps
 from handsim.shape import HandShape
 from handsim.topology import NUM_BONES, NUM_QPOS, Side
 
@@ -145,16 +144,9 @@ class TrackedTake:
             ShapeError: The hand was never tracked.
         """
         qpos = self.qpos[:, self.hand(side)]
-        there = np.flatnonzero(np.isfinite(qpos[:, 0]))
-        if not len(there):
+        if np.isnan(qpos[:, 0]).all():
             raise ShapeError(f"the {side} hand has no pose in any frame")
-        times = np.clip(self.times, self.times[there[0]], self.times[there[-1]])
-        bridged = np.empty_like(qpos)
-        for column in (*range(3), *range(7, NUM_QPOS)):
-            bridged[:, column] = np.interp(times, self.times[there], qpos[there, column])
-        bridged[:, 3:7] = _turn_on(times, self.times[there], qpos[there, 3:7])
-        bridged[there] = qpos[there]
-        return HandMotion(bridged, self.rate)
+        return bridge_gaps(self.times, qpos, self.rate)
 
 
 def save_tracked_take(path: Path, take: TrackedTake) -> None:
@@ -279,15 +271,3 @@ def _check(take: TrackedTake) -> None:
 
 def _within(values: NDArray[Any], low: float, high: float) -> bool:
     return bool(((values >= low) & (values <= high)).all())
-
-
-def _turn_on(
-    times: NDArray[np.float64], known: NDArray[np.float64], quaternions: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Orientations between known ones, along the shortest way."""
-    if len(known) == 1:
-        return np.broadcast_to(quaternions, (len(times), 4))
-    turns: NDArray[np.float64] = Slerp(known, Rotation.from_quat(quaternions, scalar_first=True))(
-        times
-    ).as_quat(scalar_first=True)
-    return turns

@@ -29,6 +29,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "simulate": ("train.take_commands:simulate", "Simulate a capture of two hands, with its truth."),
     "calibrate": ("track.calibration_command:calibrate", "Fit hands and gloves to a user, from a capture."),
     "track": ("track.commands:track", "Follow hands through a marker capture or a live stream."),
+    "body": ("track.body_command:body", "Write a rigid body's markers as a file, to track it with."),
     "reproduce": ("track.table_commands:REPRODUCE", "Print a table of the paper with our figures beside."),
     "doctor": ("handsim.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_array
 from handsim.errors import ShapeError
@@ -73,3 +74,25 @@ class BodyMotion:
     def duration(self) -> float:
         """Time from the first frame to the last [s]."""
         return (len(self.T_world_body) - 1) / self.rate
+
+
+def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], rate: float) -> HandMotion:
+    """A motion from poses some of which are missing: straight from the pose before to the pose after.
+
+    The hand stands still before its first pose and after its last.
+
+    Args:
+        times: Time of each pose [s], growing.
+        qpos: Poses, NaN where there is none; one there must be.
+        rate: Of the motion [Hz].
+    """
+    there = np.flatnonzero(np.isfinite(qpos[:, 0]))
+    known = times[there]
+    asked = np.clip(times, known[0], known[-1])
+    bridged = np.empty_like(qpos)
+    for column in (*range(3), *range(7, NUM_QPOS)):
+        bridged[:, column] = np.interp(asked, known, qpos[there, column])
+    turns = Rotation.from_quat(qpos[there, 3:7], scalar_first=True)
+    bridged[:, 3:7] = (Slerp(known, turns)(asked) if len(known) > 1 else turns).as_quat(scalar_first=True)
+    bridged[there] = qpos[there]
+    return HandMotion(bridged, rate)

@@ -29,6 +29,11 @@ def layout(*markers: tuple[str, str]) -> str:
     return TOP + "\n".join(MARKER.format(*marker) for marker in markers)
 
 
+def body(*places: str) -> str:
+    markers = (f'[[marker]]\nname = "m{n}"\nplace_mm = {place}\n' for n, place in enumerate(places))
+    return 'name = "wand"\n' + "".join(markers)
+
+
 def rig(*positions: list[float]) -> str:
     return RIG + "\n".join(CAMERA.format(position) for position in positions)
 
@@ -61,6 +66,9 @@ def folder(tmp_path, monkeypatch):
         "words.trc": text.replace("\t1\t", "\tone\t", 1) if "\t1\t" in text else text,
         "renamed.trc": text.replace("ThumbIP", "Thumb_IP"),
         "takes.docx": "x",
+        "wand.toml": body("[0, 0, 0]", "[50, 0, 0]", "[0, 80, 0]"),
+        "in_metres.toml": body("[0, 0, 0]", "[0.05, 0, 0]", "[0, 0.08, 0]"),
+        "flat_marker.toml": body("[0, 0]", "[50, 0]", "[0, 80]"),
     }
     for name, content in files.items():
         (tmp_path / name).write_text(content)
@@ -123,6 +131,22 @@ CASES = {
     "an unknown glove to track": ["track", "good.trc", "--glove", "dense91", "--out", "out.npz"],
     "millimetres said to be metres, to track": ["track", "millimetres.trc", "--out", "out.npz"],
     "a truncated capture to track": ["track", "truncated.trc", "--out", "out.npz"],
+    "an unknown body": ["track", "good.trc", "--body", "wand", "--out", "out.npz"],
+    "no body's file": ["track", "good.trc", "--body", "missing.toml", "--out", "out.npz"],
+    "a body in metres": ["track", "good.trc", "--body", "in_metres.toml", "--out", "out.npz"],
+    "a body in a plane of two numbers": [
+        "track",
+        "good.trc",
+        "--body",
+        "flat_marker.toml",
+        "--out",
+        "out.npz",
+    ],
+    "a body with too few markers": ["track", "good.trc", "--body", "pen", "--out", "out.npz"],
+    "a body twice": ["track", "good.trc", "--body", "wand.toml", "--body", "wand.toml", "--out", "out.npz"],
+    "a body out of a capture of a hand": ["body", "good.trc", "--out", "out.toml"],
+    "a body in another kind of file": ["body", "good.trc", "--out", "out.json"],
+    "a body out of a damaged take": ["body", "damaged.truth.npz", "--out", "out.toml"],
     "an unknown user": ["track", "good.trc", "--shape", "missing.json", "--out", "out.npz"],
     "a user's file that is none": ["track", "good.trc", "--shape", "good.trc", "--out", "out.npz"],
     "a user in another kind of file": ["calibrate", "good.trc", "--out", "user.toml"],

@@ -30,8 +30,16 @@ GATE: Final = 0.02
 _LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
 
 
-class _Baseline:
-    """What both have in common: hands, and a first frame whose labels are known."""
+class GivenFirst:
+    """What both have in common: hands, and a first frame whose labels are known.
+
+    Args:
+        hands: The user's hands, each side at most once.
+        first_labels: True labels of the first frame's points, counted through the hands; -1 for none.
+
+    Raises:
+        ShapeError: A label is none of the hands', or the first frame has another number of points.
+    """
 
     def __init__(self, hands: Sequence[UserHand], first_labels: Int[np.ndarray, "N"]) -> None:
         self._hands = [PlainHand(hand) for hand in hands]
@@ -41,6 +49,10 @@ class _Baseline:
             raise ShapeError(
                 f"first_labels go up to {self._first_labels.max()}, wanted less than {self._first[-1]}"
             )
+        self._begin()
+
+    def _begin(self) -> None:
+        """Make ready what one of them alone remembers."""
 
     def _given(self, points: NDArray[np.float64]) -> NDArray[np.int64] | None:
         """The labels of the first frame, when this is it."""
@@ -72,24 +84,16 @@ class _Baseline:
         return places
 
 
-class NearestNeighbourTracker(_Baseline):
+class NearestNeighbourTracker(GivenFirst):
     """Names that go on by themselves, without a hand in the loop.
 
     A point keeps its name with its ID. A point whose ID is new takes the name of the lost marker that it is
     nearest to: to where that was coming, in a straight line for 50 ms, and less than 10 mm off; nearest
     pairs first. Poses are solved from the labels afterwards and change nothing; a pose of more than 8 mm RMS
     is not given out. Markers that the first frame lacks begin where a pose fitted to it has them.
-
-    Args:
-        hands: The user's hands, each side at most once.
-        first_labels: True labels of the first frame's points, counted through the hands; -1 for none.
-
-    Raises:
-        ShapeError: A label is none of the hands', or the first frame has another number of points.
     """
 
-    def __init__(self, hands: Sequence[UserHand], first_labels: Int[np.ndarray, "N"]) -> None:
-        super().__init__(hands, first_labels)
+    def _begin(self) -> None:
         self._labels: dict[int, int] = {}
         self._before: set[int] = set()
         self._last = np.full((self._first[-1], 3), np.inf)
@@ -133,23 +137,15 @@ class NearestNeighbourTracker(_Baseline):
         self._last[mine], self._when[mine] = points[labels >= 0], time
 
 
-class HungarianTracker(_Baseline):
+class HungarianTracker(GivenFirst):
     """An optimal assignment in every frame (Maycock et al. 2015); IDs count for nothing.
 
     Every hand's pose goes on at its last speed; the model's markers there and all points are assigned to each
     other at the least sum of distances, every pair less than 20 mm apart, and the pose is solved anew. Where
     it fails (fewer than four points, or more than 8 mm RMS) a hand waits where it was, without a pose.
-
-    Args:
-        hands: The user's hands, each side at most once.
-        first_labels: True labels of the first frame's points, counted through the hands; -1 for none.
-
-    Raises:
-        ShapeError: A label is none of the hands', or the first frame has another number of points.
     """
 
-    def __init__(self, hands: Sequence[UserHand], first_labels: Int[np.ndarray, "N"]) -> None:
-        super().__init__(hands, first_labels)
+    def _begin(self) -> None:
         self._speeds = np.zeros((len(self._hands), 26))
         self._time = 0.0
 

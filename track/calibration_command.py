@@ -17,9 +17,10 @@ from handsim.errors import HandSimError
 from handsim.topology import Side
 from track.calibration import Calibration, calibrate_hands
 from track.capture_tracking import track
-from track.commands import BOTH, Size, say, users
+from track.take_summary import say
 from track.tracker import Tracker
 from track.user import UserHand, save_user
+from track.user_options import BOTH, Size, users
 from train.commands import progress_bar
 from train.labeler import labeler_for_glove
 from train.labeling import Labeler
@@ -79,7 +80,6 @@ def _round(
         take = track(
             source,
             Tracker(known, labeler),
-            known,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     shown = [side for side in take.sides if _sure(take, side).mean() > _SHOWN]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from gloves.identities import number_runs
 from gloves.tracked_take import LOST, STATUSES, MarkedBody, TrackedTake, WornGlove
 from handsim.errors import CaptureError
 from handsim.topology import NUM_QPOS
-from track.rigid_body import RigidTemplate
 from track.streaming import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
@@ -26,7 +25,7 @@ from track.user import UserHand
 from train.labeling import Labeler, check_unit
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool
     from numpy.typing import NDArray
 
     Progress = Callable[[int, int], None]
@@ -37,29 +36,12 @@ _APART: Final = 0.5  # [m] between hands that are tried out
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
-class Stepper(Protocol):
-    """Whatever takes in frames as a `Tracker` does."""
-
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Take in the next frame."""
-        ...
-
-
-def track(
-    capture: Capture,
-    tracker: Stepper,
-    hands: Sequence[UserHand],
-    *,
-    bodies: Sequence[RigidTemplate] = (),
-    progress: Progress | None = None,
-) -> TrackedTake:
+def track(capture: Capture, tracker: Tracker, *, progress: Progress | None = None) -> TrackedTake:
     """Lead a tracker through a capture.
 
     Args:
         capture: What was seen; its names are not used.
         tracker: A tracker that has seen nothing yet.
-        hands: The hands that it was made for.
-        bodies: The rigid bodies that it was made for.
         progress: Called after each frame with how many are done and how many there are.
 
     Raises:
@@ -67,7 +49,7 @@ def track(
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
-    recorder = TakeRecorder(hands, bodies)
+    recorder = TakeRecorder(tracker)
     for frame, tracked in follow(frames, tracker):
         recorder.add(frame, tracked)
         if progress is not None:
@@ -83,7 +65,7 @@ def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
         yield StreamedFrame(number, number / capture.rate, points[seen], ids[number, seen])
 
 
-def follow(frames: Iterable[StreamedFrame], tracker: Stepper) -> Iterator[tuple[StreamedFrame, TrackedFrame]]:
+def follow(frames: Iterable[StreamedFrame], tracker: Tracker) -> Iterator[tuple[StreamedFrame, TrackedFrame]]:
     """Lead a tracker through frames as they come, live ones too.
 
     After a silence of a stream the tracker is told that there are no points, at the time that has gone by
@@ -131,13 +113,12 @@ class TakeRecorder:
     """Keeps what a tracker said, frame by frame; `take` may be asked for at any time.
 
     Args:
-        hands: The hands that the tracker was made for.
-        bodies: The rigid bodies that it was made for.
+        tracker: Whose hands and bodies these are.
     """
 
-    def __init__(self, hands: Sequence[UserHand], bodies: Sequence[RigidTemplate] = ()) -> None:
-        self._hands = tuple(WornGlove(hand.model.shape, hand.attachment) for hand in hands)
-        self._bodies = tuple(MarkedBody(body.name, body.marker_names, body.places) for body in bodies)
+    def __init__(self, tracker: Tracker) -> None:
+        self._hands = tuple(WornGlove(hand.model.shape, hand.attachment) for hand in tracker.hands)
+        self._bodies = tuple(MarkedBody(body.name, body.marker_names, body.places) for body in tracker.bodies)
         self._frames: list[tuple[StreamedFrame, TrackedFrame]] = []
 
     @property
@@ -201,7 +182,7 @@ class TakeRecorder:
         poses, rms = np.full((*shape, 7), np.nan), np.full(shape, np.nan)
         status = np.full(shape, LOST, dtype=np.int8)
         for number, frame in enumerate(tracked):
-            for place, body in enumerate(getattr(frame, "bodies", ())):
+            for place, body in enumerate(frame.bodies):
                 poses[number, place] = np.concatenate([body.translation, body.rotation])
                 status[number, place], rms[number, place] = _NUMBERS[body.status], body.rms
         return {"bodies": self._bodies, "body_poses": poses, "body_status": status, "body_rms": rms}

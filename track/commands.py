@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
@@ -16,25 +16,27 @@ from rich.console import Console
 from gloves.captures import WRITABLE, Capture, read_capture, write_capture
 from gloves.captures.capture import check_suffix
 from gloves.captures.markers import labelled_capture
-from gloves.layout import load_layout
 from gloves.take import SUFFIX
-from gloves.tracked_take import STATUSES, TrackedTake, save_tracked_take
-from handsim.errors import CaptureError, HandSimError, choices
+from gloves.tracked_take import TrackedTake, save_tracked_take
+from handsim.errors import CaptureError, HandSimError
 from handsim.topology import Side
+from track.body_file import load_bodies
 from track.capture_tracking import TakeRecorder, follow, warm_up
 from track.capture_tracking import track as track_capture
+from track.rigid_body import RigidTemplate
 from track.streaming import StreamedFrame, open_stream
+from track.take_summary import say, summary
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
-from track.user import UserHand, load_user, usual_hand
+from track.user import UserHand
+from track.user_options import BOTH, Size, calibrated_users, users
 from train.commands import progress_bar
 from train.labeler import labeler_for_glove
+from train.labeling import Labeler
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-Size = Literal["XS", "S", "M", "L", "XL"]
-BOTH: Final[tuple[Side, ...]] = ("right", "left")
 _REFRESH: Final = 0.2  # [s] between words about a live stream
 
 
@@ -48,6 +50,7 @@ def track(
     size: Size | None = None,
     shape: Path | None = None,
     hands: tuple[Side, ...] | None = None,
+    body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     labeler: str | None = None,
     labelled: Path | None = None,
 ) -> None:
@@ -63,6 +66,8 @@ def track(
         size: Size of the hands; M when neither this nor --shape is given.
         shape: The user's file from handsim calibrate: hands and gloves.
         hands: Which hands there are; both, or those of --shape, when not given.
+        body: A rigid body to follow beside the hands, as often as there are some: a .toml file, see handsim
+            body, or one of handsim's own objects.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
         labelled: File for the labelled points, .trc or .c3d; markers are called right:ThumbTip and so on,
             points that are no markers Unlabeled1, Unlabeled2, ...
@@ -71,23 +76,23 @@ def track(
     if shape is None:
         user = users(glove, size or "M", BOTH if hands is None else hands)
     else:
-        user = _calibrated(shape, glove, size, hands)
+        user = calibrated_users(shape, glove, size, hands)
+    bodies = load_bodies(body)
     source = None if capture is None else read_capture(capture)
     network = labeler_for_glove(glove, labeler)
     with Console(stderr=True).status("getting ready"):
         warm_up(user, network)
-    watch = Stopwatch(Tracker(user, network))
+        watch = Stopwatch(user, network, bodies)
     if source is not None:
         with progress_bar("frames") as (bar, task):
             take = track_capture(
                 source,
                 watch,
-                user,
                 progress=lambda done, total: bar.update(task, completed=done, total=total),
             )
         notes: tuple[str, ...] = ()
     else:
-        take, notes = _track_live(str(live), seconds, watch, user)
+        take, notes = _track_live(str(live), seconds, watch)
     made = {
         "capture": live if capture is None else capture.name,
         "glove": glove,
@@ -103,87 +108,22 @@ def track(
         say(line)
 
 
-def users(glove: str, size: Size, hands: Sequence[Side]) -> tuple[UserHand, ...]:
-    """Hands of one size in a glove.
+class Stopwatch(Tracker):
+    """A tracker that knows how long it took for each frame."""
 
-    Raises:
-        LayoutError: The glove is unknown or does not fit.
-        HandSimError: A hand is named twice, or none is.
-    """
-    check_hands(hands)
-    layout = load_layout(glove)
-    return tuple(usual_hand(layout, size, side) for side in hands)
-
-
-def check_hands(hands: Sequence[Side]) -> None:
-    """Raise a `HandSimError` unless each side is there once at most, and one is."""
-    if not hands or len(set(hands)) < len(hands):
-        raise HandSimError(f"--hands is '{' '.join(hands)}', wanted right, left, or one of each")
-
-
-def _calibrated(
-    shape: Path, glove: str, size: Size | None, hands: tuple[Side, ...] | None
-) -> tuple[UserHand, ...]:
-    """Hands of a user's file."""
-    if size is not None:
-        raise HandSimError(f"given --size {size} and --shape {shape}, wanted one of them")
-    known = {hand.side: hand for hand in load_user(shape)}
-    wanted_hands = tuple(known) if hands is None else hands
-    check_hands(wanted_hands)
-    for side in wanted_hands:
-        if side not in known:
-            raise HandSimError(f"{shape}: {choices(side, known, noun='hand')}")
-    names, wanted = known[next(iter(known))].attachment.layout.names, load_layout(glove).names
-    if names != wanted:
-        raise HandSimError(
-            f"{shape} is of a glove with the markers {', '.join(names)}, "
-            f"but glove '{glove}' has {', '.join(wanted)}"
-        )
-    return tuple(known[side] for side in wanted_hands)
-
-
-class Stopwatch:
-    """A tracker, and how long it took for each frame.
-
-    Args:
-        tracker: The tracker.
-    """
-
-    def __init__(self, tracker: Tracker) -> None:
-        self._tracker = tracker
+    def __init__(
+        self, hands: Sequence[UserHand], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
+    ) -> None:
+        super().__init__(hands, labeler, bodies)
         self.spent: list[float] = []
         """[s], one a frame."""
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
         """Take in the next frame."""
         began = perf_counter()
-        frame = self._tracker.step(points, ids, time)
+        frame = super().step(points, ids, time)
         self.spent.append(perf_counter() - began)
         return frame
-
-
-def summary(take: TrackedTake) -> list[str]:
-    """What became of each hand and of the points, a line each."""
-    lines = []
-    for number, side in enumerate(take.sides):
-        status, rms = take.status[:, number], take.rms[:, number]
-        shares = (
-            f"{STATUSES[place]} {100 * np.mean(status == place):.1f} %"
-            for place in reversed(range(len(STATUSES)))
-        )
-        fitted = rms[np.isfinite(rms)]
-        line = f"{side} hand: {', '.join(shares)}"
-        if len(fitted):
-            missing = take.filled[:, number].mean(axis=1)[status > 0].mean()
-            line += (
-                f"; median RMS {1e3 * np.median(fitted):.2f} mm, {100 * missing:.1f} % of markers filled in"
-            )
-        else:
-            line += "; it was never found: --hands says which hands there are"
-        lines.append(line)
-    there = np.isfinite(take.points[..., 0])
-    unlabelled = int((there & (take.labels < 0)).sum())
-    return [*lines, f"{unlabelled} of {int(there.sum())} points are no markers"]
 
 
 def labelled_points(take: TrackedTake) -> Capture:
@@ -212,11 +152,9 @@ def _check_options(
         check_suffix(labelled, WRITABLE)
 
 
-def _track_live(
-    url: str, seconds: float | None, watch: Stopwatch, user: Sequence[UserHand]
-) -> tuple[TrackedTake, tuple[str, ...]]:
+def _track_live(url: str, seconds: float | None, watch: Stopwatch) -> tuple[TrackedTake, tuple[str, ...]]:
     """What a stream brings until it ends, time is up or somebody interrupts."""
-    recorder = TakeRecorder(user)
+    recorder = TakeRecorder(watch)
     console = Console(stderr=True)
     with closing(open_stream(url)) as stream, console.status("waiting for the first frame") as status:
         began, shown = perf_counter(), 0.0
@@ -243,10 +181,6 @@ def _word(frame: StreamedFrame, tracked: TrackedFrame) -> str:
     """How it goes, in a line."""
     if frame.silent:
         return "nothing comes; is the server playing?"
-    hands = (f"{hand.side} {hand.status.value}" for hand in tracked.hands)
-    return f"frame {frame.number}: {', '.join(hands)}; Ctrl-C ends it and writes the take"
-
-
-def say(line: str) -> None:
-    """Print a line as it is."""
-    Console().print(line, highlight=False, soft_wrap=True, markup=False)
+    words = [f"{hand.side} {hand.status.value}" for hand in tracked.hands]
+    words += [f"{body.name} {body.status.value}" for body in tracked.bodies]
+    return f"frame {frame.number}: {', '.join(words)}; Ctrl-C ends it and writes the take"

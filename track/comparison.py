@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gloves.take import Take
+from handsim.errors import ShapeError
+from handsim.objects import named_object
 from track.baselines import HungarianTracker, NearestNeighbourTracker
 from track.evaluation import (
     FrameTracker,
@@ -19,6 +21,7 @@ from track.evaluation import (
     usual_users,
 )
 from track.paper_tracker import PaperTracker
+from track.rigid_body import RigidTemplate
 from track.tracker import Tracker
 from track.trials import FEWEST_FRAMES, cut, first_locks, recoveries
 from track.user import UserHand
@@ -119,12 +122,43 @@ def compare_trackers(
     for name, make in trackers(labeler, seed).items():
         for (users, capture), hands in wearers.items():
             take = takes[capture]
-            start = cut(take, 0, min(_WARM_UP, take.num_frames))
-            evaluate_tracker(start, hands, make(start, hands))
-            report = evaluate_tracker(take, hands, make(take, hands), done=done)
+            report = _report(take, hands, make, done)
             waits = _try(take, hands, name, make, trials, seed)
             measured.append(Measured(name, users, capture, report, *waits))
     return measured
+
+
+def measure_with_body(
+    capture: str, take: Take, labeler: Labeler, *, done: Callable[[], None] | None = None
+) -> list[Measured]:
+    """Run our tracker over a take whose body it follows beside the hands; the body's labels count too.
+
+    Args:
+        capture: The take's name.
+        take: A simulated take with one of handsim's objects.
+        labeler: Of the hands' glove.
+        done: Called after every frame.
+
+    Raises:
+        ShapeError: The take has no body, or one with too few markers.
+    """
+    if take.body is None:
+        raise ShapeError(f"{capture}: the take has no body, wanted one with three markers or more")
+    body = RigidTemplate.of(named_object(take.body.name))
+    nothing, measured = np.zeros(0), []
+    for users, hands_of in USERS.items():
+        report = _report(take, hands_of(take), lambda _, hands: Tracker(hands, labeler, (body,)), done)
+        measured.append(Measured(f"{OURS}, {body.name} too", users, capture, report, nothing, nothing))
+    return measured
+
+
+def _report(
+    take: Take, hands: Sequence[UserHand], make: MakeTracker, done: Callable[[], None] | None
+) -> TrackingReport:
+    """What a tracker makes of a take, once it is warm."""
+    start = cut(take, 0, min(_WARM_UP, take.num_frames))
+    evaluate_tracker(start, hands, make(start, hands))
+    return evaluate_tracker(take, hands, make(take, hands), done=done)
 
 
 def _try(

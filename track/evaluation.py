@@ -42,7 +42,7 @@ class SeenFrame(NamedTuple):
     """[m]"""
     ids: Int[np.ndarray, "N"]
     labels: Int[np.ndarray, "N"]
-    """Marker of each point, counted through the hands; -1 for ghosts, strays and bodies."""
+    """Marker of each point, counted through the hands, then the body; -1 for ghosts and strays."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class TrackingReport:
     """What a tracker made of a take."""
 
     right: Bool[np.ndarray, "T"]
-    """Every point has its true label: a marker of a hand its own, all others none."""
+    """Every point has its true label, see `is_right`."""
     valid: Bool[np.ndarray, "T"]
     """Every hand has a pose, fitted to its labelled markers within 8 mm RMS."""
     missing: Int[np.ndarray, "T H"]
@@ -99,9 +99,7 @@ def seen_frame(take: Take, frame: int) -> SeenFrame:
     """What there is to see of one frame of a take."""
     here = np.isfinite(take.points[frame, :, 0])
     labels = take.labels[frame, here].astype(np.int64)
-    return SeenFrame(
-        take.points[frame, here], take.ids[frame, here].astype(np.int64), _of_hands(take, labels)
-    )
+    return SeenFrame(take.points[frame, here], take.ids[frame, here].astype(np.int64), labels)
 
 
 def true_users(take: Take) -> list[UserHand]:
@@ -164,8 +162,13 @@ def evaluate_tracker(
 
 
 def is_right(take: Take, tracked: TrackedFrame, seen: SeenFrame) -> bool:
-    """Whether every point of a frame has its true label; markers of bodies are to be none of a hand's."""
-    return np.array_equal(_of_hands(take, tracked.labels), seen.labels)
+    """Whether every point of a frame has its true label: a marker its own, all others none.
+
+    Markers of a body that was tracked are to have theirs; of one that was not, none of a hand's.
+    """
+    if tracked.bodies:
+        return np.array_equal(tracked.labels, seen.labels)
+    return np.array_equal(_of_hands(take, tracked.labels), _of_hands(take, seen.labels))
 
 
 def is_valid(tracked: TrackedFrame) -> bool:

@@ -20,14 +20,15 @@ _HEAD: Final = ("method", "hands")
 
 
 def print_table5(measured: Sequence[Measured], *, with_paper: bool) -> Table:
-    """Frames all of whose labels are right [%], a column a capture."""
+    """Frames all of whose labels are right [%], a column a capture; blank where nothing was measured."""
     table = _table("Table 5: frames all of whose labels are right [%]", KINDS)
     if with_paper:
         for method, shares in TABLE5.items():
             table.add_row(method, "calibrated", *(_percent(shares[kind]) for kind in KINDS))
         table.add_section()
     for (method, users), row in _rows(measured):
-        table.add_row(method, users, *(_percent(one.report.figures()["right"]) for one in row))
+        right = {one.capture: one.report.figures()["right"] for one in row}
+        table.add_row(method, users, *(_percent(right.get(kind, np.nan)) for kind in KINDS))
     return table
 
 

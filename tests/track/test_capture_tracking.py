@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from gloves.tracked_take import LOST, STATUSES, TRACKED, TrackedTake, load_track
 from handsim.errors import CaptureError, ShapeError
 from handsim.model import HandModel
 from handsim.objects import named_object
+from handsim.transforms import quaternion_matrix
 from track.capture_tracking import TakeRecorder, capture_frames, follow, track
 from track.natnet_server import ReplayServer
 from track.rigid_body import RigidTemplate
@@ -51,7 +51,7 @@ def capture(truth) -> Capture:
 
 @pytest.fixture(scope="module")
 def tracked(capture, user, labeler) -> TrackedTake:
-    return track(capture, Tracker(user, labeler), user)
+    return track(capture, Tracker(user, labeler))
 
 
 def mostly_right(take: TrackedTake, labels: np.ndarray, last: int) -> bool:
@@ -87,7 +87,7 @@ def test_a_capture_is_tracked_as_its_truth_says(tracked, truth, user, tmp_path):
 def test_file_formats_change_nothing(suffix, tracked, capture, user, labeler, tmp_path):
     path = tmp_path / f"take{suffix}"
     write_capture(path, capture)
-    again = track(read_capture(path), Tracker(user, labeler), user)
+    again = track(read_capture(path), Tracker(user, labeler))
     np.testing.assert_array_equal(again.labels, tracked.labels)
     np.testing.assert_allclose(again.qpos, tracked.qpos, atol=1e-4)
 
@@ -104,28 +104,29 @@ def test_a_column_is_an_id_until_its_point_is_lost(capture):
 def test_progress_is_told_frame_by_frame(capture, user, labeler):
     short = Capture(capture.names, capture.positions[:5], capture.rate)
     told = []
-    track(short, Tracker(user, labeler), user, progress=lambda *done: told.append(done))
+    track(short, Tracker(user, labeler), progress=lambda *done: told.append(done))
     assert told == [(n, 5) for n in range(1, 6)]
 
 
 def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler, rng):
     positions = np.full((4, 3, 3), np.nan)
     positions[2] = rng.normal(size=(3, 3))
-    take = track(Capture(("a", "b", "c"), positions, 120.0), Tracker(user, labeler), user)
+    take = track(Capture(("a", "b", "c"), positions, 120.0), Tracker(user, labeler))
     assert (take.status == LOST).all() and (take.labels == -1).all()
     assert np.isnan(take.qpos).all() and np.isnan(take.markers).all()
-    nothing = track(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), Tracker(user, labeler), user)
+    nothing = track(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), Tracker(user, labeler))
     assert nothing.num_frames == 2
 
 
 def test_millimetres_are_told(capture, user, labeler):
     large = Capture(capture.names, 1e3 * capture.positions, capture.rate)
     with pytest.raises(ShapeError, match="millimetres"):
-        track(large, Tracker(user, labeler), user)
+        track(large, Tracker(user, labeler))
 
 
 def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
-    recorder, tracker = TakeRecorder(user), Tracker(user, labeler)
+    tracker = Tracker(user, labeler)
+    recorder = TakeRecorder(tracker)
     with ReplayServer.of_take(truth) as server, open_stream(server.url, silence=0.4) as stream:
         for frame, one in follow(stream, tracker):
             recorder.add(frame, one)
@@ -161,10 +162,11 @@ def test_time_goes_on_when_a_recording_begins_anew():
 
 
 def test_too_few_frames_have_no_rate(user, capture, labeler):
-    recorder = TakeRecorder(user)
+    tracker = Tracker(user, labeler)
+    recorder = TakeRecorder(tracker)
     with pytest.raises(CaptureError, match="0 frames came, wanted two or more"):
         recorder.take()
-    for frame, one in itertools.islice(follow(capture_frames(capture), Tracker(user, labeler)), 2):
+    for frame, one in itertools.islice(follow(capture_frames(capture), tracker), 2):
         recorder.add(frame, one)
         if recorder.num_frames == 1:
             with pytest.raises(CaptureError, match="1 frames came"):
@@ -172,17 +174,21 @@ def test_too_few_frames_have_no_rate(user, capture, labeler):
     assert recorder.take().rate == pytest.approx(capture.rate)
 
 
-def test_bodies_are_kept_beside_the_hands(user, labeler, capture):
+def test_bodies_are_kept_beside_the_hands(user, labeler, capture, truth):
     thing = RigidTemplate.of(named_object("controller"))
-    recorder = TakeRecorder(user, (thing,))
-    lost = SimpleNamespace(status=Status.LOST, translation=np.full(3, np.nan), rotation=np.full(4, np.nan))
-    here = SimpleNamespace(status=Status.TRACKED, translation=np.arange(3.0), rotation=np.eye(4)[0])
-    lost.rms, here.rms = np.nan, 0.0001
-    for body, (frame, one) in zip((lost, here), follow(capture_frames(capture), Tracker(user, labeler))):  # noqa: B905
-        said = SimpleNamespace(hands=one.hands, labels=one.labels, confidence=one.confidence, bodies=(body,))
-        recorder.add(frame, said)
-    take = recorder.take()
-    np.testing.assert_array_equal(take.body_poses[1, 0], [0, 1, 2, 1, 0, 0, 0])
-    assert np.isnan(take.body_poses[0]).all()
-    assert take.body_status.tolist() == [[LOST], [TRACKED]] and take.body_rms[1, 0] == 0.0001
-    assert take.label_names[-1] == f"{thing.name}:{thing.marker_names[-1]}"
+    positions = capture.positions.copy()
+    first = truth.hand_labels[-1].stop
+    positions[:2][truth.labels[:2] >= first] = np.nan
+    part = Capture(capture.names, positions, capture.rate)
+    take = track(part, Tracker(user, labeler, (thing,)))
+    names = [STATUSES[status] for status in take.body_status[:, 0]]
+    assert names == ["lost"] * 2 + ["found"] + ["tracked"] * (FRAMES - 3)
+    assert np.isnan(take.body_poses[:2]).all() and np.isnan(take.body_rms[:2]).all()
+    assert np.nanmedian(take.body_rms) < 0.001
+    away = np.linalg.norm(take.body_poses[2:, 0, :3] - truth.body.T_world_body[2:, :3, 3], axis=1)
+    turned = quaternion_matrix(take.body_poses[2:, 0, 3:]) - truth.body.T_world_body[2:, :3, :3]
+    assert np.median(away) < 0.0005 and np.median(np.abs(turned)) < 0.01
+    assert take.label_names[first:] == tuple(f"controller:{name}" for name in thing.marker_names)
+    there = truth.labels[2:] >= first
+    assert np.mean(take.labels[2:][there] == truth.labels[2:][there]) > 0.99
+    assert (take.labels[2:][~there] < first).all()

@@ -20,7 +20,9 @@ from gloves.take import load_take
 from gloves.tracked_take import LOST, load_tracked_take
 from handsim.cli import main
 from handsim.model import HandModel
+from handsim.objects import named_object
 from handsim.shape import sample_shape
+from track.body_file import load_body
 from track.hand_errors import hand_errors
 from track.natnet_server import ReplayServer
 from track.streaming import open_stream
@@ -111,6 +113,57 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     np.testing.assert_allclose(seen, take.observed("right"), atol=1e-6)
     unlabelled = np.isfinite(columns.positions[:, 38:, 0]).sum()
     assert f"{unlabelled} of " in lines[3]
+
+
+def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
+    truth = load_take(capture.with_suffix(".truth.npz"))
+    wand, out, labelled = tmp_path / "wand.toml", tmp_path / "take.npz", tmp_path / "labelled.c3d"
+    assert main(["body", str(capture.with_suffix(".truth.npz")), "--out", str(wand)]) == 0
+    assert capsys.readouterr().out == f"{wand}: controller, 6 markers, at most 99.9 mm apart\n"
+    asked = ["--hands", "right", "--body", str(wand), "--body", "mug", "--labelled", str(labelled)]
+    assert main(["track", str(capture), "--out", str(out), *asked]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].startswith(
+        "controller: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median RMS"
+    )
+    assert lines[3] == (
+        "mug: tracked 0.0 %, found 0.0 %, coasting 0.0 %, lost 100.0 %; it was never found: are these its "
+        "markers?"
+    )
+    take, first = load_tracked_take(out), truth.hand_labels[-1].stop
+    assert [body.name for body in take.bodies] == ["controller", "mug"]
+    np.testing.assert_allclose(take.bodies[0].places, named_object("controller").markers, atol=1e-12)
+    mine = truth.labels >= first
+    assert np.mean(take.labels[mine] - 19 == truth.labels[mine] - first) > 0.99
+    columns = read_capture(labelled)
+    assert columns.names[: len(take.label_names)] == take.label_names
+    assert take.label_names[19] == "controller:ring_front"
+    seen = columns.positions[:, 19:25]
+    true = truth.observed(range(first, first + 6))
+    there = np.isfinite(true[..., 0])
+    np.testing.assert_array_equal(np.isfinite(seen[..., 0]), there)
+    np.testing.assert_allclose(seen[there], true[there], atol=1e-6)
+
+
+def test_a_body_is_learnt_from_a_capture_of_it(capture, tmp_path, capsys):
+    truth = load_take(capture.with_suffix(".truth.npz"))
+    alone = np.where((truth.labels >= truth.hand_labels[-1].stop)[..., None], truth.points, np.nan)
+    alone = alone[:, np.isfinite(alone[..., 0]).any(axis=0)]
+    file, wand = tmp_path / "alone.trc", tmp_path / "wand.toml"
+    write_capture(file, Capture(tuple(f"*{n}" for n in range(alone.shape[1])), alone, truth.rate))
+    assert main(["body", str(file), "--out", str(wand)]) == 0
+    assert capsys.readouterr().out.startswith(f"{wand}: wand, 6 markers, at most 99.9 mm apart")
+    body, true = load_body(wand), load_body("controller")
+    np.testing.assert_allclose(np.sort(body.sides.ravel()), np.sort(true.sides.ravel()), atol=0.0002)
+
+
+def test_a_body_is_followed_through_a_stream(capture, tmp_path, capsys):
+    out = tmp_path / "live.npz"
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+        asked = ["--live", server.url, "--seconds", "0.2", "--body", "controller", "--out", str(out)]
+        assert main(["track", *asked]) == 0
+    assert (load_tracked_take(out).body_status != LOST).all()
+    assert "controller: tracked" in capsys.readouterr().out
 
 
 def test_the_same_command_writes_the_same_bytes(capture, tmp_path):

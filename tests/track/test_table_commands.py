@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,8 +10,17 @@ import pytest
 import torch
 
 from handsim.cli import main
+from handsim.errors import ShapeError
 from track import comparison, table_commands
-from track.comparison import GIVEN_FIRST, OURS, PAPERS_LOOP, USERS, compare_trackers, trackers
+from track.comparison import (
+    GIVEN_FIRST,
+    OURS,
+    PAPERS_LOOP,
+    USERS,
+    compare_trackers,
+    measure_with_body,
+    trackers,
+)
 from track.paper import CAMERAS, FRAMES, HAN, TABLE5, TABLE7
 from track.tables import print_errors, print_trials
 from track.trials import FEWEST_FRAMES, without_body
@@ -18,6 +28,7 @@ from train.labeler import load_labeler
 from train.twins import KINDS, TWINS, TwinConfig, simulate_twin
 
 METHODS = (OURS, PAPERS_LOOP, *GIVEN_FIRST)
+WITH_BODY = "handsim, controller too"
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -34,7 +45,7 @@ def wide(monkeypatch):
 @pytest.fixture(scope="module")
 def measured():
     """The same captures, but short, and once for both tables."""
-    return table_commands._measure("dense19", None, 6, 0)
+    return table_commands._measure(table_commands.TableConfig(num_frames=6))
 
 
 @pytest.fixture
@@ -72,7 +83,13 @@ def test_table_5_has_a_row_a_tracker_and_kind_of_hands(tmp_path, capsys, quick):
     saved = json.loads(file.read_text())
     assert (saved["table"], saved["glove"], saved["seed"]) == ("table5", "dense19", 0)
     measured = {(one["method"], one["hands"], one["capture"]): one for one in saved["figures"]}
-    assert set(measured) == {(name, users, kind) for name in METHODS for users in USERS for kind in KINDS}
+    with_body = {(WITH_BODY, users, "hand-controller") for users in USERS}
+    assert with_body | {(name, users, kind) for name in METHODS for users in USERS for kind in KINDS} == set(
+        measured
+    )
+    for users in USERS:
+        assert tables[WITH_BODY, users] == [["", "", "", "100.00"]], "the controller's labels count"
+        assert measured[WITH_BODY, users, "hand-controller"]["right"] == 1.0
     for name in METHODS:
         for users in USERS:
             shares, joints, angles, waits, times = tables[name, users]
@@ -139,6 +156,20 @@ def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
         "never",
         "0.00",
     ]
+
+
+def test_a_body_that_is_followed_must_have_its_labels():
+    labeler = load_labeler("dense19")
+    take = simulate_twin(TwinConfig(kind="hand-controller", num_frames=20))
+    first, second, *_ = measure_with_body("controller", take, labeler)
+    assert (first.users, second.users) == tuple(USERS) and first.report.right.all()
+    labels = take.labels.copy()
+    labels[7][labels[7] == take.hand_labels[-1].stop + 1] = -1
+    other = dataclasses.replace(take, labels=labels)
+    wrong = measure_with_body("controller", other, labeler)[0].report.right
+    assert np.flatnonzero(~wrong).tolist() == [7]
+    with pytest.raises(ShapeError, match="controller: the take has no body"):
+        measure_with_body("controller", without_body(take), labeler)
 
 
 def test_every_tracker_has_a_maker():
