@@ -29,6 +29,7 @@ _FIRST_SHARE, _FIRST_SPREAD = 1.2, (0.0015, 0.006)
 """Spread of a marker around where a hand just found has it: share of the fit's RMS; least and most [m]."""
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
 _UNEVEN: Final = 0.3  # of the hand's usual miss: so much it changes as the hand moves
+_DOUBTFUL: Final = 1.0
 _DOUBT: Final = 0.5  # [s] unseen after which a marker may miss its place by the hand's usual miss again
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
@@ -39,6 +40,8 @@ _SMOOTHING: Final = 0.6  # share of the newest speed
 _RETURN: Final = 0.01  # [s] over the time for which a marker was hidden: its chance to be back in a frame
 _RETURNS: Final = (0.01, 0.65)  # least and most of that chance
 _ELSEWHERE: Final = -7.0  # log chance of a marker that was seen while the point was there already
+_STRAY_LIFE: Final = 0.1  # [s] that a stray point lives, on average
+_MOST_AGE: Final = 3.0
 _LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
 
 
@@ -84,6 +87,7 @@ class HandMemory:
         self.solver = PoseSolver(hand.model, hand.attachment)
         self.qpos: NDArray[np.float64] | None = None
         self.time = 0.0
+        self._now = 0.0
         count = self.num_markers = hand.attachment.layout.num_markers
         bones = hand.attachment.bone_indices[np.arange(count), hand.attachment.bone_weights.argmax(axis=1)]
         self.digits = np.array([BONES[bone].digit for bone in bones])
@@ -107,8 +111,9 @@ class HandMemory:
         Only for a hand that has a pose.
         """
         assert self.qpos is not None
+        self._now = time
         span = time - self.time
-        doubt = self._usual_miss * np.minimum((time - self._seen) / _DOUBT, 1.0)
+        doubt = _DOUBTFUL * self._usual_miss * np.minimum((time - self._seen) / _DOUBT, 1.0)
         self.variance = self._variance + doubt**2
         moved: NDArray[np.float64] = move(self.qpos[None], min(span, _LONGEST_GLIDE) * self._speed[None])[0]
         shift, turn = (at_once + 0.5 * gain * span**2 for at_once, gain in _WRIST)
@@ -153,7 +158,8 @@ class HandMemory:
         gap = born[:, None] - self._seen
         chance: NDArray[np.float64] = np.log(np.clip(_RETURN / np.maximum(gap, 1e-3), *_RETURNS))
         chance[gap < 0.0] = _ELSEWHERE
-        return chance
+        age = np.maximum(self._now - born, 0.0)[:, None]
+        return chance + np.minimum(age / _STRAY_LIFE, _MOST_AGE)
 
     def begin(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float

@@ -7,7 +7,7 @@ same points, of one hand or of two that touch, the best of all their namings tog
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -39,6 +39,7 @@ def name_new(
     names: Int[np.ndarray, "H N"],
     credit: Float[np.ndarray, "N"],
     born: Float[np.ndarray, "N"],
+    advice: Mapping[int, Float[np.ndarray, "N M"]],
 ) -> Float[np.ndarray, "N"]:
     """Name points that nobody has named.
 
@@ -48,6 +49,7 @@ def name_new(
         names: Names of every hand, overwritten.
         credit: What the name of each point is worth for the sake of its ID.
         born: When each point appeared [s].
+        advice: Log odds of names by what others say, for some hands.
 
     Returns:
         How sure each name is that has changed; NaN for those that have not.
@@ -56,7 +58,7 @@ def name_new(
     if not hands:
         return sure
     for hand in hands:
-        _name_palm(hand, points, names, born, sure)
+        _name_palm(hand, points, names, born, advice, sure)
     crowd = _crowd(hands, names)
     reach = find_reach(points, credit, crowd, len(hands) * len(DIGITS))
     if not reach.counts.any():
@@ -68,7 +70,7 @@ def name_new(
         digits = slice(place * len(DIGITS), (place + 1) * len(DIGITS))
         part = Reach(*(values[digits] for values in reach))
         rows = DigitNamings(*(values[digits] for values in namings))
-        _search(hand, points, names[hand.number], part, markers[digits] - first, credit, born, rows)
+        _search(hand, points, names[hand.number], part, markers[digits] - first, credit, born, advice, rows)
         first += hand.memory.num_markers
     before, margins = crowd.owners.copy(), np.full(len(points), np.nan)
     elect(reach, namings, markers, crowd.owners, margins)
@@ -83,6 +85,7 @@ def _name_palm(
     points: NDArray[np.float64],
     names: NDArray[np.int64],
     born: NDArray[np.float64],
+    advice: Mapping[int, NDArray[np.float64]],
     sure: NDArray[np.float64],
 ) -> None:
     mine = names[hand.number]
@@ -94,7 +97,10 @@ def _name_palm(
     if len(free) == 0:
         return
     odds = gains(points[free], hand.estimate.places[palm], hand.estimate.covariances[palm])
-    found, how_sure = match(odds + hand.memory.chances(born[free])[:, palm])
+    odds += hand.memory.chances(born[free])[:, palm]
+    if hand.number in advice:
+        odds += advice[hand.number][free[:, None], palm]
+    found, how_sure = match(odds)
     chosen = free[found >= 0]
     mine[chosen], sure[chosen] = palm[found[found >= 0]], how_sure[found >= 0]
 
@@ -127,6 +133,7 @@ def _search(
     markers: NDArray[np.int64],
     credit: NDArray[np.float64],
     born: NDArray[np.float64],
+    advice: Mapping[int, NDArray[np.float64]],
     namings: DigitNamings,
 ) -> None:
     """Try the points that one hand's digits may take."""
@@ -135,6 +142,8 @@ def _search(
     memory, estimate = hand.memory, hand.estimate
     odds, named = memory.chances(born), np.flatnonzero(names >= 0)
     odds[named, names[named]] = credit[named]
+    if hand.number in advice:
+        odds += advice[hand.number]
     trusted = memory.trust(hand.coming, estimate)
     for digit in np.flatnonzero(reach.counts):
         search_digit(

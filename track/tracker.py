@@ -14,6 +14,7 @@ import numpy as np
 
 from handsim.topology import NUM_QPOS
 from handsim.transforms import rotation_quaternions
+from track.advice import Adviser
 from track.finding import MOST_RMS, Found, HandFinder
 from track.hand_memory import Estimate, HandMemory
 from track.intake import Incoming, Intake
@@ -58,6 +59,7 @@ class Tracker:
         self._finder = HandFinder(self._memories, labeler)
         sizes = [memory.num_markers for memory in self._memories]
         self._first = np.cumsum([0, *sizes, *(len(body.marker_names) for body in bodies)])
+        self._adviser = Adviser(labeler)
         self._labels: dict[int, tuple[int, float]] = {}
         self._born: dict[int, float] = {}
         self._trusted = np.zeros(len(hands))
@@ -103,7 +105,7 @@ class Tracker:
         names, credit = self._carry_over(ids)
         born = self._births(ids, time)
         sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
-        following = self._follow(points, names, credit, sure, born, time)
+        following = self._follow(points, ids, names, credit, sure, born, time)
         hands = [
             self._judge(memory, points, names[number], credit, following.get(number), time)
             for number, memory in enumerate(self._memories)
@@ -136,6 +138,7 @@ class Tracker:
     def _follow(
         self,
         points: NDArray[np.float64],
+        ids: NDArray[np.int64],
         names: NDArray[np.int64],
         credit: NDArray[np.float64],
         sure: NDArray[np.float64],
@@ -155,7 +158,8 @@ class Tracker:
             estimate = fit_names(memory, points, names[number], coming)
             hands.append(Following(number, memory, coming, estimate))
         before = names.copy()
-        how_sure = name_new(hands, points, names, credit, born)
+        advice = self._adviser.odds(hands, points, ids, names, born, time)
+        how_sure = name_new(hands, points, names, credit, born, advice)
         changed = np.isfinite(how_sure)
         credit[changed], sure[changed] = 0.0, how_sure[changed]
         fitted = {}

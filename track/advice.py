@@ -1,0 +1,111 @@
+"""A second opinion: the labeler is asked about points that stay unnamed near a hand that lacks markers.
+
+Names that go along with a hand can drift into a pose that has no room for a marker that is plainly there. The
+labeler sees the same points without that history; what it says counts as odds beside the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from track.new_names import Following
+from train.labeling import Labeler
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+_NEAR: Final = 0.06  # [m] around the markers of a hand: points that the labeler is shown
+_FIRST: Final = 0.05  # [s] that a point is there before anybody is asked about it
+_LATER: Final = 3.0  # of its age: it is asked about again
+_MOST: Final = 12.0  # log odds that opinions may come to
+_WEIGHT: Final = 4.0  # log odds of one sure opinion
+
+
+class Adviser:
+    """Collects opinions on points for as long as their IDs last.
+
+    Args:
+        labeler: Names the points of a cloud of one hand.
+    """
+
+    def __init__(self, labeler: Labeler) -> None:
+        self._labeler = labeler
+        self._due: dict[int, float] = {}
+        self._opinions: dict[tuple[int, int], NDArray[np.float64]] = {}
+
+    def odds(
+        self,
+        hands: Sequence[Following],
+        points: Float[np.ndarray, "N 3"],
+        ids: Int[np.ndarray, "N"],
+        names: Int[np.ndarray, "H N"],
+        born: Float[np.ndarray, "N"],
+        time: float,
+    ) -> dict[int, Float[np.ndarray, "N M"]]:
+        """Log odds of names by what the labeler said, for those hands on whose points it said anything.
+
+        Args:
+            hands: The hands that have a pose.
+            points: The frame's points [m].
+            ids: Their IDs; nobody is asked about those that have none.
+            names: Names of every hand.
+            born: When each point appeared [s].
+            time: Time of the frame [s].
+        """
+        known = ids.tolist()
+        there = set(known)
+        self._due = {point: due for point, due in self._due.items() if point in there}
+        self._opinions = {key: said for key, said in self._opinions.items() if key[0] in there}
+        unnamed: NDArray[np.bool_] = (names < 0).all(axis=0)
+        waiting = unnamed & (ids >= 0)
+        for place in np.flatnonzero(waiting):
+            waiting[place] = time >= self._due.setdefault(known[place], float(born[place]) + _FIRST)
+        if waiting.any():
+            self._ask(hands, points, ids, names, unnamed, waiting)
+            for place in np.flatnonzero(waiting):
+                self._due[known[place]] = time + (_LATER - 1.0) * max(time - born[place], _FIRST)
+        found: dict[int, NDArray[np.float64]] = {}
+        if self._opinions:
+            rows = {point: row for row, point in enumerate(known)}
+            for (point, number), said in self._opinions.items():
+                found.setdefault(number, np.zeros((len(points), len(said))))[rows[point]] = said
+        return found
+
+    def _ask(
+        self,
+        hands: Sequence[Following],
+        points: NDArray[np.float64],
+        ids: NDArray[np.int64],
+        names: NDArray[np.int64],
+        unnamed: NDArray[np.bool_],
+        waiting: NDArray[np.bool_],
+    ) -> None:
+        clouds, asked = [], []
+        for hand in hands:
+            mine, places = names[hand.number], hand.estimate.places
+            missing = np.ones(len(places), dtype=bool)
+            missing[mine[mine >= 0]] = False
+            if not missing.any() or not _near(points[waiting], places[missing]).any():
+                continue
+            shown = mine >= 0
+            shown[unnamed] = _near(points[unnamed], places)
+            clouds.append(np.flatnonzero(shown))
+            asked.append((hand.number, missing))
+        if not clouds:
+            return
+        labellings = self._labeler.label_frames([points[cloud] for cloud in clouds])
+        for cloud, (number, missing), labelling in zip(clouds, asked, labellings, strict=True):
+            for place, label, sure in zip(cloud, labelling.labels, labelling.confidence, strict=True):
+                if waiting[place] and label >= 0 and missing[label]:
+                    said = self._opinions.setdefault((int(ids[place]), number), np.zeros(len(missing)))
+                    odds = np.log(sure / max(1.0 - sure, 1e-6))
+                    said[label] = min(said[label] + np.clip(odds, 0.0, _WEIGHT), _MOST)
+
+
+def _near(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    near: NDArray[np.bool_] = (np.linalg.norm(points[:, None] - places, axis=-1) < _NEAR).any(axis=1)
+    return near
