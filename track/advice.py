@@ -60,7 +60,7 @@ class Adviser:
         there = set(known)
         self._due = {point: due for point, due in self._due.items() if point in there}
         self._opinions = {key: said for key, said in self._opinions.items() if key[0] in there}
-        unnamed: NDArray[np.bool_] = (names < 0).all(axis=0)
+        unnamed = np.asarray((names < 0).all(axis=0), dtype=bool)
         waiting = unnamed & (ids >= 0)
         for place in np.flatnonzero(waiting):
             waiting[place] = time >= self._due.setdefault(known[place], float(born[place]) + _FIRST)

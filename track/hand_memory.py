@@ -29,7 +29,6 @@ _FIRST_SHARE, _FIRST_SPREAD = 1.2, (0.0015, 0.006)
 """Spread of a marker around where a hand just found has it: share of the fit's RMS; least and most [m]."""
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
 _UNEVEN: Final = 0.3  # of the hand's usual miss: so much it changes as the hand moves
-_DOUBTFUL: Final = 1.0
 _DOUBT: Final = 0.5  # [s] unseen after which a marker may miss its place by the hand's usual miss again
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
@@ -41,7 +40,7 @@ _RETURN: Final = 0.01  # [s] over the time for which a marker was hidden: its ch
 _RETURNS: Final = (0.01, 0.65)  # least and most of that chance
 _ELSEWHERE: Final = -7.0  # log chance of a marker that was seen while the point was there already
 _STRAY_LIFE: Final = 0.1  # [s] that a stray point lives, on average
-_MOST_AGE: Final = 3.0
+_MOST_AGE: Final = 3.0  # log odds that a point's age may come to
 _LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
 
 
@@ -113,7 +112,7 @@ class HandMemory:
         assert self.qpos is not None
         self._now = time
         span = time - self.time
-        doubt = _DOUBTFUL * self._usual_miss * np.minimum((time - self._seen) / _DOUBT, 1.0)
+        doubt = self._usual_miss * np.minimum((time - self._seen) / _DOUBT, 1.0)
         self.variance = self._variance + doubt**2
         moved: NDArray[np.float64] = move(self.qpos[None], min(span, _LONGEST_GLIDE) * self._speed[None])[0]
         shift, turn = (at_once + 0.5 * gain * span**2 for at_once, gain in _WRIST)
@@ -154,7 +153,10 @@ class HandMemory:
         return DigitTrust(coming.hinges, estimate.expected, self.variance, worth, slack, self._ranges)
 
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
-        """Log chance of each marker to come back when it did, were it the point that was born then [s]."""
+        """Log chance of each marker to come back when it did, were it the point that was born then [s].
+
+        It counts against that of a stray, which would hardly have lived for so long.
+        """
         gap = born[:, None] - self._seen
         chance: NDArray[np.float64] = np.log(np.clip(_RETURN / np.maximum(gap, 1e-3), *_RETURNS))
         chance[gap < 0.0] = _ELSEWHERE
