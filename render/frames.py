@@ -1,0 +1,101 @@
+"""What a rendered frame is: pictures, and the truth about all that is in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim.shape import HandShape
+from handsim.topology import NUM_BONES
+from render.camera import Camera
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+FOREARM: Final = NUM_BONES
+"""Part of a hand's picture beyond its bones."""
+PARTS_A_HAND: Final = 32
+"""A pixel of bone b of hand h has part 1 + b + 32 h; 0 is no hand."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pictures:
+    """The pictures of one frame; those that were not asked for are None."""
+
+    rgb: UInt8[np.ndarray, "H W 3"] | None = None
+    """sRGB."""
+    depth: Float32[np.ndarray, "H W"] | None = None
+    """Distance along the camera's axis at each pixel's centre [m]; 0 where there is nothing."""
+    normals: Float32[np.ndarray, "H W 3"] | None = None
+    """Unit normals of the surface in the camera's axes; 0 where there is nothing."""
+    parts: UInt8[np.ndarray, "H W"] | None = None
+    """Bone of each pixel's hand, see `PARTS_A_HAND`."""
+    instances: UInt8[np.ndarray, "H W"] | None = None
+    """1, 2.. for the hands in their order, then the bodies; 0 for the background.
+
+    A hand's forearm and markers are its own.
+    """
+    markers: UInt8[np.ndarray, "H W"] | None = None
+    """1 + marker of each pixel, counted through the hands; 0 for no marker."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandTruth:
+    """One hand of a frame."""
+
+    shape: HandShape
+    """Whose hand; `shape.side` is which one."""
+    qpos: Float[np.ndarray, "27"]
+    keypoints: Float[np.ndarray, "21 3"]
+    """See `render.keypoints`; in the world [m]."""
+    pixels: Float[np.ndarray, "21 2"]
+    """Their pixels, inside the picture or not; NaN where the lens cannot see them."""
+    visible: Bool[np.ndarray, "21"]
+    """Whether each is in the picture, with nothing in front of its own digit."""
+    box: Float[np.ndarray, "4"]
+    """Left, top, width, height [px] of what is seen of the hand without its forearm; NaN where nothing is."""
+    vertices: Float32[np.ndarray, "V 3"]
+    """Skin in the world [m]."""
+    marker_names: tuple[str, ...] = ()
+    markers: Float[np.ndarray, "M 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    """Centres of the glove's markers as the pose has them, in the world [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyTruth:
+    """One rigid thing of a frame."""
+
+    name: str
+    T_world_body: Float[np.ndarray, "4 4"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedFrame:
+    """Pictures of one camera at one time, and all that is known of them."""
+
+    number: int
+    """Of the take."""
+    time: float
+    """In the take [s]."""
+    camera: Camera
+    hands: tuple[HandTruth, ...]
+    bodies: tuple[BodyTruth, ...]
+    ideal: Pictures
+    """As a perfect sensor would have them."""
+    noisy: Pictures
+    """Colours and depth as the sensor has them; None for what has no noise."""
+    points: Float[np.ndarray, "N 3"]
+    """What the optical system saw, in the world [m]."""
+    labels: Int[np.ndarray, "N"]
+    """Place of each point's name in `label_names`; -1 for what is no marker."""
+    label_names: tuple[str, ...]
+    choices: Mapping[str, Any]
+    """Every random choice that made the pictures, as JSON."""
+
+    @property
+    def key(self) -> str:
+        """The frame's name in files: camera and number."""
+        return f"{self.camera.name}_{self.number:06d}"

@@ -1,0 +1,50 @@
+"""The 21 keypoints of a hand: wrist, and four a digit from its first joint to its tip.
+
+The order is FreiHAND's and MediaPipe's: wrist, thumb, index, middle, ring, little. Joints are the
+centres that the hand turns about; a tip is the far end of the last bone, on the skin.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.model import HandModel
+from handsim.topology import DIGITS, PALM, bones_of
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
+KEYPOINT_NAMES: Final[tuple[str, ...]] = (
+    "wrist",
+    *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
+)
+NUM_KEYPOINTS: Final = len(KEYPOINT_NAMES)
+KEYPOINT_DIGITS: Final[tuple[int, ...]] = (-1, *np.repeat(np.arange(len(DIGITS)), 4).tolist())
+"""Digit of each keypoint, -1 for the wrist."""
+SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
+    (0 if part == 0 else 4 * digit + part, 4 * digit + part + 1)
+    for digit in range(len(DIGITS))
+    for part in range(4)
+)
+"""Pairs of keypoints that a line joins."""
+
+
+def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
+    """Keypoints in the world [m].
+
+    Raises:
+        ShapeError: `qpos` is not (T, 27) or not finite.
+    """
+    transforms = model.forward_kinematics(qpos)
+    points: NDArray[np.float64] = np.empty((len(transforms), NUM_KEYPOINTS, 3))
+    points[:, 0] = transforms[:, PALM, :3, 3]
+    for number, digit in enumerate(DIGITS):
+        bones = bones_of(digit)
+        points[:, 4 * number + 1 : 4 * number + 4] = transforms[:, bones, :3, 3]
+        last = transforms[:, bones[-1]]
+        points[:, 4 * number + 4] = last[:, :3, 3] + model.skeleton.lengths[bones[-1]] * last[:, :3, 0]
+    return points
