@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -31,13 +33,13 @@ def test_a_step_is_mujocos(poses):
 
 def test_a_velocity_is_mujocos(poses):
     model, theirs = HandModel.named("M").mj_model, np.empty(26)
-    for before, after in zip(poses[:-1], poses[1:], strict=True):
+    for before, after in itertools.pairwise(poses):
         mujoco.mj_differentiatePos(model, theirs, 0.25, before, after)
         np.testing.assert_allclose(velocity_of(before, after, 0.25), theirs, atol=1e-9)
 
 
 def test_a_step_takes_back_what_a_velocity_said(poses):
-    for before, after in zip(poses[:-1], poses[1:], strict=True):
+    for before, after in itertools.pairwise(poses):
         moved = move(before[None], velocity_of(before, after, 0.5)[None] * 0.5)[0]
         moved[3:7] *= np.sign(moved[3:7] @ after[3:7])
         np.testing.assert_allclose(moved, after, atol=1e-9)
