@@ -63,25 +63,45 @@ def read_archive(
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
     """
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-        header = json.loads(str(arrays["header"]))
-        found = header.get("kind", _OLDEST_KIND)
-        if found != kind and found in KINDS:
-            raise CaptureError(f"{path}: {KINDS[found]}, wanted {KINDS[kind]}")
-        if header["schema"] != schema:
-            raise CaptureError(f"{path}: a {kind} of schema {header['schema']}, wanted {schema}")
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except CaptureError:
-        raise
-    except _DAMAGE as error:
-        raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
+    header, arrays = _read(path, kind)
+    found = header.get("kind", _OLDEST_KIND)
+    if found != kind and found in KINDS:
+        raise CaptureError(f"{path}: {KINDS[found]}, wanted {KINDS[kind]}")
+    if "schema" not in header:
+        raise CaptureError(f"{path}: not a {kind}, or a damaged one")
+    if header["schema"] != schema:
+        raise CaptureError(f"{path}: a {kind} of schema {header['schema']}, wanted {schema}")
     try:
         return unpack(header, arrays)
     except _DAMAGE as error:
         raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
+
+
+def archive_kind(path: Path) -> str:
+    """Which of `KINDS` a file is.
+
+    Raises:
+        CaptureError: No such file, or none of them.
+    """
+    found = _read(path, "take")[0].get("kind", _OLDEST_KIND)
+    if found not in KINDS:
+        raise CaptureError(f"{path}: a {found}, wanted {' or '.join(KINDS.values())}")
+    return str(found)
+
+
+def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays, whatever they hold."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        header = json.loads(str(arrays["header"]))
+        if not isinstance(header, dict):
+            raise ValueError("the header is no table")
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except _DAMAGE as error:
+        raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
+    return header, arrays
 
 
 def check_shapes(wanted: Iterable[tuple[np.ndarray, tuple[int, ...]]]) -> None:

@@ -1,0 +1,136 @@
+"""A take as pictures need it, simulated or tracked: who and what is where in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gloves.archives import archive_kind
+from gloves.attach import Attachment, attach
+from gloves.take import KIND, Take, load_take
+from gloves.tracked_take import LOST, TrackedTake, load_tracked_take
+from handsim.errors import CaptureError
+from handsim.model import HandModel
+from handsim.objects import RigidObject, named_object, object_names
+from handsim.transforms import quaternion_matrix
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownHand:
+    """One hand of a take."""
+
+    model: HandModel
+    attachment: Attachment
+    qpos: Float[np.ndarray, "T 27"]
+    """NaN where there is no pose to show."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownBody:
+    """One rigid thing of a take."""
+
+    name: str
+    thing: RigidObject | None
+    """What it looks like; None for a thing of the user's own, of which only its markers are known."""
+    markers: Float[np.ndarray, "Q 3"]
+    """In its own frame [m]."""
+    T_world_body: Float[np.ndarray, "T 4 4"]
+    """NaN where it is lost."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownTake:
+    """Motion of hands and things, and what the optical system saw of them."""
+
+    rate: float
+    """Frames a second [Hz]."""
+    times: Float[np.ndarray, "T"]
+    """[s]"""
+    hands: tuple[ShownHand, ...]
+    bodies: tuple[ShownBody, ...]
+    points: Float[np.ndarray, "T N 3"]
+    """World [m], NaN where a column has no point."""
+    labels: Int[np.ndarray, "T N"]
+    """Places in `label_names`, -1 for none."""
+    label_names: tuple[str, ...]
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.times)
+
+    def wrists(self) -> Float[np.ndarray, "T H 27"]:
+        """Poses of all hands."""
+        return np.stack([hand.qpos for hand in self.hands], axis=1)
+
+
+def load_shown_take(path: Path) -> ShownTake:
+    """Read a tracked take, or the truth of a simulated one.
+
+    Raises:
+        CaptureError: No such file, of another kind or schema, damaged, or without any pose.
+    """
+    shown = (
+        show_simulated(load_take(path))
+        if archive_kind(path) == KIND
+        else show_tracked(load_tracked_take(path))
+    )
+    if not np.isfinite(shown.wrists()[..., 0]).any():
+        raise CaptureError(f"{path}: there is no hand in any frame, wanted one to draw")
+    return shown
+
+
+def show_simulated(take: Take) -> ShownTake:
+    """The truth of a simulated take."""
+    hands = []
+    for hand in take.hands:
+        model = HandModel(hand.shape)
+        hands.append(ShownHand(model, attach(hand.layout, model), hand.qpos))
+    names = [f"{hand.shape.side}:{name}" for hand in take.hands for name in hand.layout.names]
+    bodies: tuple[ShownBody, ...] = ()
+    if take.body is not None:
+        names += [f"{take.body.name}:{name}" for name in take.body.marker_names]
+        bodies = (_body(take.body.name, np.empty((0, 3)), take.body.T_world_body),)
+    times = np.arange(take.num_frames) / take.rate
+    labels = take.labels.astype(np.int64)
+    return ShownTake(take.rate, times, tuple(hands), bodies, take.points, labels, tuple(names))
+
+
+def show_tracked(take: TrackedTake) -> ShownTake:
+    """What a tracker made of a capture."""
+    hands = tuple(
+        ShownHand(
+            HandModel(hand.shape),
+            hand.attachment,
+            np.where(take.status[:, place, None] == LOST, np.nan, take.qpos[:, place]),
+        )
+        for place, hand in enumerate(take.hands)
+    )
+    bodies = tuple(
+        _body(body.name, body.places, _transforms(take.body_poses[:, place]))
+        for place, body in enumerate(take.bodies)
+    )
+    labels = take.labels.astype(np.int64)
+    return ShownTake(take.rate, take.times, hands, bodies, take.points, labels, take.label_names)
+
+
+def _body(name: str, markers: NDArray[np.float64], poses: NDArray[np.float64]) -> ShownBody:
+    thing = named_object(name) if name in object_names() else None
+    return ShownBody(name, thing, markers if thing is None else thing.markers, poses)
+
+
+def _transforms(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (T, 4, 4) of places and quaternions (T, 7); NaN where there are none."""
+    transforms = np.tile(np.eye(4), (len(poses), 1, 1))
+    there = np.isfinite(poses[:, 0])
+    transforms[there, :3, :3] = quaternion_matrix(poses[there, 3:])
+    transforms[:, :3, 3] = poses[:, :3]
+    transforms[~there] = np.nan
+    return transforms
