@@ -16,7 +16,7 @@ from scipy.cluster.hierarchy import fclusterdata
 
 from track.hand_memory import HandMemory
 from track.inverse_kinematics import PoseFit
-from track.matching import gains, match
+from track.matching import gains, match, worth_of
 from track.naming import targets_of
 from train.labeling import Labeler, Labelling
 
@@ -27,12 +27,17 @@ if TYPE_CHECKING:
 MOST_RMS: Final = 0.008
 """RMS distance [m] beyond which a pose is thrown away; Han et al. 2018, section 4.4."""
 _LINK: Final = 0.085  # [m] between neighbouring markers of one hand, at most
-_SHARE: Final = 0.6  # of a hand's markers that must be found
+_SHARE: Final = 0.45  # of a hand's markers that must be found
 _STRAYS: Final = 6  # points more than a hand has, from which on a cloud is cut
 _MOST_POINTS: Final = 100  # that hang together: more are nobody's hands
 _CUTS: Final = 12
 _TRIES: Final = 6  # labelled clouds that are fitted, the surest first
-_LOOSE: Final = (0.012, 0.006)  # [m] around a fitted hand, in which its points are looked for, then again
+_ROUNDS: Final = 2  # of looking for the points of a fitted hand
+_LOOSE: Final = 4.0  # of their spread so far: where its points are looked for
+_GATES: Final = (0.003, 0.012)  # [m] that is, at least and at most
+_FREEDOM: Final = 20.0  # coordinates of its points that a pose fits, whatever they are
+_LEAST_SCORE: Final = 50.0  # of a hand that is one: twelve points 5 mm off
+_FINEST: Final = 0.0003  # [m] below which a spread says no more
 _FEWEST_POINTS: Final = 4
 
 
@@ -46,6 +51,7 @@ class Found:
     names: Int[np.ndarray, "N"]
     """Marker of each point, -1 for what is none of this hand's."""
     score: float
+    """See `score_of`."""
 
 
 class HandFinder:
@@ -104,7 +110,7 @@ class HandFinder:
                 hand = self._try(number, points, group, clouds[place], labellings[place])
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
-            if best is not None and best.score > 0.9 * self._memories[best.number].num_markers:
+            if best is not None and (best.names >= 0).sum() > 0.9 * self._memories[best.number].num_markers:
                 break
         return best
 
@@ -130,21 +136,52 @@ class HandFinder:
         """Fit a hand to a labelled cloud, and again to what it then explains of the whole group."""
         memory, names = self._memories[number], np.full(len(points), -1)
         names[cloud] = labelling.labels
-        if (names >= 0).sum() < self._least(number):
-            return None
-        fit = memory.solver.solve(targets_of(points, names, memory.num_markers)[None])
-        score = 0.0
-        for loose in _LOOSE:
-            places = memory.solver.place(fit.qpos[0])
-            spread = np.tile(loose**2 * np.eye(3), (memory.num_markers, 1, 1))
-            matched, _ = match(gains(points[group], places, spread))
-            names[:] = -1
-            names[group] = matched
-            if (names >= 0).sum() < self._least(number):
+        found = self._trim(number, points, names, None)
+        for _ in range(_ROUNDS):
+            if found is None:
                 return None
-            fit = memory.solver.solve(targets_of(points, names, memory.num_markers)[None], fit.qpos)
-        if not fit.rms[0] <= MOST_RMS:
-            return None
-        misses = np.nansum(fit.residuals[0] ** 2, axis=-1)
-        score = float((names >= 0).sum() - misses.sum() / MOST_RMS**2)
-        return Found(number, fit, names, score)
+            places = memory.solver.place(found.fit.qpos[0])
+            loose = np.clip(_LOOSE * _spread_of(found), *_GATES)
+            spread = np.tile(loose**2 * np.eye(3), (memory.num_markers, 1, 1))
+            names = np.full(len(points), -1)
+            names[group], _ = match(gains(points[group], places, spread))
+            found = self._trim(number, points, names, found.fit)
+        return found
+
+    def _trim(
+        self, number: int, points: NDArray[np.float64], names: NDArray[np.int64], start: PoseFit | None
+    ) -> Found | None:
+        """Fit named points, without those that the others speak against, the worst first."""
+        memory, best = self._memories[number], None
+        while (names >= 0).sum() >= self._least(number):
+            targets = targets_of(points, names, memory.num_markers)
+            fit = memory.solver.solve(targets[None], None if start is None else start.qpos)
+            found = Found(number, fit, names, score_of(int((names >= 0).sum()), float(fit.rms[0])))
+            if best is not None and found.score <= best.score:
+                break
+            best, start = found, fit
+            mine = np.flatnonzero(names >= 0)
+            off = (fit.residuals[0, names[mine]] ** 2).sum(axis=1)
+            names = names.copy()
+            names[mine[off.argmax()]] = -1
+        good = best is not None and best.fit.rms[0] <= MOST_RMS and best.score >= _LEAST_SCORE
+        return best if good else None
+
+
+def score_of(count: int, rms: float) -> float:
+    """Log odds of named points against strays, if their spread around a fitted hand is what it seems to be.
+
+    Few points that lie right can so be worth more than many that lie roughly.
+
+    Args:
+        count: Named points.
+        rms: Their RMS distance from the hand's markers [m].
+    """
+    freedom = max(3.0 * count - _FREEDOM, 1.0)
+    spread = max(rms * np.sqrt(count / freedom), _FINEST)
+    worth = float(worth_of(np.array(spread**2)))
+    return count * (worth - 1.5)
+
+
+def _spread_of(found: Found) -> float:
+    return float(found.fit.rms[0]) / np.sqrt(3.0)

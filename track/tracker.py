@@ -237,7 +237,7 @@ class Tracker:
                 continue
             self._trusted[number] = time
             for found in self._finder.find(points[open_points], [number]):
-                if found.score > named + _MORE:
+                if (found.names >= 0).sum() > named + _MORE:
                     hands[number] = self._take_up(found, open_points, points, names, time)
 
     def _take_up(
