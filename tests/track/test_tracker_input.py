@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -59,6 +60,23 @@ def take() -> Take:
 @pytest.fixture(scope="module")
 def users(take) -> list[UserHand]:
     return true_users(take)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Bench:
+    """What a property is tried on; it has nothing to show when an example fails."""
+
+    users: list[UserHand]
+    labeler: Labeler
+    take: Take
+
+    def tracker(self) -> Tracker:
+        return Tracker(self.users, self.labeler)
+
+
+@pytest.fixture(scope="module")
+def bench(users, labeler, take) -> Bench:
+    return Bench(users, labeler, take)
 
 
 @pytest.fixture
@@ -142,7 +160,7 @@ def nothing(number: int, fed: Fed) -> Fed:
     return fed._replace(points=np.zeros((0, 3)), ids=np.zeros(0, dtype=int), labels=np.zeros(0, dtype=int))
 
 
-def only(fed: Fed, kept: np.ndarray) -> Fed:
+def only(fed: Fed, kept: np.ndarray | slice | list[int]) -> Fed:
     return fed._replace(points=fed.points[kept], ids=fed.ids[kept], labels=fed.labels[kept])
 
 
@@ -381,10 +399,13 @@ def test_frames_of_one_point(tracker, take):
     assert all(all_right(fed[3:], tracked[3:]))
 
 
-@pytest.mark.xfail(
+LEARNT = pytest.mark.xfail(
     strict=True,
-    reason="a wrong first naming is never undone: the hand's habits learn it, and the RMS hides it",
+    reason="a wrong first name is learned as a marker's habit: it stays, and the RMS does not show it",
 )
+
+
+@LEARNT
 def test_every_point_twice_at_one_place(tracker, take):
     def change(number: int, fed: Fed) -> Fed:
         points, ids = np.repeat(fed.points, 2, axis=0), np.repeat(2 * fed.ids, 2)
@@ -392,6 +413,15 @@ def test_every_point_twice_at_one_place(tracker, take):
         return fed._replace(points=points, ids=ids)
 
     feed(tracker, take, range(20), change)
+
+
+@LEARNT
+def test_a_hand_found_on_half_of_its_markers_is_right_once_all_are_there(tracker, take):
+    """A point of something else passes for one of them; then nothing comes for 92 ms."""
+    half = only(plain(take, 6), slice(None, None, 2))
+    tracker.step(half.points, half.ids + 10**6, 6 / take.rate)
+    fed, tracked = feed(tracker, take, range(17, 60))
+    assert all(all_right(fed[20:], tracked[20:]))
 
 
 def changes_of(users: list[UserHand], labeler: Labeler, take: Take, spoil: bool) -> list[np.ndarray]:
@@ -461,9 +491,9 @@ def garbage(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, float]:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(frames=st.lists(garbage(), min_size=1, max_size=6), lead=st.booleans(), data=st.data())
-def test_garbage_never_raises_and_does_not_last(users, labeler, take, frames, lead, data):
+def test_garbage_never_raises_and_leaves_nothing_behind(bench, frames, lead, data):
     """Alone, and amid a take: among the true points, shuffled, with some lost."""
-    tracker = Tracker(users, labeler)
+    tracker, take = bench.tracker(), bench.take
     time = 0.0
     for frame in range(3 if lead else 0):
         tracker.step(*plain(take, frame)[:3])
@@ -475,8 +505,8 @@ def test_garbage_never_raises_and_does_not_last(users, labeler, take, frames, le
         with np.errstate(all="raise", under="ignore"):
             check_frame(tracker.step(points, ids, time), points)
     begin = 0.0 if np.isnan(time) else time
-    for frame in range(20, 40):
-        fed = plain(take, frame)
-        last = tracker.step(fed.points, fed.ids + 10**6, begin + frame / 120.0)
-        check_frame(last, fed.points)
-    assert all_right([fed], [last]) == [True]
+    for frame in range(1, 31):
+        last = tracker.step(np.zeros((0, 3)), np.zeros(0, dtype=int), begin + frame / 120.0)
+    assert statuses([last]) == {Status.LOST}
+    fed, tracked = feed(tracker, take, range(40, 44), lambda n, one: one._replace(time=begin + n / 120.0))
+    assert all(all_right(fed, tracked))
