@@ -54,7 +54,8 @@ from train.labeler import load_labeler
 from train.labeling import Labeler
 from train.twins import KINDS, Kind, TwinConfig, simulate_twin
 
-LOCKED, RECOVERED = 3, 5  # frames
+TRIALS = {"start": (first_locks, 3), "recovery": (recoveries, 5)}
+"""What is tried, and the frames within which all should be right."""
 WARM_UP = 30  # frames
 FINDINGS = 25  # frames in which hands are looked for
 EVERY = 36000  # frames between two looks at the memory: five minutes
@@ -96,9 +97,8 @@ def head(title: str) -> None:
 def calibrated_users(take: Take, seed: int, free: float) -> list[UserHand]:
     """The people of a take as `handsim calibrate` finds them in a capture that they make for it."""
     people = tuple((user.model, user.attachment) for user in true_users(take))
-    made = simulate_calibration(
-        people, CalibrationTakeConfig(free=free), rng=np.random.default_rng((seed, 1))
-    )
+    rng = np.random.default_rng((seed, 1))
+    made = simulate_calibration(people, CalibrationTakeConfig(free=free), rng=rng)
     with tempfile.TemporaryDirectory() as folder:
         capture, user = Path(folder) / "calibration.c3d", Path(folder) / "user.json"
         names = tuple(f"point{number}" for number in range(made.points.shape[1]))
@@ -153,27 +153,23 @@ def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
     for users, hands in HANDS.items():
         waits: dict[str, list[np.ndarray]] = {"start": [], "recovery": []}
         for name, take in takes.items():
-            known, rng = hands(take), np.random.default_rng(arguments.seeds[0])
-            tries = (
-                ("start", first_locks, arguments.starts, LOCKED),
-                ("recovery", recoveries, arguments.recoveries, RECOVERED),
-            )
-            for what, wait, count, within in tries:
-                trials = -(-count // len(takes))
+            rng = np.random.default_rng(arguments.seeds[0])
+            for what, trials in (("start", arguments.starts), ("recovery", arguments.recoveries)):
+                wait, within = TRIALS[what]
+                count, known = -(-trials // len(takes)), hands(take)
                 waits[what].append(
-                    wait(take, lambda _, known=known: Tracker(known, labeler()), trials, rng=rng)
+                    wait(take, lambda _, known=known: Tracker(known, labeler()), count, rng=rng)
                 )
                 tell_waits(f"{name}, {users}: {what}", waits[what][-1], within)
-        tell_waits(f"ALL, {users}: start", np.concatenate(waits["start"]), LOCKED)
-        tell_waits(f"ALL, {users}: recovery", np.concatenate(waits["recovery"]), RECOVERED)
+        for what, found in waits.items():
+            tell_waits(f"all, {users}: {what}", np.concatenate(found), TRIALS[what][1])
 
 
 def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
     never = np.where(np.isnan(waits), np.inf, waits)
     print(
-        f"  {name:50s} {100 * np.mean(never < within):6.1f} % within {within} frames, "
-        f"{100 * np.mean(never == 0):5.1f} % in the first, {np.isinf(never).sum():.0f} of {len(waits)} not "
-        "in 120",
+        f"  {name:46s} {100 * np.mean(never < within):6.1f} % within {within} frames, "
+        f"{100 * np.mean(never == 0):5.1f} % in the first, {np.isinf(never).sum()} of {len(waits)} not in 120",
         flush=True,
     )
 
