@@ -169,7 +169,7 @@ def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
     never = np.where(np.isnan(waits), np.inf, waits)
     print(
         f"  {name:46s} {100 * np.mean(never < within):6.1f} % within {within} frames, "
-        f"{100 * np.mean(never == 0):5.1f} % in the first, {np.isinf(never).sum()} of {len(waits)} not in 120",
+        f"{100 * np.mean(never == 0):5.1f} % in the first, {np.isinf(never).sum()}/{len(waits)} not in 120",
         flush=True,
     )
 
