@@ -447,6 +447,24 @@ def test_a_hand_found_on_half_of_its_markers_is_right_once_all_are_there(tracker
     assert all(all_right(fed[20:], tracked[20:]))
 
 
+@LEARNT
+@pytest.mark.parametrize("seed", [2, 3, 6])
+def test_ghosts_of_the_first_ten_frames_are_got_over(tracker, take, seed):
+    """Ten that stand 10 to 50 mm from markers when hands are found."""
+    rng, first = np.random.default_rng(seed), plain(take, 0)
+    markers = first.points[first.labels >= 0]
+    way = rng.normal(size=(10, 3))
+    way *= rng.uniform(0.01, 0.05, size=(10, 1)) / np.linalg.norm(way, axis=1, keepdims=True)
+    ghosts = markers[rng.integers(0, len(markers), 10)] + way
+
+    for frame in range(10):
+        points, ids, time, *_ = plain(take, frame)
+        ids = np.concatenate([ids, 10**6 + np.arange(10)])
+        tracker.step(np.concatenate([points, ghosts]), ids, time)
+    fed, tracked = feed(tracker, take, range(10, 60))
+    assert all(all_right(fed[30:], tracked[30:]))
+
+
 def changes_of(users: list[UserHand], labeler: Labeler, take: Take, spoil: bool) -> list[np.ndarray]:
     """Poses of both hands as they were said, of frames some of which are empty."""
     tracker, poses = Tracker(users, labeler), []
