@@ -454,9 +454,8 @@ def test_ghosts_of_the_first_ten_frames_are_got_over(tracker, take, seed):
     rng, first = np.random.default_rng(seed), plain(take, 0)
     markers = first.points[first.labels >= 0]
     way = rng.normal(size=(10, 3))
-    way *= rng.uniform(0.01, 0.05, size=(10, 1)) / np.linalg.norm(way, axis=1, keepdims=True)
-    ghosts = markers[rng.integers(0, len(markers), 10)] + way
-
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    ghosts = markers[rng.integers(0, len(markers), 10)] + way * rng.uniform(0.01, 0.05, size=(10, 1))
     for frame in range(10):
         points, ids, time, *_ = plain(take, frame)
         ids = np.concatenate([ids, 10**6 + np.arange(10)])
