@@ -1,0 +1,250 @@
+"""The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
+
+    OMP_NUM_THREADS=1 python benchmarks/tracking.py [calibrated drums starts speed memory]
+        [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
+
+calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
+    calibrate` begins with the nearest of the five sizes, has the tracker label the capture, and writes their
+    hands. With these the twin is tracked, beside the true hands and the nearest size as it is.
+drums: the twins with twenty ghosts a frame near the hands (`drum_takes`), from the beginning and from second
+    one, and without.
+starts: a tracker begins at a random frame, or has a second of darkness behind it; how many frames pass until
+    every point and pose of a frame is right. "Within 3" is the third frame at the latest.
+speed: time of a frame with two calibrated hands, once kernels are loaded, and of frames in which both hands
+    are looked for.
+memory: a take forwards and backwards, again and again with new IDs, 432000 frames being an hour of motion.
+
+All sections when none is named. Twins have the paper's number of frames unless told otherwise; the points of
+a rigid body with markers of its own are left out, as in the paper's tables. What counts as right and valid is
+told in docs/tracking_baselines.md. One core is used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from drum_takes import with_drum
+from machine import describe
+
+from gloves.captures import Capture, write_capture
+from gloves.take import Take
+from track.calibration_command import calibrate
+from track.capture_tracking import warm_up
+from track.evaluation import (
+    TrackingReport,
+    evaluate_tracker,
+    nearest_size,
+    seen_frame,
+    true_users,
+    usual_users,
+)
+from track.hand_errors import hand_errors
+from track.tracker import Tracker
+from track.trials import FEWEST_FRAMES, first_locks, recoveries, without_body
+from track.user import UserHand, load_user
+from train.calibration_take import CalibrationTakeConfig, simulate_calibration
+from train.labeler import load_labeler
+from train.labeling import Labeler
+from train.twins import KINDS, Kind, TwinConfig, simulate_twin
+
+TRIALS = {"start": (first_locks, 3), "recovery": (recoveries, 5)}
+"""What is tried, and the frames within which all should be right."""
+WARM_UP = 30  # frames
+FINDINGS = 25  # frames in which hands are looked for
+EVERY = 36000  # frames between two looks at the memory: five minutes
+HANDS = {"true": true_users, "uncalibrated": usual_users}
+
+
+@cache
+def twin(kind: Kind, frames: int | None, seed: int) -> Take:
+    return without_body(simulate_twin(TwinConfig(kind=kind, num_frames=frames, seed=seed)))
+
+
+@cache
+def labeler() -> Labeler:
+    return load_labeler("dense19")
+
+
+def follow(take: Take, users: Sequence[UserHand]) -> TrackingReport:
+    return evaluate_tracker(take, users, Tracker(users, labeler()))
+
+
+def tell(name: str, report: TrackingReport) -> None:
+    figures = report.figures()
+    shares = " ".join(f"{100 * figures[key]:7.2f}" for key in ("right", "valid", "right_of_valid"))
+    errors = " ".join(
+        "          -  " if not count else f"{1e3 * joint:5.2f} /{np.rad2deg(angle):6.2f}"
+        for count, joint, angle in report.by_occlusion().values()
+    )
+    print(f"  {name:30s} {shares}   {errors}", flush=True)
+
+
+def head(title: str) -> None:
+    print(f"\n{title}")
+    print(
+        "  % of frames, joints [mm] / hinges [deg]    right   valid  of these   "
+        "by markers missing: none, 1-2, 3-5, 6 or more"
+    )
+
+
+def calibrated_users(take: Take, seed: int, free: float) -> list[UserHand]:
+    """The people of a take as `handsim calibrate` finds them in a capture that they make for it."""
+    people = tuple((user.model, user.attachment) for user in true_users(take))
+    rng = np.random.default_rng((seed, 1))
+    made = simulate_calibration(people, CalibrationTakeConfig(free=free), rng=rng)
+    with tempfile.TemporaryDirectory() as folder:
+        capture, user = Path(folder) / "calibration.c3d", Path(folder) / "user.json"
+        names = tuple(f"point{number}" for number in range(made.points.shape[1]))
+        write_capture(capture, Capture(names, made.points, made.rate))
+        calibrate(capture, out=user, size=nearest_size(take.hands[0].shape.length))
+        found = {hand.side: hand for hand in load_user(user)}
+    return [found[hand.shape.side] for hand in take.hands]
+
+
+def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+    head("calibrated as users are")
+    for name, take in takes.items():
+        for number, (users, hands) in enumerate(HANDS.items()):
+            tell(f"{name if number == 0 else ''} {users}", follow(take, hands(take)))
+        began = time.perf_counter()
+        found = calibrated_users(take, arguments.seeds[0], arguments.free)
+        took = time.perf_counter() - began
+        tell(" calibrated", follow(take, found))
+        for one, true in zip(found, true_users(take), strict=True):
+            errors = hand_errors(one, true)
+            print(
+                f"    {one.side}: places {1e3 * errors.places.mean():.2f} mm, bones "
+                f"{100 * np.abs(errors.lengths).mean():.2f} %, tips {100 * np.abs(errors.tips).mean():.1f} %"
+            )
+        print(f"    calibration capture, its labels and the calibration took {took:.0f} s")
+
+
+def drums(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+    head("twenty ghosts a frame near the hands")
+    lost: dict[tuple[str, str], list[float]] = {}
+    for name, take in takes.items():
+        begins = {"ghosts": 0, "ghosts from 1 s": int(take.rate)}
+        noisy = {
+            when: with_drum(take, begin, rng=np.random.default_rng(arguments.seeds[0]))
+            for when, begin in begins.items()
+        }
+        for users, hands in HANDS.items():
+            clean = follow(take, hands(take))
+            tell(f"{name} {users}", clean)
+            for when, one in noisy.items():
+                report = follow(one, hands(take))
+                tell(f"  {when}", report)
+                lost.setdefault((users, when), []).append(100 * (report.right.mean() - clean.right.mean()))
+                medians = [1e3 * run.figures()["seconds_p50"] for run in (clean, report)]
+                print(f"    {lost[users, when][-1]:+.2f} points; {medians[0]:.1f} -> {medians[1]:.1f} ms")
+    for (users, when), points in lost.items():
+        print(f"  {users}, {when}: {np.mean(points):+.2f} points on average over {len(points)} takes")
+
+
+def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+    print(f"\nfrom nothing, and after a second of darkness; {len(takes)} takes")
+    for users, hands in HANDS.items():
+        waits: dict[str, list[np.ndarray]] = {"start": [], "recovery": []}
+        for name, take in takes.items():
+            rng = np.random.default_rng(arguments.seeds[0])
+            for what, trials in (("start", arguments.starts), ("recovery", arguments.recoveries)):
+                wait, within = TRIALS[what]
+                count, known = -(-trials // len(takes)), hands(take)
+                waits[what].append(
+                    wait(take, lambda _, known=known: Tracker(known, labeler()), count, rng=rng)
+                )
+                tell_waits(f"{name}, {users}: {what}", waits[what][-1], within)
+        for what, found in waits.items():
+            tell_waits(f"all, {users}: {what}", np.concatenate(found), TRIALS[what][1])
+
+
+def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
+    never = np.where(np.isnan(waits), np.inf, waits)
+    print(
+        f"  {name:46s} {100 * np.mean(never < within):6.1f} % within {within} frames, "
+        f"{100 * np.mean(never == 0):5.1f} % in the first, {np.isinf(never).sum()}/{len(waits)} not in 120",
+        flush=True,
+    )
+
+
+def speed(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+    print(
+        "\ntime of a frame [ms]: p50, p90, p99; and of one in which both hands are looked for: median, worst"
+    )
+    for name, take in takes.items():
+        users = true_users(take)
+        times = 1e3 * follow(take, users).seconds[WARM_UP:]
+        finding = []
+        for frame in np.linspace(0, take.num_frames - 1, FINDINGS).astype(int):
+            tracker, seen = Tracker(users, labeler()), seen_frame(take, frame)
+            began = time.perf_counter()
+            tracker.step(seen.points, seen.ids, 0.0)
+            finding.append(1e3 * (time.perf_counter() - began))
+        shown = " ".join(f"{np.quantile(times, share):6.2f}" for share in (0.5, 0.9, 0.99))
+        print(f"  {name:20s} {shown}   {np.median(finding):6.1f} {max(finding):6.1f}", flush=True)
+
+
+def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+    name, take = next(iter(takes.items()))
+    print(f"\nresident memory, {name} forwards and backwards")
+    tracker, lap, right = Tracker(true_users(take), labeler()), int(take.ids.max()) + 1, 0
+    there_and_back = [*range(take.num_frames), *range(take.num_frames - 2, 0, -1)]
+    began = time.perf_counter()
+    for number in range(arguments.hour):
+        laps, place = divmod(number, len(there_and_back))
+        seen = seen_frame(take, there_and_back[place])
+        tracked = tracker.step(seen.points, seen.ids + laps * lap, number / take.rate)
+        right += np.array_equal(tracked.labels, seen.labels)
+        if (number + 1) % min(EVERY, max(1, arguments.hour // 12)) == 0:
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            size = 1e-6 * pages * os.sysconf("SC_PAGE_SIZE")
+            print(
+                f"  {(number + 1) / take.rate / 60:5.1f} min: {size:7.1f} MB, "
+                f"{100 * right / (number + 1):.2f} % right, "
+                f"{1e3 * (time.perf_counter() - began) / (number + 1):.2f} ms a frame",
+                flush=True,
+            )
+
+
+SECTIONS = {"calibrated": calibrated, "drums": drums, "starts": starts, "speed": speed, "memory": memory}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sections", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}")
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
+    parser.add_argument("--frames", type=int, help="of every twin; the paper's number when not given")
+    parser.add_argument("--free", type=float, default=40.0, help="free motion in a calibration capture [s]")
+    parser.add_argument("--starts", type=int, default=200)
+    parser.add_argument("--recoveries", type=int, default=100)
+    parser.add_argument("--hour", type=int, default=432000, help="frames that memory is watched for")
+    arguments = parser.parse_args()
+    unknown = set(arguments.sections) - set(SECTIONS)
+    if unknown:
+        parser.error(f"no section {', '.join(sorted(unknown))}; there are {', '.join(SECTIONS)}")
+    print(describe("numba", "scipy", "torch"))
+    takes = {
+        f"{kind} {seed}": twin(kind, arguments.frames, seed)
+        for seed in arguments.seeds
+        for kind in arguments.kinds
+    }
+    for take in takes.values():
+        warm_up(usual_users(take), labeler())
+    for section in arguments.sections or SECTIONS:
+        if section == "starts" and min(take.num_frames for take in takes.values()) < FEWEST_FRAMES:
+            parser.error(f"starts needs {FEWEST_FRAMES} frames of every twin")
+        SECTIONS[section](takes, arguments)
+
+
+if __name__ == "__main__":
+    main()
