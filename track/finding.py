@@ -179,8 +179,7 @@ def score_of(count: int, rms: float) -> float:
     """
     freedom = max(3.0 * count - _FREEDOM, 1.0)
     spread = max(rms * np.sqrt(count / freedom), _FINEST)
-    worth = float(worth_of(np.array(spread**2)))
-    return count * (worth - 1.5)
+    return count * (float(worth_of(np.array([spread**2]))[0]) - 1.5)
 
 
 def _spread_of(found: Found) -> float:

@@ -18,6 +18,8 @@ _FARTHEST: Final = 1e3  # [m] beyond which there is no room
 _USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] until a stream has shown its own
 _SILENCE: Final = 0.25  # [s] without a frame that is told
 _EASE: Final = 0.1  # share of the newest interval in the usual one
+_SHORTEST, _LONGEST = 0.25, 2.0  # of the usual interval: between two frames on the clock; of one that counts
+_LATEST: Final = 1e11  # [s] beyond which there is no time: a clock of doubles would stand still
 
 
 class Incoming(NamedTuple):
@@ -68,16 +70,20 @@ class Intake:
     def _tick(self, time: float) -> list[str]:
         """Move the clock on; what was odd about the time."""
         span = time - self._last
-        if np.isfinite(time):
+        if abs(time) < _LATEST:
             self._last = time
-        if np.isnan(span):  # the first frame, or a time that is none
+        else:
             self._clock += self._interval
-            return [] if np.isfinite(time) else ["the time is not a number"]
+            return [f"the time is {time:g} s, which is none"]
+        if np.isnan(span):  # the first frame
+            self._clock += self._interval
+            return []
         if span <= 0.0:
             self._clock += self._interval
             return [f"the time went back by {-span:.3g} s" if span else "the time stood still"]
-        self._clock += span
+        # Stamps shake; what moved is divided by the time that it took.
+        self._clock += max(span, _SHORTEST * self._interval)
         if span > _SILENCE:
             return [f"no frame for {span:.3g} s"]
-        self._interval += _EASE * (span - self._interval)
+        self._interval += _EASE * (min(span, _LONGEST * self._interval) - self._interval)
         return []

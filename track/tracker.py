@@ -273,4 +273,4 @@ def _tracked(
     there[names[mine]] = True
     filled = np.flatnonzero(~there)
     rms = np.nan if fit is None else memory.rms_as_designed(fit)
-    return TrackedHand(memory.hand.side, status, memory.qpos, rms, markers, filled)
+    return TrackedHand(memory.hand.side, status, memory.qpos.copy(), rms, markers, filled)

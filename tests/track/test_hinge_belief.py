@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from track.expectation import expectation
-from track.hinge_belief import belief_of_digit, foresee, resting_covariance
+from track.hinge_belief import believe_digit, foresee, resting_covariance
 
 SEEDS = st.integers(0, 1000)
 SPANS = st.floats(0.0, 5.0)
@@ -71,6 +71,12 @@ def test_neighbouring_fingers_rest_alike():
     spread = np.sqrt(np.diag(covariance))
     together = covariance / np.outer(spread, spread)
     assert (np.diag(together[5:20:4, 9:20:4]) > 0.4).all(), "fingers flex with their neighbours"
+
+
+def belief_of_digit(belief, seen, digit):
+    angles, precision = np.empty(4), np.empty((4, 4))
+    believe_digit(belief, seen.told, seen.pull, digit, angles, precision)
+    return angles, precision
 
 
 def nothing_seen():
