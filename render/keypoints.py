@@ -44,7 +44,7 @@ def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[n
     points[:, 0] = transforms[:, PALM, :3, 3]
     for number, digit in enumerate(DIGITS):
         bones = bones_of(digit)
-        points[:, 4 * number + 1 : 4 * number + 4] = transforms[:, bones, :3, 3]
+        points[:, 4 * number + 1 : 4 * number + 4] = transforms[:, list(bones)][..., :3, 3]
         last = transforms[:, bones[-1]]
         points[:, 4 * number + 4] = last[:, :3, 3] + model.skeleton.lengths[bones[-1]] * last[:, :3, 0]
     return points

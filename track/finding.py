@@ -179,8 +179,9 @@ def score_of(count: int, rms: float) -> float:
     """
     freedom = max(3.0 * count - _FREEDOM, 1.0)
     spread = max(rms * np.sqrt(count / freedom), _FINEST)
-    return count * (float(worth_of(np.array([spread**2]))[0]) - 1.5)
+    worth = worth_of(np.array([spread**2])) - 1.5
+    return count * float(worth[0])
 
 
 def _spread_of(found: Found) -> float:
-    return float(found.fit.rms[0]) / np.sqrt(3.0)
+    return float(found.fit.rms[0] / np.sqrt(3.0))

@@ -15,7 +15,7 @@ import numpy as np
 from handsim.topology import BONES, DIGITS, NUM_JOINTS
 from track.digit_search import DigitTrust, digit_ranges
 from track.expectation import Expectation
-from track.hinge_belief import HingeBelief, foresee, resting_covariance
+from track.hinge_belief import HingeBelief, foresee, resting_angles, resting_covariance
 from track.inverse_kinematics import FEWEST_MARKERS, PoseSolver
 from track.matching import worth_of
 from track.pose_motion import move, velocity_of
@@ -169,7 +169,7 @@ class HandMemory:
         """Take up a hand that has just been found."""
         self._speed[:] = 0.0
         self._seen[:] = time
-        nothing = Coming(qpos, foresee(qpos[7:], resting_covariance(), 0.0), (1.0, 1.0))
+        nothing = Coming(qpos, foresee(resting_angles(), resting_covariance(), 0.0), (1.0, 1.0))
         estimate = self.fit(targets, qpos, nothing)
         self._take(estimate, time)
         self._habit[:], self._learned[:] = 0.0, 0.0

@@ -44,6 +44,14 @@ class HingeBelief(NamedTuple):
 
 
 @cache
+def resting_angles() -> Float[np.ndarray, "20"]:
+    """Mean of the hinges over all gestures [rad]."""
+    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
+    angles: NDArray[np.float64] = gestures.mean(axis=0)
+    return angles
+
+
+@cache
 def resting_covariance() -> Float[np.ndarray, "20 20"]:
     """Of the hinges over all gestures [rad^2]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])

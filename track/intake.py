@@ -18,7 +18,7 @@ _FARTHEST: Final = 1e3  # [m] beyond which there is no room
 _USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] until a stream has shown its own
 _SILENCE: Final = 0.25  # [s] without a frame that is told
 _EASE: Final = 0.1  # share of the newest interval in the usual one
-_SHORTEST, _LONGEST = 0.25, 2.0  # of the usual interval: between two frames on the clock; of one that counts
+_SHORTEST, _LONGEST = 0.1, 2.0  # of the usual interval: between two frames on the clock; of one that counts
 _LATEST: Final = 1e11  # [s] beyond which there is no time: a clock of doubles would stand still
 
 
@@ -74,7 +74,7 @@ class Intake:
             self._last = time
         else:
             self._clock += self._interval
-            return [f"the time is {time:g} s, which is none"]
+            return [f"the time is {time:g} s" if np.isfinite(time) else "the time is not a number"]
         if np.isnan(span):  # the first frame
             self._clock += self._interval
             return []

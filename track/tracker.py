@@ -209,8 +209,13 @@ class Tracker:
             return
         others = np.delete(names, lost, axis=0)
         free = np.flatnonzero((others < 0).all(axis=0))
-        for found in self._finder.find(points[free], lost):
+        for found in self._finder.find(points[free], tuple(lost)):
             hands[found.number] = self._take_up(found, free, points, names, time)
+            lost.remove(found.number)
+            for other in lost:  # it may have held on to some of these points
+                names[other, names[found.number] >= 0] = -1
+                memory = self._memories[other]
+                hands[other] = _tracked(memory, hands[other].status, points, names[other], None)
 
     def _doubt(
         self,

@@ -29,9 +29,6 @@ FARTHEST = 0.004
 """[m] that joints may be off on average wherever a hand is said to be tracked."""
 
 
-ENDLESS = pytest.mark.xfail(strict=True, reason="an infinite time is taken for a time: the clock breaks")
-
-
 class Fed(NamedTuple):
     """What a tracker is given of a frame, and the truth of it."""
 
@@ -86,7 +83,8 @@ def tracker(users, labeler) -> Tracker:
 
 def plain(take: Take, frame: int) -> Fed:
     seen = seen_frame(take, frame)
-    return Fed(seen.points, seen.ids, frame / take.rate, seen.labels)
+    labels = np.where(seen.labels < NUM_MARKERS, seen.labels, -1)  # the controller is not tracked
+    return Fed(seen.points, seen.ids, frame / take.rate, labels)
 
 
 def feed(
@@ -215,9 +213,9 @@ def test_frames_of_points_that_are_all_nowhere(tracker, take):
         pytest.param(lambda time: 1.0 - time, "went back", id="backwards"),
         pytest.param(lambda time: 0.25, "stood still", id="still"),
         pytest.param(lambda time: np.nan, "not a number", id="NaN"),
-        pytest.param(lambda time: -np.inf, "not a number", id="-inf", marks=ENDLESS),
-        pytest.param(lambda time: np.inf, "not a number", id="inf", marks=ENDLESS),
-        pytest.param(lambda time: -1e12 * time, "went back", id="far back"),
+        pytest.param(lambda time: -np.inf, "not a number", id="-inf"),
+        pytest.param(lambda time: np.inf, "not a number", id="inf"),
+        pytest.param(lambda time: -1e9 * time, "went back", id="far back"),
         pytest.param(lambda time: 1e9 * time, "no frame for", id="far ahead"),
     ],
 )
@@ -236,12 +234,7 @@ def test_a_frame_that_comes_twice_changes_little(tracker, take):
     assert all(all_right(fed, tracked))
 
 
-HASTY = pytest.mark.xfail(
-    strict=True, reason="a frame stamped just after another one makes a hand's speed huge"
-)
-
-
-@pytest.mark.parametrize("apart", [3e-3, pytest.param(1e-4, marks=HASTY), pytest.param(1e-6, marks=HASTY)])
+@pytest.mark.parametrize("apart", [3e-3, 1e-4, 1e-6])
 def test_stamps_that_lie_close_together(tracker, take, apart):
     """Every tenth frame is stamped just after the one before, as when a computer was busy."""
 
@@ -252,7 +245,7 @@ def test_stamps_that_lie_close_together(tracker, take, apart):
     assert np.mean(all_right(fed, tracked)) >= 0.95
 
 
-@pytest.mark.parametrize("jitter", [0.002, pytest.param(0.004, marks=HASTY)])
+@pytest.mark.parametrize("jitter", [0.002, 0.004])
 def test_stamps_that_shake(tracker, take, jitter):
     times = np.sort(np.arange(120) / take.rate + jitter * np.random.default_rng(0).normal(size=120))
     fed, tracked = feed(tracker, take, range(120), lambda n, fed: fed._replace(time=float(times[n])))
@@ -482,7 +475,6 @@ def changes_of(users: list[UserHand], labeler: Labeler, take: Take, spoil: bool)
     return poses
 
 
-@pytest.mark.xfail(strict=True, reason="qpos of a hand is the tracker's own array")
 def test_what_is_given_and_said_is_the_callers_own(users, labeler, take):
     own, spoilt = (changes_of(users, labeler, take, spoil) for spoil in (False, True))
     np.testing.assert_array_equal(own, spoilt)
