@@ -15,7 +15,7 @@ import numpy as np
 from handsim.topology import BONES, DIGITS, NUM_JOINTS
 from track.digit_search import DigitTrust, digit_ranges
 from track.expectation import Expectation
-from track.hinge_belief import HingeBelief, foresee, resting_angles, resting_covariance
+from track.hinge_belief import HingeBelief, foresee, rest, resting_covariance
 from track.inverse_kinematics import FEWEST_MARKERS, PoseSolver
 from track.matching import worth_of
 from track.pose_motion import move, velocity_of
@@ -102,6 +102,9 @@ class HandMemory:
         self._designed = self.adapted.places[:, 0].copy()
         self._ranges = digit_ranges(self.adapted)
         self._hinges = resting_covariance()
+        self._rest = rest()
+        self.proven = np.zeros(len(DIGITS), dtype=bool)
+        """Digits that have had a firm name since the hand was found."""
         self.places = np.full((count, 3), np.nan)
 
     def predict(self, time: float) -> Coming:
@@ -146,11 +149,15 @@ class HandMemory:
         )
         return Estimate(expected.qpos, rms, residuals, expected)
 
-    def trust(self, coming: Coming, estimate: Estimate) -> DigitTrust:
-        """What new points of a digit are measured by."""
+    def trust(self, coming: Coming, estimate: Estimate) -> tuple[DigitTrust, DigitTrust]:
+        """What new points of a digit are measured by, and those of one that has not yet had a firm name.
+
+        What a doubtful name made of such a digit must not speak for that name.
+        """
         slack = 2.5 * np.sqrt(self.variance) + np.sqrt((self._habit**2).sum(axis=1))
         worth = worth_of(self.variance)
-        return DigitTrust(coming.hinges, estimate.expected, self.variance, worth, slack, self._ranges)
+        firm = DigitTrust(coming.hinges, estimate.expected, self.variance, worth, slack, self._ranges)
+        return firm, firm._replace(belief=self._rest)
 
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
         """Log chance of each marker to come back when it did, were it the point that was born then [s].
@@ -169,7 +176,8 @@ class HandMemory:
         """Take up a hand that has just been found."""
         self._speed[:] = 0.0
         self._seen[:] = time
-        nothing = Coming(qpos, foresee(resting_angles(), resting_covariance(), 0.0), (1.0, 1.0))
+        self.proven[:] = False
+        nothing = Coming(qpos, self._rest, (1.0, 1.0))
         estimate = self.fit(targets, qpos, nothing)
         self._take(estimate, time)
         self._habit[:], self._learned[:] = 0.0, 0.0
@@ -189,6 +197,7 @@ class HandMemory:
         if span > 0.0:
             self._speed += _SMOOTHING * (velocity_of(self.qpos, qpos, span) - self._speed)
         self._take(estimate, time)
+        self.proven[self.digits[firm & (self.digits >= 0)]] = True
         self._learn(estimate, firm)
 
     def _take(self, estimate: Estimate, time: float) -> None:

@@ -59,6 +59,12 @@ def resting_covariance() -> Float[np.ndarray, "20 20"]:
     return covariance
 
 
+def rest() -> HingeBelief:
+    """What is believed of a hand of which nothing is known."""
+    covariance = resting_covariance()
+    return HingeBelief(resting_angles(), covariance, np.linalg.inv(covariance))
+
+
 def foresee(
     angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], span: float
 ) -> HingeBelief:

@@ -144,11 +144,11 @@ def _search(
     odds[named, names[named]] = credit[named]
     if hand.number in advice:
         odds += advice[hand.number]
-    trusted = memory.trust(hand.coming, estimate)
+    firm, doubtful = memory.trust(hand.coming, estimate)
     for digit in np.flatnonzero(reach.counts):
         search_digit(
             memory.adapted,
-            trusted,
+            firm if memory.proven[digit] else doubtful,
             digit,
             markers[digit, markers[digit] >= 0],
             points,
