@@ -34,7 +34,8 @@ class Adviser:
 
     def __init__(self, labeler: Labeler) -> None:
         self._labeler = labeler
-        self._due: dict[int, float] = {}
+        self._asked: dict[int, float] = {}
+        self._due: dict[tuple[int, int], float] = {}
         self._opinions: dict[tuple[int, int], NDArray[np.float64]] = {}
 
     def odds(
@@ -56,54 +57,49 @@ class Adviser:
             born: When each point appeared [s].
             time: Time of the frame [s].
         """
-        known = ids.tolist()
-        there = set(known)
-        self._due = {point: due for point, due in self._due.items() if point in there}
-        self._opinions = {key: said for key, said in self._opinions.items() if key[0] in there}
-        unnamed = np.asarray((names < 0).all(axis=0), dtype=bool)
-        waiting = unnamed & (ids >= 0)
-        for place in np.flatnonzero(waiting):
-            waiting[place] = time >= self._due.setdefault(known[place], float(born[place]) + _FIRST)
-        if waiting.any():
-            self._ask(hands, points, ids, names, unnamed, waiting)
-            for place in np.flatnonzero(waiting):
-                self._due[known[place]] = time + (_LATER - 1.0) * max(time - born[place], _FIRST)
+        rows = {point: row for row, point in enumerate(ids.tolist()) if point >= 0}
+        self._due = {key: due for key, due in self._due.items() if key[0] in rows}
+        self._opinions = {key: said for key, said in self._opinions.items() if key[0] in rows}
+        unnamed = np.flatnonzero((names < 0).all(axis=0) & (ids >= 0))
+        for hand in sorted(hands, key=lambda hand: self._asked.get(hand.number, -np.inf)):
+            due = [self._due.get((int(ids[row]), hand.number), born[row] + _FIRST) for row in unnamed]
+            waiting = unnamed[time >= np.array(due)]
+            if len(waiting) and self._ask(
+                hand, points, ids, names, waiting
+            ):  # one hand a frame: it takes time
+                self._asked[hand.number] = time
+                for row in waiting:
+                    self._due[int(ids[row]), hand.number] = time + (_LATER - 1.0) * (time - born[row])
+                break
         found: dict[int, NDArray[np.float64]] = {}
-        if self._opinions:
-            rows = {point: row for row, point in enumerate(known)}
-            for (point, number), said in self._opinions.items():
-                found.setdefault(number, np.zeros((len(points), len(said))))[rows[point]] = said
+        for (point, number), said in self._opinions.items():
+            found.setdefault(number, np.zeros((len(points), len(said))))[rows[point]] = said
         return found
 
     def _ask(
         self,
-        hands: Sequence[Following],
+        hand: Following,
         points: NDArray[np.float64],
         ids: NDArray[np.int64],
         names: NDArray[np.int64],
-        unnamed: NDArray[np.bool_],
-        waiting: NDArray[np.bool_],
-    ) -> None:
-        clouds, asked = [], []
-        for hand in hands:
-            mine, places = names[hand.number], hand.estimate.places
-            missing = np.ones(len(places), dtype=bool)
-            missing[mine[mine >= 0]] = False
-            if not missing.any() or not _near(points[waiting], places[missing]).any():
-                continue
-            shown = mine >= 0
-            shown[unnamed] = _near(points[unnamed], places)
-            clouds.append(np.flatnonzero(shown))
-            asked.append((hand.number, missing))
-        if not clouds:
-            return
-        labellings = self._labeler.label_frames([points[cloud] for cloud in clouds])
-        for cloud, (number, missing), labelling in zip(clouds, asked, labellings, strict=True):
-            for place, label, sure in zip(cloud, labelling.labels, labelling.confidence, strict=True):
-                if waiting[place] and label >= 0 and missing[label]:
-                    said = self._opinions.setdefault((int(ids[place]), number), np.zeros(len(missing)))
-                    odds = np.log(sure / max(1.0 - sure, 1e-6))
-                    said[label] = min(said[label] + np.clip(odds, 0.0, _WEIGHT), _MOST)
+        waiting: NDArray[np.int64],
+    ) -> bool:
+        """Ask about points that wait, if they may be markers that a hand lacks; whether they may."""
+        mine, places = names[hand.number], hand.estimate.places
+        missing = np.ones(len(places), dtype=bool)
+        missing[mine[mine >= 0]] = False
+        if not missing.any() or not _near(points[waiting], places[missing]).any():
+            return False
+        shown, free = mine >= 0, (names < 0).all(axis=0)
+        shown[free] = _near(points[free], places)
+        cloud = np.flatnonzero(shown)
+        labelling = self._labeler.label_frames([points[cloud]])[0]
+        for row, label, sure in zip(cloud, labelling.labels, labelling.confidence, strict=True):
+            if row in waiting and label >= 0 and missing[label]:
+                said = self._opinions.setdefault((int(ids[row]), hand.number), np.zeros(len(missing)))
+                odds = np.log(sure / max(1.0 - sure, 1e-6))
+                said[label] = min(said[label] + np.clip(odds, 0.0, _WEIGHT), _MOST)
+        return True
 
 
 def _near(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.bool_]:
