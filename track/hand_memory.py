@@ -86,6 +86,8 @@ class HandMemory:
         self.solver = PoseSolver(hand.model, hand.attachment)
         self.qpos: NDArray[np.float64] | None = None
         self.time = 0.0
+        self.rms = np.nan
+        """Of the last pose, its habits being known [m]."""
         self._now = 0.0
         count = self.num_markers = hand.attachment.layout.num_markers
         bones = hand.attachment.bone_indices[np.arange(count), hand.attachment.bone_weights.argmax(axis=1)]
@@ -202,6 +204,7 @@ class HandMemory:
 
     def _take(self, estimate: Estimate, time: float) -> None:
         self.qpos, self.time, self.places = estimate.qpos, time, estimate.places
+        self.rms = estimate.rms
         self._hinges = estimate.expected.hinges
         there = np.isfinite(estimate.residuals[:, 0])
         missing = np.bincount(self.digits[~there & (self.digits >= 0)], minlength=len(DIGITS))

@@ -15,7 +15,7 @@ import numpy as np
 from handsim.topology import NUM_QPOS
 from handsim.transforms import rotation_quaternions
 from track.advice import Adviser
-from track.finding import MOST_RMS, Found, HandFinder
+from track.finding import MOST_RMS, Found, HandFinder, score_of
 from track.hand_memory import Estimate, HandMemory
 from track.intake import Incoming, Intake
 from track.naming import fit_names, forget_surprises, targets_of
@@ -34,7 +34,8 @@ _FEWEST: Final = 5  # named points that a pose can be relied on for
 _LONGEST_COAST: Final = 0.1  # [s] that a pose is carried on without them
 _SHARE: Final = 0.6  # of a hand's markers; with fewer named it is doubted
 _AROUND, _PATIENCE = 0.2, 0.15  # [m] where its points must be, [s] for which that must last
-_MORE: Final = 3.0  # markers that a hand must explain beyond those it has, to be taken anew
+_ROUGH: Final = 0.003  # [m] RMS of a hand, its habits known, that is doubted
+_BETTER: Final = 20.0  # log odds by which a hand must be more, to be taken anew
 _MOST_CREDIT: Final = 12.0
 _INCOME: Final = 2.0  # credit of a name in each frame, less half the squared deviations it is off
 
@@ -224,14 +225,15 @@ class Tracker:
         hands: list[TrackedHand],
         time: float,
     ) -> None:
-        """Look again for a hand that leaves most of its markers open while there are points around it.
+        """Look again for a hand that leaves most of its markers open, or fits badly, with points around it.
 
         A hand can be followed in the wrong place on a few points; it must not stay there.
         """
-        for number, hand in enumerate(hands):
+        for number, (hand, memory) in enumerate(zip(hands, self._memories, strict=True)):
             named = int((names[number] >= 0).sum())
-            fewest = _SHARE * self._memories[number].num_markers
-            if hand.status is not Status.TRACKED or named >= fewest:
+            fewest = _SHARE * memory.num_markers
+            well = named >= fewest and memory.rms < _ROUGH
+            if hand.status is not Status.TRACKED or well:
                 self._trusted[number] = time
                 continue
             open_points = np.flatnonzero((np.delete(names, number, axis=0) < 0).all(axis=0))
@@ -242,7 +244,7 @@ class Tracker:
                 continue
             self._trusted[number] = time
             for found in self._finder.find(points[open_points], [number]):
-                if (found.names >= 0).sum() > named + _MORE:
+                if found.score > score_of(named, memory.rms) + _BETTER:
                     hands[number] = self._take_up(found, open_points, points, names, time)
 
     def _take_up(
