@@ -31,12 +31,13 @@ _SHARE: Final = 0.45  # of a hand's markers that must be found
 _STRAYS: Final = 6  # points more than a hand has, from which on a cloud is cut
 _MOST_POINTS: Final = 100  # that hang together: more are nobody's hands
 _CUTS: Final = 12
-_TRIES: Final = 6  # labelled clouds that are fitted, the surest first
+_TRIES: Final = 8  # labelled clouds that are fitted, the surest first
 _ROUNDS: Final = 2  # of looking for the points of a fitted hand
 _LOOSE: Final = 4.0  # of their spread so far: where its points are looked for
 _GATES: Final = (0.003, 0.012)  # [m] that is, at least and at most
 _FREEDOM: Final = 20.0  # coordinates of its points that a pose fits, whatever they are
 _LEAST_SCORE: Final = 50.0  # of a hand that is one: twelve points 5 mm off
+_PLAIN: Final = 10.0  # of its markers: such a hand is beyond doubt, and no further cloud is tried
 _FINEST: Final = 0.0003  # [m] below which a spread says no more
 _FEWEST_POINTS: Final = 4
 
@@ -110,7 +111,7 @@ class HandFinder:
                 hand = self._try(number, points, group, clouds[place], labellings[place])
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
-            if best is not None and (best.names >= 0).sum() > 0.9 * self._memories[best.number].num_markers:
+            if best is not None and best.score > _PLAIN * self._memories[best.number].num_markers:
                 break
         return best
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _FIRST_SHARE, _FIRST_SPREAD = 1.2, (0.0015, 0.006)
 """Spread of a marker around where a hand just found has it: share of the fit's RMS; least and most [m]."""
+_AS_EVER: Final = 0.002  # [m] RMS of a hand that is found again with its habits
 _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
 _UNEVEN: Final = 0.3  # of the hand's usual miss: so much it changes as the hand moves
 _DOUBT: Final = 0.5  # [s] unseen after which a marker may miss its place by the hand's usual miss again
@@ -175,16 +176,18 @@ class HandMemory:
     def begin(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
     ) -> Estimate:
-        """Take up a hand that has just been found."""
+        """Take up a hand that has just been found; if its habits still hold, they are kept."""
         self._speed[:] = 0.0
         self._seen[:] = time
         self.proven[:] = False
         nothing = Coming(qpos, self._rest, (1.0, 1.0))
         estimate = self.fit(targets, qpos, nothing)
+        if not (self._learned.any() and estimate.rms < _AS_EVER):
+            self._habit[:], self._learned[:], self._variance[:] = 0.0, 0.0, 0.0
+            self._adapt()
+            estimate = self.fit(targets, qpos, nothing)
+            self._variance[:] = np.clip(_FIRST_SHARE * estimate.rms, *_FIRST_SPREAD) ** 2
         self._take(estimate, time)
-        self._habit[:], self._learned[:] = 0.0, 0.0
-        self._variance[:] = np.clip(_FIRST_SHARE * estimate.rms, *_FIRST_SPREAD) ** 2
-        self._adapt()
         return estimate
 
     def rms_as_designed(self, estimate: Estimate) -> float:

@@ -36,7 +36,7 @@ def test_the_clock_only_goes_forward(times):
 
 
 @settings(deadline=None)
-@given(st.lists(st.floats(1e-4, 0.2), min_size=1, max_size=30), st.floats(-1e4, 1e4))
+@given(st.lists(st.floats(0.02, 0.2), min_size=1, max_size=30), st.floats(-1e4, 1e4))
 def test_a_clock_that_is_right_is_followed(spans, begin):
     times = begin + np.cumsum([0.0, *spans])
     now, notes = clock(times.tolist())
@@ -89,6 +89,11 @@ def test_what_is_kept_are_points_of_the_frame_each_with_an_id_of_its_own(points,
     doubled, nowhere = len(set(ids[usable & (ids >= 0)])) < np.sum(usable & (ids >= 0)), not usable.all()
     assert any("several points" in note for note in taken.notes) == doubled
     assert any("nowhere" in note for note in taken.notes) == nowhere
+
+
+def test_stamps_that_lie_together_are_told_apart():
+    now, notes = clock([0.0, 0.01, 0.02, 0.02 + 1e-6, 0.03])
+    assert np.diff(now)[2] > 5e-4 and not any(notes)
 
 
 def test_points_and_ids_that_do_not_fit_are_the_callers_mistake():
