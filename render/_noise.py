@@ -1,0 +1,35 @@
+"""Normal numbers for whole pictures, several times as fast as a generator's own.
+
+Sixteen random bits pick one of 65,536 quantiles: tails end at 4.3 standard deviations.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import ndtri
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32, UInt16
+    from numpy.typing import NDArray
+
+
+@functools.cache
+def quantiles() -> Float32[np.ndarray, "65536"]:
+    """Quantiles of the standard normal at the middle of each sixteen-bit number's share."""
+    table = ndtri((np.arange(65536) + 0.5) / 65536)
+    scaled: NDArray[np.float32] = (table / table.std()).astype(np.float32)
+    return scaled
+
+
+def random_words(shape: tuple[int, ...], *, rng: np.random.Generator) -> UInt16[np.ndarray, "..."]:
+    """Random sixteen-bit numbers, places in the tables of `quantiles`' kind."""
+    return rng.integers(0, 65536, shape, dtype=np.uint16)
+
+
+def normal_numbers(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float32[np.ndarray, "..."]:
+    """Independent standard normal numbers."""
+    numbers: NDArray[np.float32] = quantiles().take(random_words(shape, rng=rng), mode="clip")
+    return numbers
