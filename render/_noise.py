@@ -6,6 +6,7 @@ Sixteen random bits pick one of 65,536 quantiles: tails end at 4.3 standard devi
 from __future__ import annotations
 
 import functools
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,10 +27,12 @@ def quantiles() -> Float32[np.ndarray, "65536"]:
 
 def random_words(shape: tuple[int, ...], *, rng: np.random.Generator) -> UInt16[np.ndarray, "..."]:
     """Random sixteen-bit numbers, places in the tables of `quantiles`' kind."""
-    return rng.integers(0, 65536, shape, dtype=np.uint16)
+    count = math.prod(shape)
+    words = rng.integers(0, 2**64, (count + 3) // 4, dtype=np.uint64)
+    return words.astype("<u8", copy=False).view("<u2")[:count].reshape(shape)
 
 
 def normal_numbers(shape: tuple[int, ...], *, rng: np.random.Generator) -> Float32[np.ndarray, "..."]:
     """Independent standard normal numbers."""
-    numbers: NDArray[np.float32] = quantiles().take(random_words(shape, rng=rng), mode="clip")
-    return numbers
+    numbers = np.empty(shape, np.float32)
+    return quantiles().take(random_words(shape, rng=rng), mode="clip", out=numbers)

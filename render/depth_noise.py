@@ -114,7 +114,9 @@ def apply_depth_noise(
     shape = camera.size[1], camera.size[0]
     for name, picture in (("depth", depth), ("normals", normals), ("rgb", rgb)):
         if picture is not None and picture.shape[:2] != shape:
-            raise ShapeError(f"{name} has shape {picture.shape}, wanted {shape} as camera '{camera.name}' has")
+            raise ShapeError(
+                f"{name} has shape {picture.shape}, wanted {shape} as camera '{camera.name}' has"
+            )
     if noise is None:
         return depth.copy()
     cosines = None if normals is None else _facing(normals, camera)
@@ -128,10 +130,11 @@ def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]
     """Cosines between normals and the rays that come back."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
     rays = _back(camera.size, (fx, fy, cx, cy), camera.lens)
-    cosines = rays[0] * normals[..., 0]
+    cosines: NDArray[np.float32] = rays[0] * normals[..., 0]
     cosines += rays[1] * normals[..., 1]
     cosines += rays[2] * normals[..., 2]
-    return np.maximum(cosines, np.float32(0.0), out=cosines)
+    np.maximum(cosines, np.float32(0.0), out=cosines)
+    return cosines
 
 
 @functools.lru_cache(maxsize=8)
@@ -142,7 +145,8 @@ def _back(
     fx, fy, cx, cy = middle
     K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     rays = np.nan_to_num(Camera("rays", size, K, lens=lens).rays())
-    return np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
+    back: NDArray[np.float32] = np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
+    return back
 
 
 def _reflectance(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -153,4 +157,5 @@ def _reflectance(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 @functools.cache
 def _luminance() -> NDArray[np.float32]:
-    return ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)
+    table: NDArray[np.float32] = ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)
+    return table

@@ -16,7 +16,7 @@ import numpy as np
 from render._noise import normal_numbers
 
 if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt8
+    from jaxtyping import Float32
     from numpy.typing import NDArray
 
 _WALL: Final = 0.8  # reflectance of the white walls that noise was published for
