@@ -81,7 +81,7 @@ def shutter_times(
     cuts = total * (np.arange(sub_frames + 1) / sub_frames - 0.5)
     times = 0.5 * (cuts[:-1] + cuts[1:])
     middles = readout * (np.arange(height) / max(height - 1, 1) - 0.5) if height > 1 else np.zeros(1)
-    if exposure == 0.0:  # rows are moments: each has the piece that it falls into
+    if exposure < 1e-9:  # rows are moments: each has the piece that it falls into
         nearest = np.abs(middles[:, None] - times).argmin(axis=1)
         return times, np.eye(sub_frames)[nearest]
     opened, closed = middles[:, None] - 0.5 * exposure, middles[:, None] + 0.5 * exposure

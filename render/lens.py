@@ -179,6 +179,8 @@ def _polynomial(coefficients: tuple[float, ...], square: NDArray[np.float64]) ->
 def _reach(radial: tuple[float, ...], most: float) -> float:
     """First r at which r (1 + c0 r^2 + c1 r^4..) stops growing, at most `most`."""
     slopes = [(2 * n + 3) * k for n, k in enumerate(radial)]
+    while slopes and abs(slopes[-1]) * most ** (2 * len(slopes)) < 1e-9:
+        slopes.pop()  # they change nothing, and roots of tiny leading terms overflow
     roots = np.roots([*reversed(slopes), 1.0])
     folds = roots.real[(np.abs(roots.imag) < 1e-9 * np.maximum(np.abs(roots), 1.0)) & (roots.real > 0.0)]
     return min(float(np.sqrt(folds.min())), most) if len(folds) else most

@@ -37,16 +37,8 @@ def test_brown_is_opencvs(coefficients):
     rays = directions(lens, 500, most=0.6)
     theirs, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), np.array(coefficients))
     np.testing.assert_allclose(lens.distort(rays), theirs[:, 0], atol=1e-12)
-    until_exact = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-13)
-    back = (
-        cv2.undistortPointsIter(
-            lens.distort(rays)[:, None], np.eye(3), np.array(coefficients), None, None, until_exact
-        )
-        if hasattr(cv2, "undistortPointsIter")
-        else cv2.undistortPoints(
-            lens.distort(rays)[:, None], np.eye(3), np.array(coefficients), criteria=until_exact
-        )
-    )
+    exact = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-13)
+    back = cv2.undistortPoints(lens.distort(rays)[:, None], np.eye(3), np.array(coefficients), criteria=exact)
     ours = lens.undistort(lens.distort(rays))
     np.testing.assert_allclose(ours[:, :2] / ours[:, 2:], back[:, 0], atol=1e-8)
     np.testing.assert_allclose(ours, rays, atol=1e-9)
