@@ -1,6 +1,6 @@
 """Normal numbers for whole pictures, several times as fast as a generator's own.
 
-Sixteen random bits pick one of 65,536 quantiles: tails end at 4.3 standard deviations.
+Sixteen random bits pick one of 65,536 quantiles: tails end at 4.2 standard deviations.
 """
 
 from __future__ import annotations

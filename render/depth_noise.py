@@ -41,7 +41,7 @@ _SENSORS: Final[dict[str, DepthNoise]] = {
         flying=0.1,
         dropped=0.6,
         weakest=0.0101,
-        nearest=0.25,
+        nearest=0.5,
         farthest=3.86,
     ),
 }
@@ -137,7 +137,7 @@ def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]
     return cosines
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=16)
 def _back(
     size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
 ) -> NDArray[np.float32]:

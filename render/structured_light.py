@@ -48,7 +48,7 @@ class StructuredLight:
     shadow: bool = True
     """Whether the projector must see a surface too."""
     nearest: float = 0.4
-    farthest: float = 8.0
+    farthest: float = 4.0
     """What is measured at all [m]."""
 
 

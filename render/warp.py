@@ -177,7 +177,7 @@ def _plan(camera: Camera) -> tuple[_Face, ...]:
     return faces
 
 
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=16)
 def _planned(
     size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
 ) -> tuple[_Face, ...]:
