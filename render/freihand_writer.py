@@ -38,7 +38,7 @@ class FreihandWriter:
 
     Args:
         folder: Where the set shall be.
-        vertices: Whether to write `training_verts.json`, some 40 kB a hand.
+        vertices: Whether to write `training_verts.json`, some 150 kB a hand.
     """
 
     def __init__(self, folder: Path, *, vertices: bool = False) -> None:

@@ -24,7 +24,7 @@ def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dic
 
     Args:
         frame: Of a pinhole camera.
-        vertices: Whether to add the skin, some 40 kB a hand.
+        vertices: Whether to add the skin, some 150 kB a hand.
 
     Raises:
         HandSimError: The camera's lens is no pinhole.

@@ -105,7 +105,7 @@ def _hand(
     qpos = join_qpos(rng.uniform(-0.1, 0.6, (1, 20)), position=spot, quaternion=turn / np.linalg.norm(turn))
     vertices = model.skin(qpos)[0].astype(np.float32)
     bones = model.surface.bone_indices[:, 0]
-    pixels = np.floor(camera.project(vertices)).astype(int)
+    pixels = np.floor(np.nan_to_num(camera.project(vertices), nan=-9.0)).astype(int)
     depth = camera.local(vertices)[:, 2]
     mine = np.zeros(camera.size[::-1], dtype=bool)
     for vertex in np.argsort(-depth):  # the nearest last

@@ -47,11 +47,12 @@ def test_openexr_reads_metres_and_linear_light(make_frame, tmp_path: Path) -> No
     np.testing.assert_array_equal(channels["Z"], frame.ideal.depth)
     np.testing.assert_allclose(header["K"], frame.camera.K)
     np.testing.assert_allclose(header["T_world_camera"], frame.camera.T_world_camera)
-    # A pixel's depth along its ray is a point in the world: the hand's size away from its wrist.
+    # A pixel and its depth are a point in the world, which is on the skin to the size of a drawn square.
     row, column = np.argwhere(channels["id.instance"] == 1)[0]
     ray = frame.camera.rays()[row, column]
     point = frame.camera.T_world_camera @ np.array([*(ray / ray[2] * channels["Z"][row, column]), 1.0])
-    assert np.linalg.norm(point[:3] - frame.hands[0].vertices, axis=1).min() < 0.012
+    square = 3 * channels["Z"][row, column] / frame.camera.K[0, 0]
+    assert np.linalg.norm(point[:3] - frame.hands[0].vertices, axis=1).min() < square * np.sqrt(0.5)
     assert channels["R"].max() == np.float16(linear_light(frame.ideal.rgb).max(axis=(0, 1))[0])
 
 
