@@ -1,7 +1,7 @@
 """The light in a picture: one lamp that casts shadows, a few that do not, and light from everywhere.
 
-pyrender knows no light from pictures of rooms; far lamps from above, from the ground and from the side stand
-in for a room's bright and dark walls. Directions are in the camera's axes (x right, y down, z ahead) and point
+pyrender knows no light from pictures of rooms; far lamps from above, from the ground and from the side
+stand in for a room's bright and dark walls. Directions are in the camera's axes (x right, y down, z ahead) and point
 from the hand to the lamp, so that the same lighting suits every view.
 """
 
@@ -65,9 +65,9 @@ STUDIO: Final = Lighting(
 
 
 def sample_lighting(*, rng: np.random.Generator) -> Lighting:
-    """Random light: a key lamp from somewhere in front or above, fill, sky and ground, each with its colour."""
-    exposure = float(np.exp(np.clip(rng.normal(-0.05, 0.18), -0.4, 0.35)))
-    warmth = rng.normal(0.0, 0.09)
+    """Random light: a key lamp from in front or above, fill, sky and ground, each with its colour."""
+    exposure = float(np.exp(np.clip(rng.normal(0.06, 0.18), -0.35, 0.4)))
+    warmth = rng.normal(0.03, 0.06)
     key_share, ambient_share = rng.uniform(0.40, 0.72), rng.uniform(0.16, 0.34)
     # From above more than from below, and seldom from behind the hand.
     key = np.array([rng.normal(0.0, 0.75), rng.normal(-0.65, 0.5), rng.normal(-0.9, 0.45)])
@@ -87,7 +87,7 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     )
     lamps = []
     for number, (place, share) in enumerate(zip(places, shares, strict=True)):
-        own = rng.normal(0.0, 0.05 if number == 0 else 0.12)
+        own = rng.normal(0.0, 0.03 if number == 0 else 0.08)
         lamps.append(Lamp(_triple(place), float(exposure * share), _tint(warmth + own, rng)))
     ambient = exposure * ambient_share * np.array(_tint(warmth + rng.normal(0.0, 0.06), rng))
     return Lighting(tuple(lamps), _triple(ambient))
@@ -143,7 +143,7 @@ def frame_with_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _tint(warmth: float, rng: np.random.Generator) -> tuple[float, float, float]:
-    """A lamp's colour between candle and sky, as a white balance leaves it, with a little green or magenta."""
+    """A lamp's colour between candle and sky, as a white balance leaves it, a little green or magenta."""
     green = rng.normal(0.0, 0.015)
     return _triple(np.exp([warmth, green, -1.2 * warmth]))
 

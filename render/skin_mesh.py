@@ -1,4 +1,4 @@
-"""The skin as it is drawn: the hand's own surface on a forearm, with normals, shade, parts and texture places.
+"""The skin as it is drawn: the hand's own surface on a forearm, with normals, shade, parts and texture.
 
 The hand's vertices are `HandModel.skin`'s, so that pictures show what occlusion was computed from; from the
 wrist's ring on, the short stump that closes that surface gives way to the forearm.
@@ -127,7 +127,7 @@ def face_parts() -> UInt8[np.ndarray, "F"]:
     rows = np.arange(atlas.num_hand)[:, None]
     shares[rows, surface.bone_indices[atlas.used]] = surface.bone_weights[atlas.used]
     shares[atlas.num_hand :, FOREARM] = 1e3  # one vertex of the forearm makes a triangle the forearm's
-    parts = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
+    parts: NDArray[np.uint8] = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
     parts.setflags(write=False)
     return parts
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import cv2
@@ -57,7 +58,7 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None) -> SkinTexture:
     lab += look.blotches * blotches[:, None] * [1.6, -1.0, 0.3]
     lines = np.clip(_lines(back, rng), 0.0, 1.0)[:, None]
     # Pigment gathers in the lines; how dark they are goes with the contrast that the skin has room for.
-    lab += look.creases * lines * [-9.0, 3.5, 1.0]
+    lab += look.creases * lines * [-7.0, 3.0, 0.5]
     roughness = np.full(len(back), look.roughness)
     _nails(lab, roughness, look)
     if forearm is not None and forearm.sleeve < forearm.length:
@@ -113,8 +114,8 @@ def _flush(lab: NDArray[np.float64], back: NDArray[np.float64], look: SkinLook) 
             if digit.lengths is texels.digits[0].lengths and joint == 0.0:
                 continue  # the thumb's first joint lies deep under the skin
             knuckle = _bump(digit.along - joint, width) * back[mine] * np.abs(np.cos(digit.turn / 2))
-            darker = -2.5 - 0.07 * max(0.0, 60.0 - look.lightness)
-            lab[mine] += look.flush * knuckle[:, None] * [darker, 2.6, 0.3]
+            darker = -1.5 - 0.06 * max(0.0, 60.0 - look.lightness)
+            lab[mine] += look.flush * knuckle[:, None] * [darker, 1.8, 0.3]
     x, y = 1e3 * texels.places[:, 0], 1e3 * texels.places[:, 1]
     palm = 1.0 - back
     hollow = np.exp(-(((x - 50.0) / 22.0) ** 2) - (((y + 2.0) / 14.0) ** 2)) * palm
@@ -152,7 +153,7 @@ def _palm_distances() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         fine = np.linspace(0.0, len(knots) - 1.0, 10 * len(knots))
         knots = np.stack([np.interp(fine, np.arange(len(knots)), knots[:, i]) for i in range(2)], axis=1)
         knots = ndimage.gaussian_filter1d(knots, 4.0, axis=0, mode="nearest")
-        for a, b in zip(knots[:-1], knots[1:], strict=True):
+        for a, b in itertools.pairwise(knots):
             along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
             distances[number] = np.minimum(
                 distances[number], np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
@@ -173,7 +174,7 @@ def _lines(back: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.fl
         depth[near] = np.maximum(depth[near], wobble * on_palm * _bump(distance, 0.0011))
     x = texels.places[:, 0]
     for place in _WRIST_LINES:
-        depth = np.maximum(depth, 0.7 * _bump(x - place - 0.03 * (1 - back) * 0.0, 0.0009) * (1.0 - back))
+        depth = np.maximum(depth, 0.35 * _bump(x - place, 0.0009) * (1.0 - back))
     for number, digit in enumerate(texels.digits):
         mine, joints = digit.texels, np.cumsum(digit.lengths)[:2]
         pad = 1.0 - back[mine]
