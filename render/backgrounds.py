@@ -195,7 +195,8 @@ def _pick_photo(folder: Path, rng: np.random.Generator) -> Path:
     files: list[Path] = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
     for place in rng.permutation(len(files))[:_TRIES]:
         if _read(files[place]) is not None:
-            return files[place]
+            readable: Path = files[place]
+            return readable
     raise HandSimError(
         f"{folder}: no photograph that can be read; wanted files that end in {', '.join(PHOTO_SUFFIXES)}"
     )

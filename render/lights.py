@@ -1,8 +1,8 @@
 """The light in a picture: one lamp that casts shadows, a few that do not, and light from everywhere.
 
 pyrender knows no light from pictures of rooms; far lamps from above, from the ground and from the side
-stand in for a room's bright and dark walls. Directions are in the camera's axes (x right, y down, z ahead) and point
-from the hand to the lamp, so that the same lighting suits every view.
+stand in for a room's bright and dark walls. Directions are in the camera's axes (x right, y down, z ahead)
+and point from the hand to the lamp, so that the same lighting suits every view.
 """
 
 from __future__ import annotations
