@@ -7,6 +7,7 @@ and point from the hand to the lamp, so that the same lighting suits every view.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -89,6 +90,10 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     for number, (place, share) in enumerate(zip(places, shares, strict=True)):
         own = rng.normal(0.0, 0.03 if number == 0 else 0.08)
         lamps.append(Lamp(_triple(place), float(exposure * share), _tint(warmth + own, rng)))
+    # Lamps in rooms are wide and their shadows faint: part of the key light comes without any.
+    hard, key_lamp = rng.uniform(0.25, 0.75), lamps[0]
+    lamps[0] = dataclasses.replace(key_lamp, strength=hard * key_lamp.strength)
+    lamps.append(dataclasses.replace(key_lamp, strength=(1.0 - hard) * key_lamp.strength))
     ambient = exposure * ambient_share * np.array(_tint(warmth + rng.normal(0.0, 0.06), rng))
     return Lighting(tuple(lamps), _triple(ambient))
 

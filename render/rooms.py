@@ -39,7 +39,8 @@ def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.
     picture *= (light * rng.uniform(0.55, 1.1))[:, None]
     grain = 1.0 + 0.05 * rng.standard_normal((height, width, 1), dtype=np.float32)
     small = picture.reshape(height, width, 3).astype(np.float32) * grain
-    drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
+    small = cv2.GaussianBlur(small, (0, 0), 0.7)  # or edges would show the coarse pixels
+    drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
     return drawn
 
 

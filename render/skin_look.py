@@ -4,8 +4,8 @@ Tones go by the individual typology angle, arctan((L* - 50) / b*) in degrees, an
 Cretois and Hourseau 1991, Int. J. Cosmet. Sci. 13:191). Redness and yellowness over that angle follow the
 measured gamut of human skin: chroma is highest in the middle and falls towards both ends, most of all for
 the darkest skin (Xiao et al. 2017, Skin Res. Technol. 23:21, doi 10.1111/srt.12295, four groups and four
-places of the body, the back of the hand among them). Palms hold little pigment in everybody, so that dark hands have
-palms much lighter than their backs.
+places of the body, the back of the hand among them). Palms hold little pigment in everybody, so that dark
+hands have palms much lighter than their backs.
 """
 
 from __future__ import annotations
