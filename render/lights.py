@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MOST_LAMPS: Final = 5  # pyrender's shader takes four lamps without a shadow
-_DISTANCE: Final = 30.0  # [m], so far that a lamp's rays are as good as parallel
+_DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
 _SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
 
 
