@@ -39,7 +39,7 @@ def paint(
         indices=skin.faces,
         texcoord_0=skin.uv,
         color_0=shade_colors(skin.shade),
-        material=skin_material(skin_texture(look, forearm)),
+        material=skin_material(skin_texture(look, forearm, side=model.shape.side)),
     )
     scene = pyrender.Scene(bg_color=[0.0, 0.0, 0.0, 0.0])
     scene.add(pyrender.Mesh([primitive]))

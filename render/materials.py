@@ -66,9 +66,14 @@ def skin_material(texture: SkinTexture) -> Any:
     sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
     rough = np.zeros((*texture.roughness.shape, 3), dtype=np.uint8)
     rough[..., 0] = texture.roughness  # the shader looks for roughness in red and for metal in green
+    color, normals, roughness = (
+        pyrender.Texture(source=source, source_channels="RGB", sampler=sampler)
+        for source in (texture.color, texture.normals, rough)
+    )
     return pyrender.MetallicRoughnessMaterial(
-        baseColorTexture=pyrender.Texture(source=texture.color, source_channels="RGB", sampler=sampler),
-        metallicRoughnessTexture=pyrender.Texture(source=rough, source_channels="RGB", sampler=sampler),
+        baseColorTexture=color,
+        normalTexture=normals,
+        metallicRoughnessTexture=roughness,
         metallicFactor=0.0,
         roughnessFactor=1.0,
     )

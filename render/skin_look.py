@@ -56,6 +56,8 @@ class SkinLook:
     """How dark lines of the palm and wrinkles of the knuckles are."""
     veins: float = 1.0
     """How well veins show through the back."""
+    relief: float = 1.0
+    """How far tendons, knuckles and the skin's grain stand out."""
     nail: tuple[float, float, float] = (4.0, 5.0, -3.0)
     """L*, a*, b* of the nails above the skin's."""
     polish: float = 0.0
@@ -97,7 +99,7 @@ def sample_skin_look(tones: tuple[float, float] = ALL_TONES, *, rng: np.random.G
     palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(0.0, 2.0)
     polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0
     color = rng.uniform((25.0, 10.0, -15.0), (75.0, 60.0, 30.0))
-    strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 4), -0.7, 0.7))
+    strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 5), -0.7, 0.7))
     nail = np.array([4.0, 5.0, -3.0]) + rng.normal(0.0, (1.5, 1.5, 1.0))
     return SkinLook(
         lightness=lightness,
@@ -108,9 +110,10 @@ def sample_skin_look(tones: tuple[float, float] = ALL_TONES, *, rng: np.random.G
         blotches=float(strengths[1]),
         creases=float(strengths[2]),
         veins=float(strengths[3]),
+        relief=float(strengths[4]),
         nail=(float(nail[0]), float(nail[1]), float(nail[2])),
         polish=float(polish),
         polish_color=(float(color[0]), float(color[1]), float(color[2])),
-        roughness=float(rng.uniform(0.42, 0.7)),
+        roughness=float(rng.uniform(0.4, 0.62)),
         seed=int(rng.integers(2**31)),
     )

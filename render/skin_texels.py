@@ -45,6 +45,8 @@ class Texels(NamedTuple):
 
     places: NDArray[np.float64]
     """On the reference hand's skin, in the wrist's frame [m] (N, 3)."""
+    normals: NDArray[np.float64]
+    """Outward unit normals (N, 3)."""
     dorsal: NDArray[np.float64]
     """From -1 in the middle of the palm or of a finger's pad to 1 on the back (N,)."""
     palm: NDArray[np.float64]
@@ -66,11 +68,12 @@ def skin_texels() -> Texels:
     backs = model.rest_transforms[:, :3, 2]
     dorsal = np.einsum("vi,vi->v", normals, weights @ backs)
     # The thumb's metacarpal is flesh of the palm: its skin is coloured as the palm's
-    values = np.concatenate([mesh.rest, dorsal[:, None], weights], axis=1)
+    values = np.concatenate([mesh.rest, normals, dorsal[:, None], weights], axis=1)
     grid = _spread(values)
-    places, dorsal, weights = grid[:, :3], grid[:, 3], grid[:, 4:]
+    places, normals, dorsal, weights = grid[:, :3], grid[:, 3:6], grid[:, 6], grid[:, 7:]
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     digits = tuple(_digit_texels(model, digit, places, weights) for digit in range(len(DIGITS)))
-    return Texels(places, dorsal, weights[:, 0], digits)
+    return Texels(places, normals, dorsal, weights[:, 0], digits)
 
 
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:

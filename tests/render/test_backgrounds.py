@@ -97,7 +97,7 @@ def test_impossible_configs_are_told() -> None:
         BackgroundConfig(plain=-1.0)
     with pytest.raises(HandSimError, match="`photos`"):
         BackgroundConfig(photo=1.0)
-    with pytest.raises(HandSimError, match="unknown background 'rom' .did you mean 'room'"):
+    with pytest.raises(HandSimError, match=r"unknown background .rom. .did you mean .room."):
         draw_background(Background("rom", ((0.1, 0.1, 0.1),) * 2, 0), SIZE)  # type: ignore[arg-type]
     gone = Background("photo", ((0.1, 0.1, 0.1),) * 2, 0, photo="/nowhere/a.jpg")  # type: ignore[arg-type]
     with pytest.raises(HandSimError, match=r"/nowhere/a\.jpg: not a readable photograph"):
