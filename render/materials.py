@@ -33,7 +33,8 @@ _DIGIT_COLORS: Final = (
 _PALM_COLOR: Final = (0.32, 0.36, 0.42)
 _GL_LINEAR: Final = 0x2601
 _FOLDS: Final = 0.85  # a lamp that shines into a fold lights it up in part
-_BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": (0.235, 0.25, 0.29)}
+GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
+_BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": GLOVE_COLOR}
 _ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
 
 
