@@ -12,8 +12,10 @@ from handsim.topology import BONES, DIGITS
 from render._gl import load_pyrender
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Float32
     from numpy.typing import NDArray
+
+    from render.skin_texture import SkinTexture
 
 Covering = Literal["skin", "glove"]
 BACKGROUND: Final = (0.957, 0.961, 0.969)
@@ -29,7 +31,10 @@ _DIGIT_COLORS: Final = (
     (0.56, 0.27, 0.68),
 )
 _PALM_COLOR: Final = (0.32, 0.36, 0.42)
-_BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": (0.235, 0.25, 0.29)}
+_GL_LINEAR: Final = 0x2601
+_FOLDS: Final = 0.85  # a lamp that shines into a fold lights it up in part
+GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
+_BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": GLOVE_COLOR}
 _ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
 
 
@@ -53,6 +58,33 @@ def covering_material(covering: Covering) -> Any:
 def ball_material() -> Any:
     """Material of markers, coloured by vertex; it glows a little, so that no shadow swallows it."""
     return _material((1.0, 1.0, 1.0), 0.45, glow=0.2)
+
+
+def skin_material(texture: SkinTexture) -> Any:
+    """Material of painted skin, for meshes with `DrawnSkin.uv`."""
+    pyrender = load_pyrender()
+    # No smaller copies of the texture: they would mix tiles that are no neighbours on the hand.
+    sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
+    rough = np.zeros((*texture.roughness.shape, 3), dtype=np.uint8)
+    rough[..., 0] = texture.roughness  # the shader looks for roughness in red and for metal in green
+    color, normals, roughness = (
+        pyrender.Texture(source=source, source_channels="RGB", sampler=sampler)
+        for source in (texture.color, texture.normals, rough)
+    )
+    return pyrender.MetallicRoughnessMaterial(
+        baseColorTexture=color,
+        normalTexture=normals,
+        metallicRoughnessTexture=roughness,
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+    )
+
+
+def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
+    """Vertex colours for `DrawnSkin.shade`: red light finds its way through flesh into the folds."""
+    colors = np.ones((len(shade), 4), dtype=np.float32)
+    colors[:, :3] = (1.0 - _FOLDS * (1.0 - shade))[:, None] ** np.array([0.8, 1.0, 1.05], dtype=np.float32)
+    return colors
 
 
 def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:

@@ -16,6 +16,7 @@ from handsim.model import HandModel
 from handsim.surface import vertex_normals
 from handsim.topology import NUM_QPOS
 from render._gl import load_pyrender
+from render.lights import STUDIO, add_lights
 from render.materials import (
     BACKGROUND,
     MARKER_COLOR,
@@ -33,13 +34,6 @@ if TYPE_CHECKING:
 OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
 _NEAR, _FAR = 0.01, 20.0  # [m]
-# Where the light comes from, in camera axes (x right, y down, z ahead), and how strong it is.
-_KEY: Final = (-0.45, -0.7, -1.0)
-_KEY_INTENSITY: Final = 2.9
-_LAMPS: Final = (((0.85, -0.1, -0.5), 1.3), ((0.15, -0.85, 0.5), 1.2))  # fill, rim
-_LAMP_DISTANCE: Final = 30.0  # [m], so far that its rays are as good as parallel
-_SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
-_AMBIENT: Final = 0.16
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +164,7 @@ def build_scene(scene: HandScene) -> Any:
         HandSimError: Drawing is impossible on this machine; the sentence says what to install.
     """
     pyrender = load_pyrender()
-    built = pyrender.Scene(bg_color=[*scene.background, 1.0], ambient_light=[_AMBIENT] * 3)
+    built = pyrender.Scene(bg_color=[*scene.background, 1.0])
     for hand in scene.hands:
         built.add(_hand_mesh(pyrender, hand))
         if hand.attachment is not None:
@@ -180,27 +174,8 @@ def build_scene(scene: HandScene) -> Any:
         _add_balls(pyrender, built, balls)
     camera = pyrender.PerspectiveCamera(yfov=scene.view.field_of_view, znear=_NEAR, zfar=_FAR)
     built.add(camera, pose=scene.view.T_world_camera @ OPENGL_FROM_OPENCV)
-    _add_lights(pyrender, built, scene.view)
+    add_lights(pyrender, built, STUDIO, scene.view.T_world_camera)
     return built
-
-
-def _add_lights(pyrender: Any, built: Any, view: View) -> None:
-    """A key light that casts shadows, and two far lamps that cast none: grazing shadows look like dirt."""
-    rotation = view.T_world_camera[:3, :3]
-    pose = np.eye(4)
-    pose[:3, :3] = _frame_with_z(rotation @ np.array(_KEY))
-    key = pyrender.DirectionalLight(intensity=_KEY_INTENSITY)
-    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; depth adds bias.
-    # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
-    diagonal = max(float(built.scale), 1e-3)  # an empty scene has none
-    key._get_shadow_camera = lambda _: pyrender.OrthographicCamera(
-        xmag=0.52 * diagonal, ymag=0.52 * diagonal, znear=0.3 * diagonal, zfar=_SHADOW_DEPTH * diagonal
-    )
-    built.add(key, pose=pose)
-    for place, intensity in _LAMPS:
-        lamp = np.eye(4)
-        lamp[:3, 3] = view.T_world_camera[:3, 3] + rotation @ np.array(place) * _LAMP_DISTANCE
-        built.add(pyrender.PointLight(intensity=intensity * _LAMP_DISTANCE**2), pose=lamp)
 
 
 def _hand_mesh(pyrender: Any, hand: PosedHand) -> Any:
@@ -247,11 +222,3 @@ def _mesh(
 @functools.cache
 def _unit_ball() -> trimesh.Trimesh:
     return trimesh.creation.icosphere(subdivisions=3)
-
-
-def _frame_with_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Any rotation whose z axis is `direction`."""
-    z = direction / np.linalg.norm(direction)
-    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], axis=1)

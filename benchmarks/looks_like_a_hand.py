@@ -1,0 +1,209 @@
+"""Whether a hand tracker that was trained on photographs takes the renders for hands.
+
+    python benchmarks/looks_like_a_hand.py OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
+
+Writes two sets of 640 x 480 pictures of one hand each, with COCO keypoints: OUT/clean (plain and graded
+backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand among them). Five kinds of pose
+x palm, back and edge views x six skin tones x both sides; the hand's box takes 20 to 30 % of the frame.
+
+The judge is a program of the user's own: `judge --images DIR --annotations COCO --report JSON` finds hands in
+the pictures without being told where they are. With --judge it is run, and its figures are printed by view,
+pose, tone and side; without, its command lines are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from one_hand_picture import paint, record
+
+from handsim.errors import ShapeError
+from handsim.model import HandModel, join_qpos
+from handsim.shape import sample_shape
+from handsim.topology import SIDES, Side
+from poses.library import gesture
+from poses.validity import make_valid
+from render.backgrounds import BackgroundConfig, draw_background, sample_background
+from render.camera import Camera, preset
+from render.forearm import sample_forearm
+from render.keypoints import KEYPOINT_NAMES, SKELETON, hand_keypoints
+from render.lights import sample_lighting
+from render.skin_look import TONES, sample_skin_look
+
+POSES: Final[dict[str, tuple[str, ...]]] = {
+    "open": ("flat", "spread", "stretched", "four", "asl_b", "count_thumb_5"),
+    "relaxed": ("relaxed", "typing_rest", "duck_bill", "tabletop", "asl_c", "letter_c"),
+    "fist": (
+        *("fist", "soft_fist", "fist_thumb_beside", "thumb_up"),
+        *("cylinder_grasp", "ball_grasp", "grasp_medium_wrap", "grasp_power_sphere"),
+    ),
+    "pointing": ("point", "two", "gun", "horns", "shaka", "three", "little_up", "grip_pointing"),
+    "pinch": ("pinch_index", "pinch_middle", "ok", "pinch_pad_index", "tripod", "pinch_fist"),
+}
+VIEWS: Final = {"palm": (0.0, 0.0, 1.0), "back": (0.0, 0.0, -1.0), "edge": (0.0, -1.0, 0.0)}
+SETS: Final = {
+    "clean": BackgroundConfig(plain=1, gradient=1, noise=0, clutter=0, room=0),
+    "mixed": BackgroundConfig(plain=0, gradient=0, noise=1, clutter=1, room=2),
+}
+FILL: Final = (0.2, 0.3)  # the hand's box over the frame
+TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way
+DEPTH_SLACK: Final = 0.02  # keypoints lie in the flesh [m]
+GROUPS: Final = ("view", "pose", "tone", "side")
+
+
+class Case(NamedTuple):
+    """What one picture shows."""
+
+    pose: str
+    view: str
+    tone: str
+    side: Side
+    gesture: str
+    model: HandModel
+    qpos: np.ndarray
+    camera: Camera
+
+
+def make_case(number: int, rng: np.random.Generator) -> Case:
+    """Kinds go round by number; all else is drawn."""
+    pose = list(POSES)[number % 5]
+    view = list(VIEWS)[number // 5 % 3]
+    side = SIDES[number // 15 % 2]
+    tone = list(TONES)[(number // 30 + number) % 6]
+    name = POSES[pose][int(rng.integers(len(POSES[pose])))]
+    model, qpos = pose_somebody(name, side, rng)
+    return Case(pose, view, tone, side, name, model, qpos, place_camera(model, qpos, view, rng))
+
+
+def pose_somebody(name: str, side: Side, rng: np.random.Generator) -> tuple[HandModel, np.ndarray]:
+    while True:
+        model = HandModel(sample_shape(side=side, rng=rng))
+        low, high = model.skeleton.ranges.T
+        angles = np.clip(gesture(name) + np.deg2rad(rng.normal(0.0, 3.0, 20)), low, high)
+        try:
+            return model, join_qpos(make_valid(model, angles[None]))[0]
+        except ShapeError:  # fingers too thick for so narrow a palm
+            continue
+
+
+def place_camera(model: HandModel, qpos: np.ndarray, view: str, rng: np.random.Generator) -> Camera:
+    """Off the view's axis and rolled a little, at the distance that gives the hand its share of the frame."""
+    camera = preset("vga")
+    size = np.array(camera.size)
+    ahead = np.array(VIEWS[view]) * [1.0, 1.0 if model.shape.side == "right" else -1.0, 1.0]
+    if view == "edge" and rng.random() < 0.35:
+        ahead = -ahead  # the little finger's side
+    ahead = ahead + np.tan(np.clip(rng.normal(0.0, TILT / 1.5, 3), -TILT, TILT))
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [1.0, 0.0, 0.0])  # fingers up
+    right /= np.linalg.norm(right)
+    roll = np.clip(rng.normal(0.0, np.deg2rad(25.0)), -1.0, 1.0)
+    right = np.cos(roll) * right + np.sin(roll) * np.cross(ahead, right)
+    rotation = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    skin = model.skin(qpos[None])[0]
+    local, wanted, distance = (skin - skin.mean(axis=0)) @ rotation, rng.uniform(*FILL), 0.6
+    for _ in range(8):
+        pixels = local[:, :2] / (local[:, 2:] + distance) * camera.K[0, 0]
+        distance *= (np.ptp(pixels, axis=0) / size).max() / wanted
+    free = np.clip(size / 2 - np.abs(pixels).max(axis=0) - 15.0, 0.0, [120.0, 70.0])
+    shift = rng.uniform(-1.0, 1.0, 2) * free / camera.K[0, 0] * distance
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = skin.mean(axis=0) - rotation @ np.array([*shift, distance])
+    return camera.at(pose)
+
+
+def annotation(case: Case, depth: np.ndarray) -> dict[str, Any]:
+    points = hand_keypoints(case.model, case.qpos[None])[0]
+    pixels = case.camera.project(points)
+    row, column = np.clip(pixels[:, ::-1].astype(int), 0, np.array(depth.shape) - 1).T
+    seen = case.camera.local(points)[:, 2] <= depth[row, column] + DEPTH_SLACK
+    box = case.camera.project(case.model.skin(case.qpos[None])[0])
+    low, high = box.min(axis=0), box.max(axis=0)
+    return {
+        "keypoints": np.column_stack([pixels, 1 + seen]).round(2).ravel().tolist(),
+        "num_keypoints": len(points),
+        "bbox": [*low.round(2).tolist(), *(high - low).round(2).tolist()],
+        "category_id": 1,
+        "side": case.side,
+    }
+
+
+def write_set(name: str, hands: int, empty: int, seed: int, out: Path) -> None:
+    """Pictures and coco.json of one set; pictures without a hand come last."""
+    out.mkdir(parents=True, exist_ok=True)
+    images, annotations = [], []
+    for number in range(hands + empty):
+        rng = np.random.default_rng([seed, list(SETS).index(name), number])
+        background = sample_background(SETS[name], rng=rng)
+        image: dict[str, Any] = {"id": number, "file_name": f"{number:05d}.png", "width": 640, "height": 480}
+        if number < hands:
+            case = make_case(number, rng)
+            look, forearm = sample_skin_look(TONES[case.tone], rng=rng), sample_forearm(rng=rng)
+            lighting = sample_lighting(rng=rng)
+            picture, depth = paint(case.model, case.qpos, case.camera, look, forearm, lighting, background)
+            image |= {"pose": case.pose, "view": case.view, "tone": case.tone, "gesture": case.gesture}
+            image["choices"] = record(look, forearm, lighting, background)
+            annotations.append({"id": len(annotations), "image_id": number, **annotation(case, depth)})
+        else:
+            picture = (255.0 * draw_background(background, (640, 480)) ** (1 / 2.2)).astype(np.uint8)
+        images.append(image)
+        cv2.imwrite(str(out / image["file_name"]), picture[..., ::-1])
+        if sys.stderr.isatty():
+            print(f"\r{name}: {number + 1} of {hands + empty}", end="", file=sys.stderr)
+    category = {
+        "id": 1,
+        "name": "hand",
+        "keypoints": KEYPOINT_NAMES,
+        "skeleton": [[a + 1, b + 1] for a, b in SKELETON],
+    }
+    coco = {"images": images, "annotations": annotations, "categories": [category]}
+    (out / "coco.json").write_text(json.dumps(coco), encoding="utf-8")
+
+
+def judge(program: Path | None, out: Path) -> None:
+    """Run the judge on a set and print its figures, or print how to run it."""
+    report = out / "report.json"
+    line = ["--images", str(out), "--annotations", str(out / "coco.json"), "--report", str(report)]
+    line += [word for group in GROUPS for word in ("--by", group)]
+    if program is None:
+        print("JUDGE", *line)
+        return
+    done = subprocess.run([sys.executable, str(program), *line], capture_output=True, text=True, check=False)
+    if not report.is_file():
+        sys.exit(f"{program}: left no report\n{done.stderr}")
+    figures = json.loads(report.read_text(encoding="utf-8"))
+    print(f"\n{out.name:22s}{'n':>6s}{'found':>8s}{'error':>8s}{'PCK.1':>8s}{'side':>8s}  [%]")
+    for name, row in [*figures["sets"].items(), ("all", figures["total"])]:
+        values = (row["found"], row["err"], row["pck_all"], row["side"])
+        cells = "".join(f"{'-' if value is None else format(100 * value, '.1f'):>8s}" for value in values)
+        print(f"{name:22s}{row['n']:6d}{cells}")
+    empty = [found for _, found in figures["controls"]]
+    if empty:
+        print(f"pictures without a hand: one reported in {sum(empty)} of {len(empty)}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--clean", type=int, default=300)
+    parser.add_argument("--mixed", type=int, default=300)
+    parser.add_argument("--empty", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--judge", type=Path, default=None)
+    options = parser.parse_args()
+    for name, hands, empty in (("clean", options.clean, 0), ("mixed", options.mixed, options.empty)):
+        if hands + empty:
+            write_set(name, hands, empty, options.seed, options.out / name)
+            judge(options.judge, options.out / name)
+
+
+if __name__ == "__main__":
+    main()
