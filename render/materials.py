@@ -55,6 +55,11 @@ def covering_material(covering: Covering) -> Any:
     return _material(_BASE[covering], _ROUGHNESS[covering])
 
 
+def plain_material(color: tuple[float, float, float]) -> Any:
+    """Material of a thing of one colour, such as plastic."""
+    return _material(color, 0.5)
+
+
 def ball_material() -> Any:
     """Material of markers, coloured by vertex; it glows a little, so that no shadow swallows it."""
     return _material((1.0, 1.0, 1.0), 0.45, glow=0.2)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import trimesh
 
 from gloves.attach import Attachment
 from handsim._checks import check_array
@@ -26,6 +24,7 @@ from render.materials import (
     linear,
     skin_tint,
 )
+from render.spheres import sphere_surface
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -183,42 +182,37 @@ def _hand_mesh(pyrender: Any, hand: PosedHand) -> Any:
     colors = np.ones((len(vertices), 4))
     if hand.covering == "skin":
         colors[:, :3] = skin_tint(hand.model)
-    return _mesh(pyrender, vertices, faces, colors, covering_material(hand.covering))
+    normals = vertex_normals(vertices, faces)
+    return _mesh(pyrender, vertices, normals, faces, colors, covering_material(hand.covering))
 
 
 def _add_balls(pyrender: Any, built: Any, balls: Balls) -> None:
-    """One mesh for all balls, told apart by vertex colours: a mesh a ball would cost a draw call each."""
+    """One mesh for all balls, told apart by vertex colours."""
     known = np.isfinite(balls.centers).all(axis=-1)
     centers = balls.centers[known]
     if not len(centers):
         return
-    template = _unit_ball()
-    each = len(template.vertices)
-    vertices = (centers[:, None] + balls.radius * template.vertices).reshape(-1, 3)
-    faces = (template.faces + each * np.arange(len(centers))[:, None, None]).reshape(-1, 3)
+    vertices, normals, faces = sphere_surface(centers, balls.radius, level=3)
+    each = len(vertices) // len(centers)
     colors = np.ones((len(vertices), 4))
     tint = linear(np.broadcast_to(np.asarray(balls.colors, dtype=np.float64), balls.centers.shape)[known])
     colors[:, :3] = np.repeat(tint, each, axis=0)
-    built.add(_mesh(pyrender, vertices, faces, colors, ball_material()))
+    built.add(_mesh(pyrender, vertices, normals, faces, colors, ball_material()))
 
 
 def _mesh(
     pyrender: Any,
     vertices: NDArray[np.float64],
+    normals: NDArray[np.float64],
     faces: NDArray[np.int64],
     colors: NDArray[np.float64],
     material: Any,
 ) -> Any:
     primitive = pyrender.Primitive(
         positions=vertices,
-        normals=vertex_normals(vertices, faces),
+        normals=normals,
         indices=faces,
         color_0=colors,
         material=material,
     )
     return pyrender.Mesh(primitives=[primitive])
-
-
-@functools.cache
-def _unit_ball() -> trimesh.Trimesh:
-    return trimesh.creation.icosphere(subdivisions=3)

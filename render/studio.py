@@ -1,0 +1,258 @@
+"""One frame of a take as one camera sees it: pictures, and the truth about all that is in them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim.errors import HandSimError
+from render.backgrounds import Background, draw_background
+from render.blur import Shutter, combine, shutter_times
+from render.camera import Camera
+from render.depth_noise import DepthNoise, apply_depth_noise
+from render.exposure import Exposure, expose, linear_of
+from render.figures import Appearance, BodyFigure, Drawn, HandFigure
+from render.frames import BodyTruth, Pictures, RenderedFrame
+from render.lights import Lighting
+from render.painter import paint, put_before
+from render.rasteriser import NEAR, join, rasterise
+from render.shown_take import ShownTake
+from render.truth import hand_truth
+from render.warp import faces_for, warp, warp_depth, warp_normals
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32, UInt8
+    from numpy.typing import NDArray
+
+PASSES: Final = ("rgb", "depth", "normals", "ids")
+_GAMMA: Final = 2.2
+
+
+@dataclass(frozen=True, slots=True)
+class FrameChoices:
+    """Everything about a picture that is chosen, beside the people and the camera."""
+
+    lighting: Lighting
+    background: Background
+    exposure: Exposure | None
+    """None for a perfect colour sensor."""
+    shutter: Shutter | None
+    """None for a picture of a moment."""
+    depth_noise: DepthNoise | None
+    """None for a perfect depth sensor."""
+    seed: int
+    """Of the sensors' noise."""
+
+
+class Studio:
+    """Draws frames of one take with the same people.
+
+    Args:
+        take: What happens.
+        people: How each of its hands looks.
+        body_colors: Of each of its things, sRGB in [0, 1].
+        passes: Some of `PASSES`.
+    """
+
+    def __init__(
+        self,
+        take: ShownTake,
+        people: Sequence[Appearance],
+        body_colors: Sequence[tuple[float, float, float]],
+        passes: Sequence[str] = PASSES,
+    ) -> None:
+        self.take, self.passes = take, tuple(passes)
+        self._people = tuple(people)
+        first = np.cumsum([0, *(len(hand.attachment.points) for hand in take.hands)])
+        self._hands = [
+            HandFigure(hand, look, first_marker=int(number))
+            for hand, look, number in zip(take.hands, people, first, strict=False)
+        ]
+        self._bodies = [BodyFigure(body, color) for body, color in zip(take.bodies, body_colors, strict=True)]
+        self._colors = tuple(body_colors)
+
+    def photograph(self, frame: int, camera: Camera, choices: FrameChoices) -> RenderedFrame:
+        """Draw one frame.
+
+        Args:
+            frame: Its number in the take.
+            camera: Who looks.
+            choices: What else is to be decided.
+
+        Raises:
+            HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
+        """
+        rng = np.random.default_rng(choices.seed)
+        drawn = self._drawn(frame, 0.0)
+        _check_outside(camera, drawn, frame)
+        truth = self._geometry(camera, drawn)
+        rgb = noisy_rgb = noisy_depth = None
+        if "rgb" in self.passes:
+            rgb = self._colors_of(camera, drawn, choices)
+            noisy_rgb = self._exposed(frame, camera, rgb, choices, rng)
+        if "depth" in self.passes and choices.depth_noise is not None:
+            assert truth.depth is not None
+            noisy_depth = apply_depth_noise(
+                truth.depth, truth.normals, choices.depth_noise, camera=camera, rgb=rgb, rng=rng
+            )
+        present = [
+            number for number, figure in enumerate(self._hands) if self._pose(figure, frame) is not None
+        ]
+        hands = tuple(
+            hand_truth(self._hands[number], self.take.hands[number].qpos[frame], place, camera, truth)
+            for place, number in enumerate(present)
+        )
+        bodies = tuple(
+            BodyTruth(body.name, body.T_world_body[frame])
+            for body in self.take.bodies
+            if np.isfinite(body.T_world_body[frame]).all()
+        )
+        there = np.isfinite(self.take.points[frame, :, 0])
+        return RenderedFrame(
+            number=frame,
+            time=float(self.take.times[frame]),
+            camera=camera,
+            hands=hands,
+            bodies=bodies,
+            ideal=self._asked_for(truth, rgb),
+            noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
+            points=self.take.points[frame, there],
+            labels=self.take.labels[frame, there],
+            label_names=self.take.label_names,
+            choices=self._record(choices),
+        )
+
+    def _pose(self, figure: HandFigure, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
+        """Pose of a hand some time after a frame [s]; None where there is none."""
+        pose = _between(figure.hand.qpos, frame, shift * self.take.rate)
+        if pose is None:
+            return None
+        pose[3:7] /= np.linalg.norm(pose[3:7])
+        return pose
+
+    def _drawn(self, frame: int, shift: float) -> list[Drawn]:
+        drawn: list[Drawn] = []
+        number = 0
+        for figure in self._hands:
+            pose = self._pose(figure, frame, shift)
+            if pose is not None:
+                drawn += figure.drawn(pose, number)
+                number += 1
+        for body in self._bodies:
+            place = _between(body.body.T_world_body, frame, shift * self.take.rate)
+            if place is not None:
+                number += 1
+                left, _, right = np.linalg.svd(place[:3, :3])
+                place[:3, :3] = left @ right
+                drawn += body.drawn(place, number)
+        return drawn
+
+    def _geometry(self, camera: Camera, drawn: Sequence[Drawn]) -> Pictures:
+        """Depth, normals and ids, through whatever lens."""
+        surface = join([one.triangles for one in drawn]) if drawn else None
+        width, height = camera.size
+        if surface is None:
+            flat = np.zeros((height, width), dtype=np.uint8)
+            bare = np.zeros((height, width, 3), dtype=np.float32)
+            return Pictures(None, flat.astype(np.float32), bare, flat, flat, flat)
+        faces = [rasterise(face, surface, with_normals=self._wants_normals) for face in faces_for(camera)]
+        if camera.lens.kind == "pinhole":
+            return faces[0]
+        normals = [face.normals for face in faces if face.normals is not None]
+        ids = (
+            warp(camera, [getattr(face, name) for face in faces], "nearest")
+            for name in ("parts", "instances", "markers")
+        )
+        return Pictures(
+            None,
+            warp_depth(camera, [face.depth for face in faces if face.depth is not None]),
+            warp_normals(camera, normals) if normals else None,
+            *ids,
+        )
+
+    @property
+    def _wants_normals(self) -> bool:
+        return "normals" in self.passes or "depth" in self.passes
+
+    def _colors_of(
+        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """The perfect colour picture."""
+        painted = [paint(face, drawn, choices.lighting) for face in faces_for(camera)]
+        whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
+        return put_before(whole, _background(choices.background, camera.size))
+
+    def _exposed(
+        self,
+        frame: int,
+        camera: Camera,
+        rgb: NDArray[np.uint8],
+        choices: FrameChoices,
+        rng: np.random.Generator,
+    ) -> UInt8[np.ndarray, "H W 3"] | None:
+        """What shutter and sensor make of it; None when they change nothing."""
+        if choices.exposure is None and choices.shutter is None:
+            return None
+        if choices.shutter is None:
+            light = linear_of(rgb)
+        else:
+            one = choices.shutter
+            times, weights = shutter_times(one.exposure, one.readout, one.sub_frames, camera.size[1])
+            moments = (self._colors_of(camera, self._drawn(frame, time), choices) for time in times)
+            light = combine(moments, weights)
+        return expose(light, choices.exposure or Exposure(), rng=rng)
+
+    def _asked_for(self, truth: Pictures, rgb: NDArray[np.uint8] | None) -> Pictures:
+        ids = "ids" in self.passes
+        return Pictures(
+            rgb,
+            truth.depth if "depth" in self.passes else None,
+            truth.normals if "normals" in self.passes else None,
+            truth.parts if ids else None,
+            truth.instances if ids else None,
+            truth.markers if ids else None,
+        )
+
+    def _record(self, choices: FrameChoices) -> dict[str, Any]:
+        people = [dataclasses.asdict(look) for look in self._people]
+        noise = choices.depth_noise
+        kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
+        return {"people": people, "body_colors": self._colors, **kind, **dataclasses.asdict(choices)}
+
+
+def _between(rows: Float[np.ndarray, "T ..."], frame: int, shift: float) -> NDArray[np.float64] | None:
+    """A row some part of a frame later, straight between two; None where there is none."""
+    if not np.isfinite(rows[frame]).all():
+        return None
+    step = int(np.floor(shift))
+    places = np.clip([frame + step, frame + step + 1], 0, len(rows) - 1)
+    before, after = (rows[place] if np.isfinite(rows[place]).all() else rows[frame] for place in places)
+    if before.shape == (27,) and before[3:7] @ after[3:7] < 0.0:
+        after = np.concatenate([after[:3], -after[3:7], after[7:]])
+    mixed: NDArray[np.float64] = before + (shift - step) * (after - before)
+    return mixed
+
+
+def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
+    centre = camera.T_world_camera[:3, 3]
+    for one in drawn:
+        nearest = np.linalg.norm(one.triangles.vertices - centre, axis=1).min()
+        if nearest < 2.0 * NEAR:
+            raise HandSimError(
+                f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or thing in frame {frame}, "
+                f"wanted {2e3 * NEAR:.0f} mm or more; place it elsewhere"
+            )
+
+
+@functools.lru_cache(maxsize=2)
+def _background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
+    """SRGB from 0 to 255."""
+    drawn: NDArray[np.float32] = (255.0 * draw_background(background, size) ** (1.0 / _GAMMA)).astype(
+        np.float32
+    )
+    return drawn

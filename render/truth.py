@@ -1,0 +1,77 @@
+"""What is known of a hand in a picture: its keypoints, which of them are seen, and its box."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from render.camera import Camera
+from render.figures import HandFigure, digit_of_part
+from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures
+from render.keypoints import KEYPOINT_DIGITS, hand_keypoints
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, UInt8
+    from numpy.typing import NDArray
+
+_DEEP: Final = 0.03  # [m] that a keypoint may lie under its own skin; deeper it is another fold of it
+
+
+def hand_truth(
+    figure: HandFigure, qpos: Float[np.ndarray, "27"], number: int, camera: Camera, pictures: Pictures
+) -> HandTruth:
+    """All that is known of one hand.
+
+    Args:
+        figure: The hand.
+        qpos: Its pose.
+        number: Its place among those in the picture.
+        camera: Who looks.
+        pictures: Depth and parts as that camera has them.
+    """
+    model = figure.hand.model
+    keypoints = hand_keypoints(model, qpos[None])[0]
+    pixels = camera.project(keypoints)
+    assert pictures.parts is not None
+    worn = figure.look.glove is not None
+    return HandTruth(
+        shape=model.shape,
+        qpos=qpos,
+        keypoints=keypoints,
+        pixels=pixels,
+        visible=_visible(keypoints, pixels, number, camera, pictures),
+        box=_box(pictures.parts, number),
+        vertices=model.skin(qpos[None])[0].astype(np.float32),
+        marker_names=figure.hand.attachment.layout.names if worn else (),
+        markers=figure.markers(qpos) if worn else np.empty((0, 3)),
+    )
+
+
+def _visible(
+    keypoints: NDArray[np.float64],
+    pixels: NDArray[np.float64],
+    number: int,
+    camera: Camera,
+    pictures: Pictures,
+) -> Bool[np.ndarray, "21"]:
+    """Keypoints in the picture with nothing in front of their own digit, or of the palm for the wrist."""
+    assert pictures.parts is not None and pictures.depth is not None
+    width, height = camera.size
+    inside = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
+    columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
+    digits = digit_of_part(pictures.parts[rows, columns], number)
+    under = camera.local(keypoints)[:, 2] - pictures.depth[rows, columns]
+    visible: NDArray[np.bool_] = inside & (digits == np.array(KEYPOINT_DIGITS)) & (under < _DEEP)
+    return visible
+
+
+def _box(parts: UInt8[np.ndarray, "H W"], number: int) -> Float[np.ndarray, "4"]:
+    """Left, top, width, height of what is seen of a hand without its forearm."""
+    first = 1 + PARTS_A_HAND * number
+    mine = (parts >= first) & (parts < first + FOREARM)
+    columns, rows = np.flatnonzero(mine.any(axis=0)), np.flatnonzero(mine.any(axis=1))
+    if not len(columns):
+        return np.full(4, np.nan)
+    left, top = float(columns[0]), float(rows[0])
+    return np.array([left, top, columns[-1] + 1.0 - left, rows[-1] + 1.0 - top])
