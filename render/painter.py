@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 _NEAR, _FAR = 0.02, 30.0  # [m]
 _WHITE: Final = 255.0
+_STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL begin anew
 
 
 def paint(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
@@ -33,10 +35,36 @@ def paint(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[n
         HandSimError: Drawing is impossible on this machine; the sentence says what to install.
     """
     width, height = camera.size
+    picture = np.zeros((height, width, 4), dtype=np.uint8)
+    left, top, right, bottom = _window(camera, drawn)
+    if left < right and top < bottom:
+        inner = dataclasses.replace(
+            camera, size=(right - left, bottom - top), K=camera.K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
+        )
+        picture[top:bottom, left:right] = _paint_all(inner, drawn, lighting)
+    return picture
+
+
+def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of where there is anything to see: what is empty costs time too."""
+    width, height = camera.size
     if not drawn:
-        return np.zeros((height, width, 4), dtype=np.uint8)
+        return 0, 0, 0, 0
+    local = camera.local(np.concatenate([one.triangles.vertices for one in drawn]))
+    if local[:, 2].min() < _NEAR:
+        return 0, 0, width, height
+    pixels = local[:, :2] / local[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    low, high = np.floor(pixels.min(axis=0) - 1.0), np.ceil(pixels.max(axis=0) + 1.0)
+    left, top = (np.clip(low, 0, camera.size) // _STEP * _STEP).astype(int)
+    right, bottom = np.minimum(np.ceil(np.clip(high, 0, camera.size) / _STEP) * _STEP, camera.size).astype(
+        int
+    )
+    return int(left), int(top), int(right), int(bottom)
+
+
+def _paint_all(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
     pyrender = load_pyrender()
-    renderer = offscreen_renderer(width, height)
+    renderer = offscreen_renderer(*camera.size)
     scene = pyrender.Scene(bg_color=[0.0, 0.0, 0.0, 0.0])
     for one in drawn:
         primitive = pyrender.Primitive(
@@ -52,8 +80,7 @@ def paint(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[n
     scene.add(lens, pose=camera.T_world_camera @ OPENGL_FROM_OPENCV)
     add_lights(pyrender, scene, lighting, camera.T_world_camera)
     flags = pyrender.RenderFlags
-    picture, _ = renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)
-    painted: NDArray[np.uint8] = np.array(picture)
+    painted: NDArray[np.uint8] = renderer.render(scene, flags=flags.RGBA | flags.SHADOWS_DIRECTIONAL)[0]
     return painted
 
 

@@ -14,6 +14,7 @@ from scipy.spatial.distance import cdist
 from gloves.captures import Capture, read_capture
 from gloves.tracked_take import FOUND, TRACKED, TrackedTake
 from handsim.errors import HandSimError
+from handsim.progress import progress_bar
 from handsim.topology import Side
 from track.calibration import Calibration, calibrate_hands
 from track.capture_tracking import track
@@ -21,7 +22,6 @@ from track.take_summary import say
 from track.tracker import Tracker
 from track.user import UserHand, save_user
 from track.user_options import BOTH, Size, users
-from train.commands import progress_bar
 from train.labeler import labeler_for_glove
 from train.labeling import Labeler
 

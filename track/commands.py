@@ -19,6 +19,7 @@ from gloves.captures.markers import labelled_capture
 from gloves.take import SUFFIX
 from gloves.tracked_take import TrackedTake, save_tracked_take
 from handsim.errors import CaptureError, HandSimError
+from handsim.progress import progress_bar
 from handsim.topology import Side
 from track.body_file import load_bodies
 from track.capture_tracking import TakeRecorder, follow, warm_up
@@ -30,7 +31,6 @@ from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from track.user import UserHand
 from track.user_options import BOTH, Size, calibrated_users, users
-from train.commands import progress_bar
 from train.labeler import labeler_for_glove
 from train.labeling import Labeler
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import tyro
 from rich.console import Console
 
-from train.commands import progress_bar
+from handsim.json_files import save_json
+from handsim.progress import progress_bar
 from train.labeler import labeler_for_glove
-from train.shards import save_json
 from train.table_commands import REPRODUCE as LABELLING
 from train.twins import KINDS, TwinConfig, simulate_twin
 

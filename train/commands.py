@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
-from rich.text import Text
 
 from gloves.captures import WRITABLE, read_capture, write_capture
 from gloves.captures.capture import check_suffix
@@ -30,12 +17,14 @@ from gloves.captures.markers import labelled_capture, unlabelled_frames
 from gloves.layout import load_layout
 from gloves.take import load_take
 from handsim.errors import HandSimError
+from handsim.json_files import save_json
+from handsim.progress import progress_bar
 from train.config import Preset, TrainConfig, with_preset
 from train.labeler import labeler_for_glove
 from train.metrics import percent
 from train.report import write_report
 from train.run_page import PAGE
-from train.shards import Dataset, save_json
+from train.shards import Dataset
 from train.synthesis import DatasetConfig, generate_dataset
 from train.twins import TwinConfig, simulate_twin
 
@@ -216,37 +205,6 @@ def _print_report(figures: dict[str, float], by_marker: dict[str, float], title:
     print_figures({"share": figures}, title=title)
     worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
     Console().print("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
-
-
-@contextmanager
-def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
-    """A progress bar on standard error and the one task in it."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f} " + unit),
-        _Speed(unit),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        yield bar, bar.add_task("", total=1)
-
-
-class _Speed(ProgressColumn):
-    """How many a second of late; blank until there is something to measure."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self.unit = unit
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        if not speed:
-            return Text("")
-        number = f"{speed:,.0f}" if speed >= 10.0 else f"{speed:.2g}"
-        return Text(f"{number} {self.unit}/s", style="progress.data.speed")
 
 
 def print_figures(columns: dict[str, dict[str, float]], *, title: str) -> None:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 from gloves.layout import load_layout
 from handsim.errors import WeightsError, choices
 from handsim.io import atomic_write
+from handsim.json_files import save_json
 from train.config import Kind, SetLabelerConfig
 from train.labeling import Labeler
-from train.shards import save_json
 
 if TYPE_CHECKING:
     from torch import nn

@@ -18,6 +18,7 @@ from torch import nn
 
 from handsim._version import __version__
 from handsim.errors import DatasetError, WeightsError
+from handsim.json_files import claim
 from train.augmentation import Corruption
 from train.batches import draw_batch, paper_corruption
 from train.config import TrainConfig
@@ -25,7 +26,7 @@ from train.evaluation import Report, evaluate_labeler
 from train.kinds import labeler_of
 from train.labeler import save_network
 from train.run_page import write_run_page
-from train.shards import Dataset, claim
+from train.shards import Dataset
 from train.training_state import TrainingState, paper_report, passed
 
 if TYPE_CHECKING:

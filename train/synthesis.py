@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import multiprocessing
+import functools
 import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -21,7 +19,9 @@ from gloves.optics import OpticsConfig
 from handsim.cameras import ROOM_CENTRE, CameraRig, check_outside_volume, list_rigs, load_rig
 from handsim.errors import DatasetError, ShapeError
 from handsim.hand_records import HAND_DTYPE, pack_hand
+from handsim.json_files import claim, load_json
 from handsim.model import HandModel
+from handsim.processes import in_processes
 from handsim.shape import Population, sample_shape
 from handsim.topology import SIDES
 from poses.samplers import PoseMix
@@ -31,9 +31,7 @@ from train.shards import (
     CONFIG,
     Manifest,
     checksum,
-    claim,
     hands_name,
-    load_json,
     row_dtype,
     rows_name,
     save_array,
@@ -121,7 +119,9 @@ def generate_dataset(
     shards = range(-(-config.num_frames // ROWS_PER_SHARD))
     todo = [shard for shard in shards if not _finished(out, shard)]
     done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
-    for shard in _make_all(config, out, todo, workers or os.cpu_count() or 1):
+    for shard in in_processes(
+        functools.partial(make_shard, config, out), todo, workers or os.cpu_count() or 1
+    ):
         done += _shard_size(config, shard)
         if progress is not None:
             progress(done, config.num_frames)
@@ -143,28 +143,6 @@ def _finished(out: Path, shard: int) -> bool:
 
 def _shard_size(config: DatasetConfig, shard: int) -> int:
     return min(ROWS_PER_SHARD, config.num_frames - shard * ROWS_PER_SHARD)
-
-
-def _make_all(config: DatasetConfig, out: Path, todo: list[int], workers: int) -> Iterator[int]:
-    """Make the shards and yield each one's number when it is on disk."""
-    if not todo:
-        return
-    yield make_shard(config, out, todo[0])  # also fills numba's cache before workers ask for it
-    if workers == 1:
-        yield from (make_shard(config, out, shard) for shard in todo[1:])
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, max(1, len(todo) - 1)), mp_context=context) as pool:
-        jobs = [pool.submit(make_shard, config, out, shard) for shard in todo[1:]]
-        try:
-            for job in as_completed(jobs):
-                yield job.result()
-        except BrokenProcessPool as error:
-            raise DatasetError(
-                "a worker died (out of memory?); run the same command again to go on"
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:

@@ -14,7 +14,7 @@ from rich.table import Table
 from gloves.captures.collection import find_captures, read_markers
 from gloves.gaps import count_gaps, run_lengths
 from handsim.errors import HandSimError
-from train.commands import progress_bar
+from handsim.progress import progress_bar
 from train.config import Kind, TrainConfig, with_preset
 from train.labeler import labeler_for_glove, shipped_labelers
 from train.paper import AUGMENTATIONS, TABLE4, TABLE6

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from rich.progress import Progress
 
-from train.commands import _Speed, print_figures
+from handsim.progress import _Speed
+from train.commands import print_figures
 
 
 @pytest.mark.parametrize(
