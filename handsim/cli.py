@@ -30,6 +30,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "calibrate": ("track.calibration_command:calibrate", "Fit hands and gloves to a user, from a capture."),
     "track": ("track.commands:track", "Follow hands through a marker capture or a live stream."),
     "body": ("track.body_command:body", "Write a rigid body's markers as a file, to track it with."),
+    "render": ("render.render_command:render", "Draw the hands of a take, with the truth of each picture."),
     "reproduce": ("track.table_commands:REPRODUCE", "Print a table of the paper with our figures beside."),
     "doctor": ("handsim.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }

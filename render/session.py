@@ -1,0 +1,212 @@
+"""A whole take, drawn in shards: on all cores, resumable, the same bytes whatever the number of workers."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+
+from handsim.errors import HandSimError, ShapeError, choices
+from handsim.json_files import claim
+from handsim.processes import in_processes
+from render.backgrounds import BackgroundConfig, sample_background
+from render.blur import ShutterConfig, sample_shutter
+from render.contact_sheet import contact_sheet
+from render.depth_noise import DepthNoiseConfig, sample_depth_noise
+from render.exposure import ExposureConfig, sample_exposure
+from render.figures import sample_people
+from render.frames import RenderedFrame
+from render.labels import write_png
+from render.lights import sample_lighting
+from render.shown_take import ShownTake, load_shown_take
+from render.skin_look import ALL_TONES
+from render.studio import PASSES, FrameChoices, Studio
+from render.viewpoints import ViewConfig, Viewpoints
+from render.writer import FORMATS, open_writer
+
+Progress = Callable[[int, int], None]
+"""Called with pictures done and pictures wanted."""
+CONFIG: Final = "render.json"
+SHEET: Final = "contact_sheet.png"
+_ON_SHEET: Final = 9
+_PATHS: Final = 1  # spawn keys of what is drawn for the whole take, and for a shard
+_SHARDS: Final = 2
+
+
+@dataclass(frozen=True, slots=True)
+class RenderConfig:
+    """Everything that decides the bytes of a rendering.
+
+    Raises:
+        ShapeError: A pass is unknown, or a number is none.
+    """
+
+    passes: tuple[str, ...] = PASSES
+    """Some of rgb, depth, normals, ids."""
+    view: ViewConfig = field(default_factory=ViewConfig)
+    dress: Literal["skin", "glove"] = "skin"
+    """Bare hands, or the marker glove with its markers."""
+    tones: tuple[float, float] = ALL_TONES
+    """Between which individual typology angles skin is drawn [deg]."""
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    vary: Literal["shard", "frame"] = "shard"
+    """When light and background change; the people change with the shard."""
+    depth_sensor: DepthNoiseConfig | None = field(default_factory=DepthNoiseConfig)
+    """None: depth is perfect only."""
+    color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
+    """None: colours are perfect only."""
+    shutter: ShutterConfig | None = None
+    """None: pictures of moments; else motion blur and rolling shutters, which take a drawing a sub-frame."""
+    every: int = 1
+    """Each so many frames of the take one is drawn."""
+    frames_per_shard: int = 64
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in self.passes:
+            if name not in PASSES:
+                raise ShapeError(choices(name, PASSES, noun="pass"))
+        if not self.passes or self.every < 1 or self.frames_per_shard < 1:
+            raise ShapeError("a rendering wants at least one pass, one frame a step and one frame a shard")
+
+
+def render_take(
+    path: Path,
+    out: Path,
+    formats: Sequence[str],
+    config: RenderConfig,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> int:
+    """Draw a take; called again it goes on where it was stopped.
+
+    Args:
+        path: A tracked take, or the truth of a simulated one.
+        out: Folder; each format has its own in it where there are several.
+        formats: Some of `render.writer.FORMATS`.
+        config: What to draw.
+        workers: Processes; all cores when not given.
+        progress: Told after every shard.
+
+    Returns:
+        Number of pictures.
+
+    Raises:
+        HandSimError: The take or the settings cannot be drawn; shards that are finished are kept.
+    """
+    for name in formats:
+        if name not in FORMATS:
+            raise HandSimError(choices(name, FORMATS, noun="format"))
+    if not formats or len(set(formats)) < len(formats):
+        raise HandSimError(f"formats are {', '.join(formats) or 'none'}, wanted at least one, each once")
+    take = load_shown_take(path)
+    settings = {"take": path.name, "frames": take.num_frames, "formats": list(formats)}
+    claim(out / CONFIG, settings | dataclasses.asdict(config), noun="rendering", error=HandSimError)
+    shards = _shards(take, config)
+    views = len(_viewpoints(take, config).cameras(0))
+    job = functools.partial(_render_shard, path, out, tuple(formats), config)
+    done = _finished(out, formats)
+    count = views * sum(len(shards[number]) for number in done if number < len(shards))
+    total = views * sum(map(len, shards))
+    todo = [number for number in range(len(shards)) if number not in done]
+    for number in in_processes(job, todo, workers or os.cpu_count() or 1):
+        count += views * len(shards[number])
+        if progress is not None:
+            progress(count, total)
+    for name in formats:
+        open_writer(name, _folder(out, formats, name)).finish()
+    _write_sheet(out, take, config, shards)
+    return total
+
+
+def _folder(out: Path, formats: Sequence[str], name: str) -> Path:
+    return out if len(formats) == 1 else out / name
+
+
+def _finished(out: Path, formats: Sequence[str]) -> frozenset[int]:
+    done = [open_writer(name, _folder(out, formats, name)).done() for name in formats]
+    return frozenset.intersection(*done)
+
+
+def _shards(take: ShownTake, config: RenderConfig) -> list[list[int]]:
+    """Frames of each shard: those in which there is a hand."""
+    there = np.isfinite(take.wrists()[..., 0]).any(axis=1)
+    frames = [frame for frame in range(0, take.num_frames, config.every) if there[frame]]
+    size = config.frames_per_shard
+    return [frames[first : first + size] for first in range(0, len(frames), size)]
+
+
+def _viewpoints(take: ShownTake, config: RenderConfig) -> Viewpoints:
+    rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(_PATHS,)))
+    return Viewpoints(config.view, take, rng=rng)
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(path: Path, config: RenderConfig) -> tuple[ShownTake, Viewpoints]:
+    """A take and its cameras; kept, because a worker draws many of its shards."""
+    cv2.setNumThreads(1)  # there is a process a core
+    take = load_shown_take(path)
+    return take, _viewpoints(take, config)
+
+
+def _render_shard(path: Path, out: Path, formats: tuple[str, ...], config: RenderConfig, shard: int) -> int:
+    take, viewpoints = _opened(path, config)
+    frames = draw_shard(take, viewpoints, config, shard, _shards(take, config)[shard])
+    kept = list(frames) if len(formats) > 1 else frames
+    for name in formats:
+        writer = open_writer(name, _folder(out, formats, name))
+        if shard not in writer.done():
+            writer.write(shard, kept)
+    return shard
+
+
+def draw_shard(
+    take: ShownTake, viewpoints: Viewpoints, config: RenderConfig, shard: int, frames: Sequence[int]
+) -> Iterator[RenderedFrame]:
+    """Some frames of a take, seen by all its cameras, with the people of this shard."""
+    seeds = np.random.SeedSequence(config.seed, spawn_key=(_SHARDS, shard)).spawn(1 + len(frames))
+    rng = np.random.default_rng(seeds[0])
+    people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
+    colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in take.bodies]
+    studio = Studio(take, people, colors, config.passes)
+    kept = _choices(config, rng)
+    for frame, seed in zip(frames, seeds[1:], strict=True):
+        own = np.random.default_rng(seed)
+        chosen = _choices(config, own) if config.vary == "frame" else kept
+        for camera in viewpoints.cameras(frame):
+            fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
+            yield studio.photograph(frame, camera, fresh)
+
+
+def _choices(config: RenderConfig, rng: np.random.Generator) -> FrameChoices:
+    return FrameChoices(
+        lighting=sample_lighting(rng=rng),
+        background=sample_background(config.background, rng=rng),
+        exposure=None if config.color_sensor is None else sample_exposure(config.color_sensor, rng=rng),
+        shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
+        depth_noise=None if config.depth_sensor is None else sample_depth_noise(config.depth_sensor, rng=rng),
+        seed=0,
+    )
+
+
+def _write_sheet(out: Path, take: ShownTake, config: RenderConfig, shards: list[list[int]]) -> None:
+    """A few of the pictures at one glance."""
+    if not {"rgb", "depth"} & set(config.passes):
+        return
+    viewpoints, frames = _viewpoints(take, config), []
+    for shard in np.unique(np.linspace(0, len(shards) - 1, _ON_SHEET).round().astype(int)):
+        wanted = (
+            shards[shard][:1]
+            if len(shards) >= _ON_SHEET
+            else shards[shard][:: max(1, len(shards[shard]) // 3)][:3]
+        )
+        frames += list(draw_shard(take, viewpoints, config, int(shard), wanted))
+    write_png(out / SHEET, contact_sheet(frames[:_ON_SHEET]))
