@@ -1,4 +1,4 @@
-"""Takes drawn in shards: the truth agrees with the pictures, work goes on where it stopped, bytes are the same."""
+"""Takes drawn in shards: truth agrees with pictures, work goes on where it stopped, bytes are the same."""
 
 from __future__ import annotations
 
