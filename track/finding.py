@@ -36,6 +36,7 @@ _ROUNDS: Final = 2  # of looking for the points of a fitted hand
 _LOOSE: Final = 4.0  # of their spread so far: where its points are looked for
 _GATES: Final = (0.003, 0.012)  # [m] that is, at least and at most
 _FREEDOM: Final = 20.0  # coordinates of its points that a pose fits, whatever they are
+_STRICT: Final = 60  # frames in which a hand that was known is looked for as it was, before as anybody's
 _LEAST_SCORE: Final = 50.0  # of a hand that is one: twelve points 5 mm off
 _PLAIN: Final = 10.0  # of its markers: such a hand is beyond doubt, and no further cloud is tried
 _FINEST: Final = 0.0003  # [m] below which a spread says no more
@@ -66,6 +67,7 @@ class HandFinder:
     def __init__(self, memories: Sequence[HandMemory], labeler: Labeler) -> None:
         self._memories = memories
         self._labeler = labeler
+        self._sought = np.zeros(len(memories), dtype=np.int64)
         spread = np.arange(_CUTS) + 0.5
         height, turn = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
@@ -83,6 +85,9 @@ class HandFinder:
                 found.append(hand)
                 left = left[hand.names[left] < 0]
                 missing.remove(hand.number)
+            self._sought[missing] += 1
+        for hand in found:
+            self._sought[hand.number] = 0
         return found
 
     def _groups(self, points: NDArray[np.float64], wanted: Sequence[int]) -> list[NDArray[np.int64]]:
@@ -157,7 +162,9 @@ class HandFinder:
         while (names >= 0).sum() >= self._least(number):
             targets = targets_of(points, names, memory.num_markers)
             fit = memory.solver.solve(targets[None], None if start is None else start.qpos)
-            found = Found(number, fit, names, score_of(int((names >= 0).sum()), float(fit.rms[0])))
+            count, rms = int((names >= 0).sum()), float(fit.rms[0])
+            known = memory.spread if self._sought[number] < _STRICT else None
+            found = Found(number, fit, names, score_of(count, rms, known))
             if best is not None and found.score <= best.score:
                 break
             best, start = found, fit
@@ -169,19 +176,22 @@ class HandFinder:
         return best if good else None
 
 
-def score_of(count: int, rms: float) -> float:
-    """Log odds of named points against strays, if their spread around a fitted hand is what it seems to be.
+def score_of(count: int, rms: float, spread: float | None = None) -> float:
+    """Log odds of named points against strays.
 
     Few points that lie right can so be worth more than many that lie roughly.
 
     Args:
         count: Named points.
         rms: Their RMS distance from the hand's markers [m].
+        spread: What is known of how they lie around them, in each direction [m]; what it seems to be when
+            nothing is.
     """
     freedom = max(3.0 * count - _FREEDOM, 1.0)
-    spread = max(rms * np.sqrt(count / freedom), _FINEST)
-    worth = worth_of(np.array([spread**2])) - 1.5
-    return count * float(worth[0])
+    usual = max(rms * np.sqrt(count / freedom), _FINEST) if spread is None else spread
+    worth = worth_of(np.array([usual**2]))
+    off = 1.5 if spread is None else 0.5 * rms**2 / spread**2
+    return count * float(worth[0] - off)
 
 
 def _spread_of(found: Found) -> float:

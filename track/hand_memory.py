@@ -32,6 +32,7 @@ _LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by f
 _UNEVEN: Final = 0.3  # of the hand's usual miss: so much it changes as the hand moves
 _DOUBT: Final = 0.5  # [s] unseen after which a marker may miss its place by the hand's usual miss again
 _MEMORY: Final = 120.0  # frames that a habit is averaged over
+_KNOWN: Final = 30.0  # frames after which a hand's habits are known
 _NOISE: Final = 0.001  # [m] of markers around a fitted pose
 _WRIST: Final = ((0.001, 10.0), (np.deg2rad(1.5), 100.0))
 """Of its place and its orientation: spread at once [m, rad], unforeseen acceleration [m/s^2, rad/s^2]."""
@@ -161,6 +162,13 @@ class HandMemory:
         worth = worth_of(self.variance)
         firm = DigitTrust(coming.hinges, estimate.expected, self.variance, worth, slack, self._ranges)
         return firm, firm._replace(belief=self._rest)
+
+    @property
+    def spread(self) -> float | None:
+        """Of the markers around their places, in each direction [m]; None while little is known of it."""
+        if np.median(self._learned) < _KNOWN:
+            return None
+        return max(float(np.sqrt(np.median(self._variance))), _NOISE)
 
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
         """Log chance of each marker to come back when it did, were it the point that was born then [s].
