@@ -16,7 +16,7 @@ memory: a take forwards and backwards, again and again with new IDs, 432000 fram
 
 All sections when none is named. Twins have the paper's number of frames unless told otherwise; the points of
 a rigid body with markers of its own are left out, as in the paper's tables. What counts as right and valid is
-told in docs/tracking_baselines.md. One core is used.
+told in docs/tracking.md. One core is used.
 """
 
 from __future__ import annotations
