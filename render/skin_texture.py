@@ -62,12 +62,12 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side =
     veins = _veins(back, rng)
     lab += look.veins * veins[:, None] * [-1.6, -1.6, -2.2]
     blotches = noise(texels.places, (0.05, 0.018, 0.007, 0.003), rng=rng)
-    lab += look.blotches * blotches[:, None] * [1.7, -1.0, 0.3]
+    lab += look.blotches * blotches[:, None] * [1.0, -0.6, 0.2]
     lines = np.clip(line_depth(back, rng), 0.0, 1.0)
     # Pigment gathers in the lines; how dark they are goes with the contrast that the skin has room for.
-    lab += look.creases * lines[:, None] * [-7.0, 3.0, 0.5]
-    height = look.relief * relief(back) - 0.0003 * look.creases * lines + 0.0003 * look.veins * veins
-    height += look.relief * 4e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
+    lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
+    height = look.relief * relief(back) - 0.0004 * look.creases * lines + 0.0003 * look.veins * veins
+    height += look.relief * 2e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
     paint = _Paint(lab, np.full(len(back), look.roughness), height)
     _nails(paint, look)
     if forearm is not None and forearm.sleeve < forearm.length:
