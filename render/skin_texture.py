@@ -66,7 +66,7 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side =
     lines = np.clip(line_depth(back, rng), 0.0, 1.0)
     # Pigment gathers in the lines; how dark they are goes with the contrast that the skin has room for.
     lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
-    height = look.relief * relief(back) - 0.0004 * look.creases * lines + 0.0003 * look.veins * veins
+    height = look.relief * relief(back) - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
     height += look.relief * 2e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
     paint = _Paint(lab, np.full(len(back), look.roughness), height)
     _nails(paint, look)
