@@ -68,7 +68,7 @@ STUDIO: Final = Lighting(
 def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     """Random light: a key lamp from in front or above, fill, sky and ground, each with its colour."""
     exposure = float(np.exp(np.clip(rng.normal(0.06, 0.18), -0.35, 0.4)))
-    warmth = rng.normal(0.03, 0.06)
+    warmth = rng.normal(0.06, 0.06)  # lamps are warm, and white balances keep some of it
     key_share, ambient_share = rng.uniform(0.40, 0.72), rng.uniform(0.16, 0.34)
     # From above more than from below, and seldom from behind the hand.
     key = np.array([rng.normal(0.0, 0.75), rng.normal(-0.65, 0.5), rng.normal(-0.9, 0.45)])

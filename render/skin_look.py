@@ -28,8 +28,8 @@ TONES: Final[dict[str, tuple[float, float]]] = {
 """Individual typology angles [deg] of the classes; the outer two end where measured skin does."""
 ALL_TONES: Final = (TONES["dark"][0], TONES["very light"][1])
 _ANGLES: Final = (-52.0, -30.0, 0.0, 20.0, 35.0, 50.0, 64.0)
-_YELLOWNESS: Final = (10.5, 14.5, 18.0, 18.5, 17.5, 15.5, 12.5)  # CIELAB b* of the back of the hand
-_REDNESS: Final = (7.5, 9.5, 11.5, 11.5, 10.5, 9.5, 8.5)  # CIELAB a*
+_YELLOWNESS: Final = (12.0, 15.5, 18.5, 18.5, 17.5, 15.5, 12.5)  # CIELAB b* of the back of the hand
+_REDNESS: Final = (8.8, 10.5, 12.0, 11.5, 10.5, 9.5, 8.5)  # CIELAB a*
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,10 +85,10 @@ def relief(back: NDArray[np.float64]) -> NDArray[np.float64]:
         root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
         along = np.clip((places - root) @ (knuckle - root) / ((knuckle - root) @ (knuckle - root)), 0.0, 1.0)
         aside = np.linalg.norm(places - root - along[:, None] * (knuckle - root), axis=1)
-        height += 0.0007 * smooth(along, 0.05, 0.6) * bump(aside, 0.0028)
-        height += 0.0009 * bump(np.linalg.norm(places - knuckle, axis=1), 0.0065)
+        height += 0.00025 * smooth(along, 0.2, 0.8) * bump(aside, 0.0032)
+        height += 0.0005 * bump(np.linalg.norm(places - knuckle, axis=1), 0.0065)
     for hollow in 0.5 * (knuckles[:-1] + knuckles[1:]) + [0.004, 0.0]:
-        height -= 0.0008 * bump(np.linalg.norm(places - hollow, axis=1), 0.0055)
+        height -= 0.0004 * bump(np.linalg.norm(places - hollow, axis=1), 0.0055)
     height *= back * texels.palm
     for digit in texels.digits:
         for joint, high, wide in zip(

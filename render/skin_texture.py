@@ -62,12 +62,12 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side =
     veins = _veins(back, rng)
     lab += look.veins * veins[:, None] * [-1.6, -1.6, -2.2]
     blotches = noise(texels.places, (0.05, 0.018, 0.007, 0.003), rng=rng)
-    lab += look.blotches * blotches[:, None] * [1.7, -1.0, 0.3]
+    lab += look.blotches * blotches[:, None] * [1.0, -0.6, 0.2]
     lines = np.clip(line_depth(back, rng), 0.0, 1.0)
     # Pigment gathers in the lines; how dark they are goes with the contrast that the skin has room for.
-    lab += look.creases * lines[:, None] * [-7.0, 3.0, 0.5]
-    height = look.relief * relief(back) - 0.0003 * look.creases * lines + 0.0003 * look.veins * veins
-    height += look.relief * 4e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
+    lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
+    height = look.relief * relief(back) - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
+    height += look.relief * 2e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
     paint = _Paint(lab, np.full(len(back), look.roughness), height)
     _nails(paint, look)
     if forearm is not None and forearm.sleeve < forearm.length:
@@ -90,13 +90,13 @@ def lab_to_srgb(lab: NDArray[np.float64]) -> UInt8[np.ndarray, "H W 3"]:
 def _flush(lab: NDArray[np.float64], back: NDArray[np.float64], look: SkinLook) -> None:
     """Blood in the finger tips, knuckles and balls of the hand; knuckles are darker, too."""
     texels = skin_texels()
-    for digit in texels.digits:
-        _, middle, _ = ends = np.cumsum(digit.lengths)
+    for number, digit in enumerate(texels.digits):
+        first, middle, end = np.cumsum(digit.lengths)
         mine = digit.texels
-        tips = smooth(digit.along, middle, ends[2]) * digit.share
+        tips = smooth(digit.along, middle, end) * digit.share
         lab[mine] += look.flush * tips[:, None] * [-1.0, 4.0, 0.0]
-        for joint, width in zip((0.0, ends[0], middle), (0.010, 0.0075, 0.006), strict=True):
-            if digit.lengths is texels.digits[0].lengths and joint == 0.0:
+        for joint, width in ((0.0, 0.010), (first, 0.0075), (middle, 0.006)):
+            if number == 0 and joint == 0.0:
                 continue  # the thumb's first joint lies deep under the skin
             knuckle = bump(digit.along - joint, width) * back[mine] * np.abs(np.cos(digit.turn / 2))
             darker = -1.5 - 0.06 * max(0.0, 60.0 - look.lightness)
