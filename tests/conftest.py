@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from handsim.errors import HandSimError
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -33,3 +35,14 @@ def denormals() -> Iterator[None]:
     yield
     if "torch" in sys.modules:
         sys.modules["torch"].set_flush_denormal(False)
+
+
+@pytest.fixture(scope="session")
+def drawing() -> None:
+    """Skips where nothing can be drawn."""
+    from render._gl import offscreen_renderer
+
+    try:
+        offscreen_renderer(16, 16)
+    except HandSimError as error:
+        pytest.skip(str(error))

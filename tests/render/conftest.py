@@ -8,23 +8,11 @@ import pytest
 from gloves.attach import Attachment, attach
 from gloves.layout import load_layout
 from handsim.cameras import look_at
-from handsim.errors import HandSimError
 from handsim.model import HandModel, join_qpos
 from handsim.topology import Side
 from render.camera import Camera, pinhole
 from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
 from render.keypoints import hand_keypoints
-
-
-@pytest.fixture(scope="session")
-def drawing() -> None:
-    """Skips where nothing can be drawn."""
-    from render._gl import offscreen_renderer
-
-    try:
-        offscreen_renderer(16, 16)
-    except HandSimError as error:
-        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,81 @@
+"""The whole chain at its ends: simulate, write, track, draw; what is drawn lies where the truth is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.captures import read_capture, write_capture
+from gloves.take import load_take
+from gloves.tracked_take import load_tracked_take, save_tracked_take
+from handsim.model import HandModel
+from render.keypoints import hand_keypoints
+from render.session import RenderConfig, draw_shard
+from render.shown_take import load_shown_take
+from render.viewpoints import ViewConfig, Viewpoints
+from track.capture_tracking import track
+from track.evaluation import true_users
+from track.tracker import Tracker
+from train.labeler import load_labeler
+from train.take_commands import simulate
+from train.twins import TwinConfig
+
+MOST_MILLIMETRES = 1.0
+MOST_PIXELS = 2.0
+FRAMES = 120
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("loop")
+    simulate(folder / "take.c3d", TwinConfig(kind="hand-hand", num_frames=FRAMES))
+    return load_take(folder / "take.truth.npz"), folder
+
+
+@pytest.fixture(scope="module")
+def tracked(truth):
+    """Tracked from the file of points alone."""
+    take, folder = truth
+    capture = read_capture(folder / "take.c3d")
+    result = track(capture, Tracker(true_users(take), load_labeler("dense19")))
+    save_tracked_take(folder / "tracked.npz", result)
+    return load_tracked_take(folder / "tracked.npz"), folder
+
+
+def test_hands_are_tracked_to_a_millimetre(truth, tracked):
+    take, _ = truth
+    result, _ = tracked
+    for hand in take.hands:
+        place = result.hand(hand.shape.side)
+        there = np.isfinite(result.qpos[:, place, 0])
+        assert there.mean() >= 0.98
+        model = HandModel(hand.shape)
+        joints = [
+            model.forward_kinematics(qpos[there])[..., :3, 3] for qpos in (result.qpos[:, place], hand.qpos)
+        ]
+        off = 1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1)
+        assert off.mean() <= MOST_MILLIMETRES
+
+
+@pytest.mark.usefixtures("drawing")
+def test_pictures_of_tracked_hands_have_their_keypoints_where_the_truth_is(truth, tracked):
+    take, folder = truth
+    shown = load_shown_take(folder / "tracked.npz")
+    config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("rgb", "depth", "ids"))
+    viewpoints = Viewpoints(config.view, shown, rng=np.random.default_rng(0))
+    off = []
+    for frame in draw_shard(shown, viewpoints, config, 0, range(10, FRAMES, 20)):
+        assert frame.camera.size == (640, 480) and len(frame.hands) == 2
+        for hand in frame.hands:
+            true = next(one for one in take.hands if one.shape.side == hand.shape.side)
+            points = hand_keypoints(HandModel(true.shape), true.qpos[frame.number : frame.number + 1])[0]
+            off.append(np.linalg.norm(frame.camera.project(points) - hand.pixels, axis=-1))
+    assert np.mean(off) <= MOST_PIXELS
+
+
+def test_what_is_written_is_read_back(tracked, tmp_path):
+    result, folder = tracked
+    again = read_capture(folder / "take.c3d")
+    write_capture(tmp_path / "again.trc", again)
+    np.testing.assert_allclose(read_capture(tmp_path / "again.trc").positions, again.positions, atol=1e-6)
+    assert result.num_frames == FRAMES
