@@ -1,0 +1,194 @@
+"""How quickly pictures come, and how true their depth is.
+
+    python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
+
+speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one a core: depth alone;
+    colours, depth, ids and keypoints; the same written as WebDataset. Beside them the loop that a user would
+    write with pyrender (the same meshes, plain material, one light) and MuJoCo's own renderer (the hand's
+    capsules, no skin), each for depth and for colours.
+accuracy: depth and ids against embree through trimesh on the same triangles.
+memory: resident memory over many pictures.
+
+Speeds are medians over rounds of the machine's clock: run it where nothing else runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+import trimesh
+from machine import describe
+
+from gloves.take import save_take
+from handsim.processes import in_processes
+from render._gl import load_pyrender, offscreen_renderer
+from render.figures import sample_people
+from render.rasteriser import join, rasterise
+from render.scene import OPENGL_FROM_OPENCV
+from render.session import RenderConfig, draw_shard, render_take
+from render.shown_take import ShownTake, show_simulated
+from render.skin_look import ALL_TONES
+from render.studio import Studio
+from render.viewpoints import ViewConfig, Viewpoints
+from train.twins import TwinConfig, simulate_twin
+
+SECTIONS: Final = ("speed", "accuracy", "memory")
+ROUNDS: Final = 3
+PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None)
+PASSES: Final = {"depth": ("depth",), "colours, depth, ids, keypoints": ("rgb", "depth", "ids")}
+
+
+@functools.lru_cache(maxsize=1)
+def a_take(frames: int) -> ShownTake:
+    return show_simulated(simulate_twin(TwinConfig(kind="hand-hand", num_frames=frames)))
+
+
+def draw(passes: tuple[str, ...], frames: int, shard: int) -> int:
+    """One worker's share."""
+    take = a_take(frames)
+    config = dataclasses.replace(PLAIN, passes=passes)
+    viewpoints = Viewpoints(config.view, take, rng=np.random.default_rng(0))
+    for _ in draw_shard(take, viewpoints, config, shard, range(frames)):
+        pass
+    return shard
+
+
+def rate(job: Callable[[], object], count: int) -> float:
+    """Pictures a second, the median of some rounds after one that does not count."""
+    job()
+    seconds = []
+    for _ in range(ROUNDS):
+        start = time.perf_counter()
+        job()
+        seconds.append(time.perf_counter() - start)
+    return count / float(np.median(seconds))
+
+
+def plain_pyrender(take: ShownTake, color: bool) -> None:
+    """What a user would write: a scene a frame, skinned meshes, one light."""
+    pyrender = load_pyrender()
+    view = Viewpoints(PLAIN.view, take, rng=np.random.default_rng(0))
+    renderer = offscreen_renderer(640, 480)
+    for frame in range(take.num_frames):
+        scene, camera = pyrender.Scene(), view.cameras(frame)[0]
+        for hand in take.hands:
+            skin = hand.model.skin(hand.qpos[frame : frame + 1])[0]
+            scene.add(
+                pyrender.Mesh.from_trimesh(trimesh.Trimesh(skin, hand.model.surface.faces, process=False))
+            )
+        pose = camera.T_world_camera @ OPENGL_FROM_OPENCV
+        scene.add(pyrender.IntrinsicsCamera(600.0, 600.0, 320.0, 240.0), pose=pose)
+        scene.add(pyrender.DirectionalLight(intensity=3.0), pose=pose)
+        renderer.render(scene, flags=pyrender.RenderFlags.NONE if color else pyrender.RenderFlags.DEPTH_ONLY)
+
+
+def mujoco_loop(take: ShownTake, color: bool) -> None:
+    """MuJoCo's renderer on one hand's capsules."""
+    hand = take.hands[0]
+    model = hand.model.mj_model
+    data = mujoco.MjData(model)
+    with mujoco.Renderer(model, 480, 640) as renderer:
+        if not color:
+            renderer.enable_depth_rendering()
+        camera = mujoco.MjvCamera()
+        camera.distance = 0.6
+        for qpos in hand.qpos:
+            data.qpos[:] = qpos
+            mujoco.mj_kinematics(model, data)
+            camera.lookat[:] = qpos[:3]
+            renderer.update_scene(data, camera)
+            renderer.render()
+
+
+def speed(frames: int) -> None:
+    take, cores = a_take(frames), os.cpu_count() or 1
+    print(f"\nimages a second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
+    for name, passes in PASSES.items():
+        job = functools.partial(draw, passes, frames)
+        alone = rate(lambda job=job: job(0), frames)
+        together = rate(lambda job=job: list(in_processes(job, range(2 * cores), cores)), 2 * cores * frames)
+        print(f"  {name:32s} {alone:8.1f} {together:8.1f}")
+    for color, name in ((False, "depth"), (True, "colours")):
+        print(
+            f"  plain pyrender loop, {name:11s} {rate(lambda c=color: plain_pyrender(take, c), frames):8.1f}"
+        )
+        print(f"  MuJoCo's renderer, {name:13s} {rate(lambda c=color: mujoco_loop(take, c), frames):8.1f}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "take.truth.npz"
+        save_take(path, simulate_twin(TwinConfig(kind="hand-hand", num_frames=frames)))
+        start = time.perf_counter()
+        render_take(path, Path(folder) / "out", ["webdataset"], PLAIN)
+        print(f"  all passes, written as WebDataset {'':7s}{frames / (time.perf_counter() - start):8.1f}")
+
+
+def accuracy(frames: int) -> None:
+    from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+    take = a_take(frames)
+    view = Viewpoints(ViewConfig("anywhere"), take, rng=np.random.default_rng(1))
+    studio = bare_studio(take)
+    off, agree = [], []
+    for frame in np.linspace(0, take.num_frames - 1, 8).astype(int):
+        camera = view.cameras(frame)[0]
+        surface = join([one.triangles for one in studio._drawn(int(frame), 0.0)])
+        mine = rasterise(camera, surface)
+        vertices = np.asarray(surface.vertices, dtype=np.float64)
+        caster = RayMeshIntersector(trimesh.Trimesh(vertices, surface.faces, process=False))
+        directions = camera.rays().reshape(-1, 3) @ camera.T_world_camera[:3, :3].T
+        origins = np.broadcast_to(camera.T_world_camera[:3, 3], directions.shape)
+        places, rays, faces = caster.intersects_location(origins, directions, multiple_hits=False)
+        depth, part = np.zeros(len(directions)), np.zeros(len(directions), dtype=np.uint8)
+        depth[rays], part[rays] = camera.local(places)[:, 2], surface.parts[faces]
+        depth, part = depth.reshape(480, 640), part.reshape(480, 640)
+        both = (depth > 0) & (mine.depth > 0)
+        off.append(1e3 * np.abs(depth - mine.depth)[both])
+        agree.append(np.mean(part == mine.parts))
+    errors = np.concatenate(off)
+    print(
+        f"\nagainst embree: depth median {np.median(errors):.2g} mm, 99.9 % within "
+        f"{np.quantile(errors, 0.999):.2g} mm; ids and silhouettes agree on {100 * min(agree):.3f} % of the "
+        "pixels or more"
+    )
+
+
+def bare_studio(take: ShownTake) -> Studio:
+    rng = np.random.default_rng(0)
+    return Studio(take, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng), [])
+
+
+def memory(images: int) -> None:
+    frames = 200
+    print(f"\nresident memory over {images} pictures (colours, depth, ids)")
+    page = os.sysconf("SC_PAGE_SIZE")
+    for shard in range(images // frames):
+        draw(PASSES["colours, depth, ids, keypoints"], frames, shard)
+        if shard % max(1, images // frames // 8) == 0:
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            print(f"  {(shard + 1) * frames:6d}: {pages * page / 2**20:.1f} MB", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("section", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}")
+    parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--images", type=int, default=20000)
+    options = parser.parse_args()
+    print(describe())
+    for name in options.section or SECTIONS:
+        {"speed": speed, "accuracy": accuracy}.get(name, memory)(
+            options.images if name == "memory" else options.frames
+        )
+
+
+if __name__ == "__main__":
+    main()
