@@ -9,12 +9,13 @@ import numpy as np
 from render.camera import Camera
 from render.figures import HandFigure, digit_of_part
 from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures
-from render.keypoints import KEYPOINT_DIGITS, hand_keypoints
+from render.keypoints import KEYPOINT_DIGITS, NUM_KEYPOINTS, hand_keypoints
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, UInt8
     from numpy.typing import NDArray
 
+_FIRST_JOINTS: Final = np.arange(NUM_KEYPOINTS) % 4 == 1
 _DEEP: Final = 0.03  # [m] that a keypoint may lie under its own skin; deeper it is another fold of it
 
 
@@ -55,14 +56,18 @@ def _visible(
     camera: Camera,
     pictures: Pictures,
 ) -> Bool[np.ndarray, "21"]:
-    """Keypoints in the picture with nothing in front of their own digit, or of the palm for the wrist."""
+    """Keypoints in the picture with nothing in front of their own digit.
+
+    For the wrist that is the palm, and for a digit's first joint, which lies under both, either.
+    """
     assert pictures.parts is not None and pictures.depth is not None
     width, height = camera.size
     inside = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
     digits = digit_of_part(pictures.parts[rows, columns], number)
     under = camera.local(keypoints)[:, 2] - pictures.depth[rows, columns]
-    visible: NDArray[np.bool_] = inside & (digits == np.array(KEYPOINT_DIGITS)) & (under < _DEEP)
+    own = (digits == np.array(KEYPOINT_DIGITS)) | (_FIRST_JOINTS & (digits == -1))
+    visible: NDArray[np.bool_] = inside & own & (under < _DEEP)
     return visible
 
 

@@ -25,6 +25,7 @@ Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 PLACEMENTS: Final[tuple[Placement, ...]] = ("still", "orbit", "head", "anywhere", "rig")
 _REACH: Final = 0.08  # [m] from the wrist to the middle of the hand
 _EYES: Final = (0.32, 0.38)  # [m] of the head's camera behind and above the hands
+_PAST: Final = np.deg2rad(50.0)  # between a head's line of sight and a forearm, at least
 _SWAY: Final = 1.0  # [s] over which a head follows the hands
 _TURN: Final = 12.0  # [s] of a camera that goes round once
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
@@ -143,13 +144,31 @@ def _head(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list
     centres = uniform_filter1d(hand_centres(take), max(1, round(_SWAY * take.rate)), axis=0, mode="nearest")
     user = _towards_user(take)
     back, up = _EYES[0] + rng.uniform(-0.05, 0.05), _EYES[1] + rng.uniform(-0.05, 0.05)
+    direction = _past_forearms(take, back * user + [0.0, 0.0, up])
     aside = np.cross(user, [0.0, 0.0, 1.0])
     paths = []
     for number in range(config.views):
-        eyes = centres + back * user + [0.0, 0.0, up]
+        eyes = centres + direction
         eyes += 0.064 * (number - 0.5 * (config.views - 1)) * aside
         paths.append(np.array([look_at(eye, centre) for eye, centre in zip(eyes, centres, strict=True)]))
     return paths
+
+
+def _past_forearms(take: ShownTake, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same way from the hands, turned aside until no forearm usually lies in the line of sight."""
+    length = float(np.linalg.norm(offset))
+    direction = offset / length
+    w, x, y, z = np.moveaxis(take.wrists()[..., 3:7], -1, 0)
+    arms = -np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
+    medians = np.nanmedian(arms, axis=0)
+    medians /= np.linalg.norm(medians, axis=1, keepdims=True)
+    for arm in [*medians] * 2:  # past one may be into the other
+        if direction @ arm > np.cos(_PAST):
+            across = direction - (direction @ arm) * arm
+            if np.linalg.norm(across) < 1e-3:
+                across = np.cross(arm, [1.0, 0.0, 0.0])
+            direction = np.cos(_PAST) * arm + np.sin(_PAST) * across / np.linalg.norm(across)
+    return length * direction
 
 
 def _anywhere(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:

@@ -51,7 +51,9 @@ def test_truth_agrees_with_the_pictures(path, dress):
         for number, hand in enumerate(frame.hands):
             columns, rows = hand.pixels[hand.visible].astype(int).T
             digits = digit_of_part(pictures.parts[rows, columns], number)
-            assert (digits == np.array(KEYPOINT_DIGITS)[hand.visible]).all()
+            own = np.array(KEYPOINT_DIGITS)[hand.visible]
+            knuckle = np.flatnonzero(hand.visible) % 4 == 1
+            assert ((digits == own) | (knuckle & (digits == -1))).all()
             assert (pictures.instances[rows, columns] == number + 1).all()
             assert len(hand.markers) == (19 if dress == "glove" else 0)
         if dress == "glove":
