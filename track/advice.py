@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 _NEAR: Final = 0.06  # [m] around the markers of a hand: points that the labeler is shown
 _FIRST: Final = 0.05  # [s] that a point is there before anybody is asked about it
 _LATER: Final = 3.0  # of its age: it is asked about again
+_RATE, _BURST = 0.9, 6.0  # [1/s] askings, which take longer than the rest of a frame; those saved up at most
 _MOST: Final = 12.0  # log odds that opinions may come to
 _WEIGHT: Final = 4.0  # log odds of one sure opinion
 
@@ -35,6 +36,7 @@ class Adviser:
     def __init__(self, labeler: Labeler) -> None:
         self._labeler = labeler
         self._asked: dict[int, float] = {}
+        self._left, self._last = _BURST, -np.inf
         self._due: dict[tuple[int, int], float] = {}
         self._opinions: dict[tuple[int, int], NDArray[np.float64]] = {}
 
@@ -61,13 +63,17 @@ class Adviser:
         self._due = {key: due for key, due in self._due.items() if key[0] in rows}
         self._opinions = {key: said for key, said in self._opinions.items() if key[0] in rows}
         unnamed = np.flatnonzero((names < 0).all(axis=0) & (ids >= 0))
-        for hand in sorted(hands, key=lambda hand: self._asked.get(hand.number, -np.inf)):
+        self._left, self._last = min(self._left + _RATE * (time - self._last), _BURST), time
+        for hand in sorted(
+            hands if self._left >= 1.0 else (), key=lambda hand: self._asked.get(hand.number, -np.inf)
+        ):
             due = [self._due.get((int(ids[row]), hand.number), born[row] + _FIRST) for row in unnamed]
             waiting = unnamed[time >= np.array(due)]
             if len(waiting) and self._ask(
                 hand, points, ids, names, waiting
             ):  # one hand a frame: it takes time
                 self._asked[hand.number] = time
+                self._left -= 1.0
                 for row in waiting:
                     self._due[int(ids[row]), hand.number] = time + (_LATER - 1.0) * (time - born[row])
                 break
