@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -46,8 +48,8 @@ class Drawn:
     colors: Float32[np.ndarray, "V 4"]
     """Factors on the material's colour, linear."""
     uv: Float32[np.ndarray, "V 2"] | None
-    material: Any
-    """pyrender's."""
+    material: Callable[[], Any]
+    """Gives pyrender's, the same every time; whoever wants no colours needs none."""
 
 
 def sample_people(
@@ -78,11 +80,7 @@ class HandFigure:
     def __init__(self, hand: ShownHand, look: Appearance, *, first_marker: int) -> None:
         self.hand, self.look = hand, look
         self._skin = SkinMesh(hand.model, look.forearm)
-        side = hand.model.shape.side
-        texture = skin_texture(look.skin, look.forearm, side=side)
-        if look.glove is not None:
-            texture = glove_texture(look.glove, texture, look.forearm, side=side)
-        self._material, self._balls = skin_material(texture), ball_material()
+        self._material, self._balls = functools.cache(self._painted), functools.cache(ball_material)
         bones = hand.attachment.bone_indices[
             np.arange(len(hand.attachment.bone_indices)), hand.attachment.bone_weights.argmax(axis=1)
         ]
@@ -117,6 +115,13 @@ class HandFigure:
         markers: NDArray[np.float64] = self.hand.attachment.markers(self.hand.model, transforms)[0][0]
         return markers
 
+    def _painted(self) -> Any:
+        look, side = self.look, self.hand.model.shape.side
+        texture = skin_texture(look.skin, look.forearm, side=side)
+        if look.glove is not None:
+            texture = glove_texture(look.glove, texture, look.forearm, side=side)
+        return skin_material(texture)
+
     def _drawn_markers(self, qpos: NDArray[np.float64], number: int) -> Drawn:
         balls = sphere_surface(self.markers(qpos), self.hand.attachment.layout.radius, level=_BALL_LEVEL)
         each = len(balls.faces) // len(self._marker_bones)
@@ -136,7 +141,8 @@ class BodyFigure:
 
     def __init__(self, body: ShownBody, color: tuple[float, float, float]) -> None:
         self.body = body
-        self._material, self._balls = plain_material(color), ball_material()
+        self._material = functools.cache(functools.partial(plain_material, color))
+        self._balls = functools.cache(ball_material)
         if body.thing is not None:
             self._normals = vertex_normals(body.thing.vertices, body.thing.faces)
 
@@ -162,7 +168,7 @@ def _drawn_balls(
     parts: UInt8[np.ndarray, "F"],
     instances: UInt8[np.ndarray, "F"],
     markers: UInt8[np.ndarray, "F"],
-    material: Any,
+    material: Callable[[], Any],
 ) -> Drawn:
     triangles = Triangles(balls.vertices, balls.faces, balls.normals, parts, instances, markers)
     colors = np.ones((len(balls.vertices), 4), dtype=np.float32)

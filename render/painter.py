@@ -73,7 +73,7 @@ def _paint_all(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UI
             indices=one.triangles.faces,
             texcoord_0=one.uv,
             color_0=one.colors,
-            material=one.material,
+            material=one.material(),
         )
         scene.add(pyrender.Mesh([primitive]))
     lens = pyrender.IntrinsicsCamera(*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], znear=_NEAR, zfar=_FAR)
