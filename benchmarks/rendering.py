@@ -1,6 +1,6 @@
 """How quickly pictures come, and how true their depth is.
 
-    python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
+    MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one a core: depth alone;
     colours, depth, ids and keypoints; the same written as WebDataset. Beside them the loop that a user would
@@ -102,7 +102,7 @@ def plain_pyrender(take: ShownTake, color: bool) -> None:
 
 
 def mujoco_loop(take: ShownTake, color: bool) -> None:
-    """MuJoCo's renderer on one hand's capsules."""
+    """MuJoCo's renderer on one hand's capsules; it needs MUJOCO_GL=egl where there is no screen."""
     hand = take.hands[0]
     model = hand.model.mj_model
     data = mujoco.MjData(model)
