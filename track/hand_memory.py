@@ -41,6 +41,8 @@ _SMOOTHING: Final = 0.6  # share of the newest speed
 _RETURN: Final = 0.01  # [s] over the time for which a marker was hidden: its chance to be back in a frame
 _RETURNS: Final = (0.01, 0.65)  # least and most of that chance
 _ELSEWHERE: Final = -7.0  # log chance of a marker that was seen while the point was there already
+_STRAY_LIFE: Final = 0.1  # [s] that a stray point lives, on average
+_MOST_AGE: Final = 3.0  # log odds that a point's age may come to
 _LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
 
 
@@ -88,6 +90,7 @@ class HandMemory:
         self.time = 0.0
         self.rms = np.nan
         """Of the last pose, its habits being known [m]."""
+        self._now = 0.0
         count = self.num_markers = hand.attachment.layout.num_markers
         bones = hand.attachment.bone_indices[np.arange(count), hand.attachment.bone_weights.argmax(axis=1)]
         self.digits = np.array([BONES[bone].digit for bone in bones])
@@ -114,6 +117,7 @@ class HandMemory:
         Only for a hand that has a pose.
         """
         assert self.qpos is not None
+        self._now = time
         span = time - self.time
         doubt = self._usual_miss * np.minimum((time - self._seen) / _DOUBT, 1.0)
         self.variance = self._variance + doubt**2
@@ -167,11 +171,15 @@ class HandMemory:
         return max(float(np.sqrt(np.median(self._variance))), _NOISE)
 
     def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
-        """Log chance of each marker to come back when it did, were it the point that was born then [s]."""
+        """Log chance of each marker to come back when it did, were it the point that was born then [s].
+
+        It counts against that of a stray, which would hardly have lived for so long.
+        """
         gap = born[:, None] - self._seen
         chance: NDArray[np.float64] = np.log(np.clip(_RETURN / np.maximum(gap, 1e-3), *_RETURNS))
         chance[gap < 0.0] = _ELSEWHERE
-        return chance
+        age = np.maximum(self._now - born, 0.0)[:, None]
+        return chance + np.minimum(age / _STRAY_LIFE, _MOST_AGE)
 
     def begin(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
