@@ -51,24 +51,6 @@ def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]
     return quaternions
 
 
-def quaternion_vectors(quaternions: Float[np.ndarray, "T 4"]) -> NDArray[np.float64]:
-    """Rotation vectors (T, 3) [rad] of unit quaternions, the shorter way round."""
-    vectors = quaternions[:, 1:] * np.where(quaternions[:, :1] < 0.0, -1.0, 1.0)
-    sines = np.linalg.norm(vectors, axis=1, keepdims=True)
-    angles = 2.0 * np.arctan2(sines, np.abs(quaternions[:, :1]))
-    turned: NDArray[np.float64] = vectors * np.where(sines > 1e-8, angles / np.maximum(sines, 1e-8), 2.0)
-    return turned
-
-
-def multiply_quaternions(
-    first: Float[np.ndarray, "T 4"], second: Float[np.ndarray, "T 4"]
-) -> NDArray[np.float64]:
-    """Rotations `second`, then `first`, as unit wxyz quaternions (T, 4)."""
-    product = Rotation.from_quat(first, scalar_first=True) * Rotation.from_quat(second, scalar_first=True)
-    quaternions: NDArray[np.float64] = product.as_quat(scalar_first=True)
-    return quaternions
-
-
 def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
     """Rotation Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: turn, then tip, then roll about the own x axis."""
     x, y, z = np.eye(3)

@@ -90,7 +90,8 @@ class Studio:
         rng = np.random.default_rng(choices.seed)
         drawn = self._drawn(frame, 0.0)
         _check_outside(camera, drawn, frame)
-        truth = self._geometry(camera, drawn)
+        noisy = "depth" in self.passes and choices.depth_noise is not None
+        truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self.passes:
             rgb = self._colors_of(camera, drawn, choices)
@@ -152,7 +153,7 @@ class Studio:
                 drawn += body.drawn(place, number)
         return drawn
 
-    def _geometry(self, camera: Camera, drawn: Sequence[Drawn]) -> Pictures:
+    def _geometry(self, camera: Camera, drawn: Sequence[Drawn], *, with_normals: bool) -> Pictures:
         """Depth, normals and ids, through whatever lens."""
         surface = join([one.triangles for one in drawn]) if drawn else None
         width, height = camera.size
@@ -160,7 +161,7 @@ class Studio:
             flat = np.zeros((height, width), dtype=np.uint8)
             bare = np.zeros((height, width, 3), dtype=np.float32)
             return Pictures(None, flat.astype(np.float32), bare, flat, flat, flat)
-        faces = [rasterise(face, surface, with_normals=self._wants_normals) for face in faces_for(camera)]
+        faces = [rasterise(face, surface, with_normals=with_normals) for face in faces_for(camera)]
         if camera.lens.kind == "pinhole":
             return faces[0]
         normals = [face.normals for face in faces if face.normals is not None]
@@ -174,10 +175,6 @@ class Studio:
             warp_normals(camera, normals) if normals else None,
             *ids,
         )
-
-    @property
-    def _wants_normals(self) -> bool:
-        return "normals" in self.passes or "depth" in self.passes
 
     def _colors_of(
         self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices

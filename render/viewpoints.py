@@ -14,6 +14,7 @@ from scipy.ndimage import uniform_filter1d
 
 from handsim.cameras import load_rig, look_at
 from handsim.errors import ShapeError, choices
+from handsim.transforms import quaternion_matrix
 from render.camera import Camera, preset
 from render.shown_take import ShownTake
 
@@ -83,10 +84,7 @@ class Viewpoints:
 
 def hand_centres(take: ShownTake) -> Float[np.ndarray, "T 3"]:
     """Middle of the hands that are there [m]; where there are none, straight from before to after."""
-    wrists = take.wrists()
-    w, x, y, z = np.moveaxis(wrists[..., 3:7], -1, 0)
-    along = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
-    middles = wrists[..., :3] + _REACH * along
+    middles = take.wrists()[..., :3] + _REACH * _along(take)
     there = np.isfinite(middles[..., :1])
     counts = there.sum(axis=1)
     centres = np.where(there, middles, 0.0).sum(axis=1) / np.maximum(counts, 1)
@@ -95,11 +93,14 @@ def hand_centres(take: ShownTake) -> Float[np.ndarray, "T 3"]:
     return np.stack([np.interp(frames, known, centres[known, axis]) for axis in range(3)], axis=1)
 
 
+def _along(take: ShownTake) -> NDArray[np.float64]:
+    """Direction (T, H, 3) from each wrist to its fingers; NaN where there is no hand."""
+    return quaternion_matrix(take.wrists()[..., 3:7])[..., 0]
+
+
 def _towards_user(take: ShownTake) -> NDArray[np.float64]:
     """Level direction from the hands to the body that they belong to: where their forearms point."""
-    w, x, y, z = np.moveaxis(take.wrists()[..., 3:7], -1, 0)
-    back = -np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=-1)
-    level = np.append(np.nanmean(back.reshape(-1, 2), axis=0), 0.0)
+    level = np.append(np.nanmean(-_along(take)[..., :2].reshape(-1, 2), axis=0), 0.0)
     length = float(np.linalg.norm(level))
     return level / length if length > 1e-3 else np.array([0.0, -1.0, 0.0])
 
@@ -158,9 +159,7 @@ def _past_forearms(take: ShownTake, offset: NDArray[np.float64]) -> NDArray[np.f
     """The same way from the hands, turned aside until no forearm usually lies in the line of sight."""
     length = float(np.linalg.norm(offset))
     direction = offset / length
-    w, x, y, z = np.moveaxis(take.wrists()[..., 3:7], -1, 0)
-    arms = -np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=-1)
-    medians = np.nanmedian(arms, axis=0)
+    medians = np.nanmedian(-_along(take), axis=0)
     medians /= np.linalg.norm(medians, axis=1, keepdims=True)
     for arm in [*medians] * 2:  # past one may be into the other
         if direction @ arm > np.cos(_PAST):

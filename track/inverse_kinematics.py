@@ -36,6 +36,7 @@ FEWEST_MARKERS: Final = 4
 _EASING: Final = (1 / 64, 1 / 8, 1.0)  # of the tightness of a robust loss, so that a start may be far off
 _EASY_STEPS: Final = 8
 _MOST_STEPS: Final = 30
+_NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # a pose, and no trust in it
 _GOOD: Final = 0.0005  # [m] RMS, limits and prior included, from which on no further start is tried
 
 
@@ -54,19 +55,12 @@ class PoseFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Where hinges are thought to be; it counts for digits that lack a marker or never had three.
-
-    And where the wrist is; that counts where the palm lacks a marker or never had three.
-    """
+    """Where hinges are thought to be; it counts for digits that lack a marker or never had three."""
 
     angles: Float[np.ndarray, "*T 20"]
     """Angles [rad], for each frame or for all."""
     spread: ArrayLike
     """Their standard deviation [rad]: one number, or an array that goes with the angles."""
-    wrist: Float[np.ndarray, "7"] | None = None
-    """Place [m] and orientation, for all frames."""
-    wrist_spread: tuple[float, float] = (np.inf, np.inf)
-    """Their standard deviations [m, rad]."""
 
 
 class PoseSolver:
@@ -122,16 +116,12 @@ class PoseSolver:
                 f"targets have shape {targets.shape}, wanted (T, {self._shapes.markers.shape[1]}, 3)"
             )
         starts = np.empty((0, NUM_QPOS))
-        wrist = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-        if prediction is not None and prediction.wrist is not None:
-            wrist[:7] = check_array("prediction.wrist", prediction.wrist, (7,))
-            wrist[7:] = np.array(prediction.wrist_spread) ** -2.0
         if initial is not None:
             starts = np.array(check_array("initial", initial, (None, NUM_QPOS)), order="C")
             if starts.shape != (len(targets), NUM_QPOS):
                 raise ShapeError(f"initial has shape {starts.shape}, wanted ({len(targets)}, {NUM_QPOS})")
         angles, trust = _rows(prediction, len(targets))
-        wrong, fit = self._run(targets, starts, angles, trust, wrist, iterations)
+        wrong, fit = self._run(targets, starts, angles, trust, _NO_WRIST, iterations)
         if wrong >= 0:
             there = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
             if there < FEWEST_MARKERS:
@@ -157,8 +147,9 @@ class PoseSolver:
             start: A pose near theirs.
             angles: See `Prediction`.
             spread: See `Prediction`.
-            wrist: See `Prediction`.
-            wrist_spread: See `Prediction`.
+            wrist: Where the wrist is thought to be, place [m] and orientation; that counts where the palm
+                lacks a marker or never had three.
+            wrist_spread: Standard deviations of its place [m] and orientation [rad].
         """
         trust = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
         return self._run(target[None], start[None], angles[None], spread[None] ** -2.0, trust, _MOST_STEPS)[1]

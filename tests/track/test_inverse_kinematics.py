@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from gloves.attach import attach
 from gloves.layout import load_layout
@@ -13,7 +14,7 @@ from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.shape import sample_shape
 from handsim.topology import SIDES
-from handsim.transforms import multiply_quaternions, quaternion_matrix, random_quaternions
+from handsim.transforms import quaternion_matrix, random_quaternions
 from poses.motions import sample_motion
 from poses.validity import resting_angles, sample_valid_angles
 from track.inverse_kinematics import PoseSolver, Prediction, solve_poses
@@ -38,6 +39,12 @@ def random_poses(model, count, rng):
         position=rng.normal(size=(count, 3)),
         quaternion=random_quaternions(count, rng=rng),
     )
+
+
+def multiply_quaternions(first, second):
+    """Rotations `second`, then `first`."""
+    product = Rotation.from_quat(first, scalar_first=True) * Rotation.from_quat(second, scalar_first=True)
+    return product.as_quat(scalar_first=True)
 
 
 def markers_of(model, glove, qpos):
