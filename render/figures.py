@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,7 +14,15 @@ from handsim.topology import BONES, NUM_BONES
 from render.forearm import Forearm, sample_forearm
 from render.frames import PARTS_A_HAND
 from render.glove_look import GloveLook, glove_texture, sample_glove_look
-from render.materials import MARKER_COLOR, ball_material, linear, plain_material, shade_colors, skin_material
+from render.materials import (
+    MARKER_COLOR,
+    Material,
+    ball_material,
+    linear,
+    plain_material,
+    shade_colors,
+    skin_material,
+)
 from render.rasteriser import Triangles
 from render.shown_take import ShownBody, ShownHand
 from render.skin_look import SkinLook, sample_skin_look
@@ -48,8 +56,8 @@ class Drawn:
     colors: Float32[np.ndarray, "V 4"]
     """Factors on the material's colour, linear."""
     uv: Float32[np.ndarray, "V 2"] | None
-    material: Callable[[], Any]
-    """Gives pyrender's, the same every time; whoever wants no colours needs none."""
+    material: Callable[[], Material]
+    """The same every time; whoever wants no colours needs none."""
 
 
 def sample_people(
@@ -115,7 +123,7 @@ class HandFigure:
         markers: NDArray[np.float64] = self.hand.attachment.markers(self.hand.model, transforms)[0][0]
         return markers
 
-    def _painted(self) -> Any:
+    def _painted(self) -> Material:
         look, side = self.look, self.hand.model.shape.side
         texture = skin_texture(look.skin, look.forearm, side=side)
         if look.glove is not None:
@@ -168,7 +176,7 @@ def _drawn_balls(
     parts: UInt8[np.ndarray, "F"],
     instances: UInt8[np.ndarray, "F"],
     markers: UInt8[np.ndarray, "F"],
-    material: Callable[[], Any],
+    material: Callable[[], Material],
 ) -> Drawn:
     triangles = Triangles(balls.vertices, balls.faces, balls.normals, parts, instances, markers)
     colors = np.ones((len(balls.vertices), 4), dtype=np.float32)

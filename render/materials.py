@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from handsim.topology import BONES, DIGITS
 from render._gl import load_pyrender
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Float32
+    from jaxtyping import Float, Float32, UInt8
     from numpy.typing import NDArray
 
     from render.skin_texture import SkinTexture
@@ -38,6 +39,50 @@ _BASE: Final = {"skin": (0.86, 0.66, 0.56), "glove": GLOVE_COLOR}
 _ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Material:
+    """How a surface sends back light: the microfacet model of glTF 2.0, without metals."""
+
+    color: Float[np.ndarray, "3"]
+    """Linear light."""
+    roughness: float
+    """0 a mirror, 1 chalk."""
+    glow: float = 0.0
+    """Share of its colour that it sends out by itself."""
+    texels: UInt8[np.ndarray, "H W 8"] | None = None
+    """Factors on the above, the top row first: sRGB, roughness (255 for 1), normals over the surface's own
+    (0 for -1, 255 for 1) in the axes along u and normal x that, and nothing."""
+
+    def for_pyrender(self) -> Any:
+        """The same for pyrender.
+
+        Raises:
+            HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+        """
+        pyrender, textures = load_pyrender(), {}
+        if self.texels is not None:
+            # No smaller copies of the texture: they would mix tiles that are no neighbours on the hand.
+            sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
+            rough = np.zeros((*self.texels.shape[:2], 3), dtype=np.uint8)
+            rough[..., 0] = self.texels[..., 3]  # its shader looks for roughness in red and metal in green
+            sources = {
+                "baseColorTexture": np.ascontiguousarray(self.texels[..., :3]),
+                "normalTexture": np.ascontiguousarray(self.texels[..., 4:7]),
+                "metallicRoughnessTexture": rough,
+            }
+            textures = {
+                name: pyrender.Texture(source=source, source_channels="RGB", sampler=sampler)
+                for name, source in sources.items()
+            }
+        return pyrender.MetallicRoughnessMaterial(
+            baseColorFactor=[*self.color, 1.0],
+            metallicFactor=0.0,
+            roughnessFactor=self.roughness,
+            emissiveFactor=np.sqrt(self.glow * self.color),  # its shader squares it
+            **textures,
+        )
+
+
 def bone_colors() -> Float[np.ndarray, "L 3"]:
     """One colour a digit, and one for the palm, in the order of `topology.BONES`."""
     colors = [_PALM_COLOR if bone.digit < 0 else _DIGIT_COLORS[bone.digit] for bone in BONES]
@@ -50,39 +95,26 @@ def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) ->
     return light
 
 
-def covering_material(covering: Covering) -> Any:
-    """Material of bare skin or of a dark glove."""
-    return _material(_BASE[covering], _ROUGHNESS[covering])
+def covering_material(covering: Covering) -> Material:
+    """Bare skin or a dark glove, of one colour."""
+    return Material(linear(_BASE[covering]), _ROUGHNESS[covering])
 
 
-def plain_material(color: tuple[float, float, float]) -> Any:
-    """Material of a thing of one colour, such as plastic."""
-    return _material(color, 0.5)
+def plain_material(color: tuple[float, float, float]) -> Material:
+    """A thing of one colour, such as plastic."""
+    return Material(linear(color), 0.5)
 
 
-def ball_material() -> Any:
-    """Material of markers, coloured by vertex; it glows a little, so that no shadow swallows it."""
-    return _material((1.0, 1.0, 1.0), 0.45, glow=0.2)
+def ball_material() -> Material:
+    """Markers, coloured by vertex; they glow a little, so that no shadow swallows them."""
+    return Material(np.ones(3), 0.45, glow=0.2)
 
 
-def skin_material(texture: SkinTexture) -> Any:
-    """Material of painted skin, for meshes with `DrawnSkin.uv`."""
-    pyrender = load_pyrender()
-    # No smaller copies of the texture: they would mix tiles that are no neighbours on the hand.
-    sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
-    rough = np.zeros((*texture.roughness.shape, 3), dtype=np.uint8)
-    rough[..., 0] = texture.roughness  # the shader looks for roughness in red and for metal in green
-    color, normals, roughness = (
-        pyrender.Texture(source=source, source_channels="RGB", sampler=sampler)
-        for source in (texture.color, texture.normals, rough)
-    )
-    return pyrender.MetallicRoughnessMaterial(
-        baseColorTexture=color,
-        normalTexture=normals,
-        metallicRoughnessTexture=roughness,
-        metallicFactor=0.0,
-        roughnessFactor=1.0,
-    )
+def skin_material(texture: SkinTexture) -> Material:
+    """Painted skin, for meshes with `DrawnSkin.uv`."""
+    nothing = np.zeros_like(texture.roughness)
+    texels = np.dstack([texture.color, texture.roughness, texture.normals, nothing])
+    return Material(np.ones(3), 1.0, texels=texels)
 
 
 def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
@@ -106,13 +138,3 @@ def skin_tint(model: HandModel) -> Float[np.ndarray, "V 3"]:
     paleness, redness = np.array([0.10, 0.06, 0.06]), np.array([0.0, -0.16, -0.13])
     tint: NDArray[np.float64] = 1.0 + pale * paleness + reddening[:, None] * redness
     return tint
-
-
-def _material(color: tuple[float, float, float], roughness: float, *, glow: float = 0.0) -> Any:
-    base = linear(color)
-    return load_pyrender().MetallicRoughnessMaterial(
-        baseColorFactor=[*base, 1.0],
-        metallicFactor=0.0,
-        roughnessFactor=roughness,
-        emissiveFactor=np.sqrt(glow * base),  # the shader squares it
-    )

@@ -18,7 +18,7 @@ from render.camera import Camera
 from render.frames import Pictures
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int, UInt8
+    from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 NEAR: Final = 0.01
 """Triangles that come nearer to the camera's plane are not drawn [m]."""
@@ -65,9 +65,9 @@ def rasterise(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
         raise ShapeError(f"camera '{camera.name}' has a lens '{camera.lens.kind}', wanted a pinhole")
     width, height = camera.size
     local = camera.local(surface.vertices)
-    inverse, first = np.zeros((height, width), dtype=np.float32), np.full((height, width), -1, dtype=np.int32)
     faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
-    corners = _draw(local, faces, camera.K, inverse, first)
+    corners = project(local, camera.K)
+    inverse, first = nearest_faces(corners, faces, camera.size, farthest=0.0)
     depth = np.zeros((height, width), dtype=np.float32)
     normals = np.zeros((height, width, 3), dtype=np.float32) if with_normals else None
     parts, instances, markers = (np.zeros((height, width), dtype=np.uint8) for _ in range(3))
@@ -79,29 +79,51 @@ def rasterise(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     return Pictures(depth=depth, normals=normals, parts=parts, instances=instances, markers=markers)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _draw(local: Any, faces: Any, K: Any, inverse: Any, first: Any) -> Any:
-    """Nearest face of every pixel and its inverse depth, which is linear over a triangle's picture.
+def nearest_faces(
+    corners: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    size: tuple[int, int],
+    *,
+    farthest: float,
+) -> tuple[Float32[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
+    """Nearness behind the centre of every pixel, and the number of the face there, -1 for none.
 
-    Returns:
-        Pixels and inverse depth (V, 3) of all vertices.
+    Args:
+        corners: Pixels and nearness of the vertices; the nearness must be linear over a triangle's picture,
+            as is one over the depth, or the depth itself where rays are parallel. NaN hides a vertex's faces.
+        faces: Triangles.
+        size: Width and height of the picture [px].
+        farthest: Nearness of nothing.
     """
-    height, width = inverse.shape
-    corners = np.empty_like(local)
+    nearness = np.full(size[::-1], farthest, dtype=np.float32)
+    first = np.full(size[::-1], -1, dtype=np.int32)
+    _draw(corners, faces, nearness, first)
+    return nearness, first
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def project(local: Any, K: Any) -> Any:
+    """Pixels and one over the depth (V, 3) of points (V, 3) in a pinhole camera's axes; NaN before `NEAR`."""
+    corners = np.full_like(local, np.nan)
     for vertex in range(len(local)):
         depth = local[vertex, 2]
-        corners[vertex, 0] = K[0, 0] * local[vertex, 0] / depth + K[0, 2]
-        corners[vertex, 1] = K[1, 1] * local[vertex, 1] / depth + K[1, 2]
-        corners[vertex, 2] = 1.0 / depth
+        if depth >= NEAR:
+            corners[vertex, 0] = K[0, 0] * local[vertex, 0] / depth + K[0, 2]
+            corners[vertex, 1] = K[1, 1] * local[vertex, 1] / depth + K[1, 2]
+            corners[vertex, 2] = 1.0 / depth
+    return corners
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
+    height, width = nearness.shape
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-        if min(local[a, 2], local[b, 2], local[c, 2]) < NEAR:
-            continue
         ax, ay, az = corners[a, 0], corners[a, 1], corners[a, 2]
         bx, by, bz = corners[b, 0] - ax, corners[b, 1] - ay, corners[b, 2] - az
         cx, cy, cz = corners[c, 0] - ax, corners[c, 1] - ay, corners[c, 2] - az
         area = bx * cy - by * cx
-        if area == 0.0:
+        if not abs(area) > 0.0:
             continue
         low_x, high_x = min(0.0, bx, cx) + ax, max(0.0, bx, cx) + ax
         low_y, high_y = min(0.0, by, cy) + ay, max(0.0, by, cy) + ay
@@ -118,12 +140,11 @@ def _draw(local: Any, faces: Any, K: Any, inverse: Any, first: Any) -> Any:
             for column in range(left, right + 1):
                 if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
                     near = az + v * bz + w * cz
-                    if near > inverse[row, column]:
-                        inverse[row, column] = near
+                    if near > nearness[row, column]:
+                        nearness[row, column] = near
                         first[row, column] = face
                 v += step_v
                 w += step_w
-    return corners
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -15,6 +15,7 @@ from render.backgrounds import KINDS, BackgroundConfig, BackgroundKind
 from render.blur import ShutterConfig
 from render.depth_noise import SENSORS, DepthNoiseConfig
 from render.exposure import ExposureConfig
+from render.painter import Painter
 from render.session import SHEET, RenderConfig, render_take
 from render.skin_look import ALL_TONES, TONES
 from render.viewpoints import Placement, ViewConfig
@@ -40,6 +41,7 @@ def render(
     depth_sensor: tuple[str, ...] = ("kinect2",),
     color_sensor: bool = True,
     motion_blur: bool = False,
+    painter: Painter = "compiled",
     every: int = 1,
     frames_per_shard: int = 64,
     seed: int = 0,
@@ -67,6 +69,7 @@ def render(
         depth_sensor: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only.
         color_sensor: Whether there are noisy colours beside the perfect ones.
         motion_blur: Whether there are shutters, some of them rolling; takes eight drawings a picture.
+        painter: Who paints colours: our own code, or opengl, which is quicker where there is a graphics card.
         every: Draw each so many frames one.
         frames_per_shard: Frames that are finished together.
         seed: Of all that is random.
@@ -82,6 +85,7 @@ def render(
         depth_sensor=_sensors(depth_sensor),
         color_sensor=ExposureConfig() if color_sensor else None,
         shutter=ShutterConfig() if motion_blur else None,
+        painter=painter,
         every=every,
         frames_per_shard=frames_per_shard,
         seed=seed,

@@ -19,6 +19,7 @@ from render.materials import (
     BACKGROUND,
     MARKER_COLOR,
     Covering,
+    Material,
     ball_material,
     covering_material,
     linear,
@@ -206,13 +207,13 @@ def _mesh(
     normals: NDArray[np.float64],
     faces: NDArray[np.int64],
     colors: NDArray[np.float64],
-    material: Any,
+    material: Material,
 ) -> Any:
     primitive = pyrender.Primitive(
         positions=vertices,
         normals=normals,
         indices=faces,
         color_0=colors,
-        material=material,
+        material=material.for_pyrender(),
     )
     return pyrender.Mesh(primitives=[primitive])

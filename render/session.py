@@ -25,6 +25,7 @@ from render.figures import sample_people
 from render.frames import RenderedFrame
 from render.labels import write_png
 from render.lights import sample_lighting
+from render.painter import Painter
 from render.shown_take import ShownTake, load_shown_take
 from render.skin_look import ALL_TONES
 from render.studio import PASSES, FrameChoices, Studio
@@ -62,6 +63,8 @@ class RenderConfig:
     """None: depth is perfect only."""
     color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
     """None: colours are perfect only."""
+    painter: Painter = "compiled"
+    """Who paints colours: opengl is worth it where there is a graphics card."""
     shutter: ShutterConfig | None = None
     """None: pictures of moments; else motion blur and rolling shutters, which take a drawing a sub-frame."""
     every: int = 1
@@ -176,7 +179,7 @@ def draw_shard(
     rng = np.random.default_rng(seeds[0])
     people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in take.bodies]
-    studio = Studio(take, people, colors, config.passes)
+    studio = Studio(take, people, colors, config.passes, painter=config.painter)
     kept = _choices(config, rng)
     for frame, seed in zip(frames, seeds[1:], strict=True):
         own = np.random.default_rng(seed)

@@ -44,9 +44,10 @@ def _palm_distances() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return near, distances
 
 
-def line_depth(back: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+def line_depth(rng: np.random.Generator) -> NDArray[np.float64]:
     """How deep in a line of the palm, a crease of a finger or a wrinkle of a knuckle each texel lies."""
     texels = skin_texels()
+    back = texels.back
     depth = np.zeros(len(back))
     near, distances = _palm_distances()
     on_palm = (1.0 - back[near]) * (

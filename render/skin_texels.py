@@ -12,6 +12,7 @@ import numpy as np
 
 from handsim.model import HandModel
 from handsim.topology import DIGITS, NUM_BONES
+from render._fields import smooth
 from render.forearm import Forearm
 from render.skin_atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin_mesh import SkinMesh, mesh_normals
@@ -49,6 +50,8 @@ class Texels(NamedTuple):
     """Outward unit normals (N, 3)."""
     dorsal: NDArray[np.float64]
     """From -1 in the middle of the palm or of a finger's pad to 1 on the back (N,)."""
+    back: NDArray[np.float64]
+    """1 on the back of the hand, 0 on the palm, smooth between (N,)."""
     palm: NDArray[np.float64]
     """Share of the skin that moves with the palm and no digit (N,)."""
     digits: tuple[DigitTexels, ...]
@@ -73,7 +76,7 @@ def skin_texels() -> Texels:
     places, normals, dorsal, weights = grid[:, :3], grid[:, 3:6], grid[:, 6], grid[:, 7:]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     digits = tuple(_digit_texels(model, digit, places, weights) for digit in range(len(DIGITS)))
-    return Texels(places, normals, dorsal, weights[:, 0], digits)
+    return Texels(places, normals, dorsal, smooth(dorsal, -0.25, 0.35), weights[:, 0], digits)
 
 
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -51,33 +52,39 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side =
         forearm: Its sleeve is painted too.
         side: Of the hand; colours are the same on both.
     """
+    color, roughness, height = _painted(look, forearm)
+    return SkinTexture(color, roughness, normal_map(height, side))
+
+
+@functools.lru_cache(maxsize=2)  # both hands of a person have the same
+def _painted(
+    look: SkinLook, forearm: Forearm | None
+) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], NDArray[np.float64]]:
+    """Colour, roughness and height of the relief."""
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
-    back = smooth(texels.dorsal, -0.25, 0.35)
+    back = texels.back
     lab = np.empty((len(back), 3))
     lab[:, 0] = look.palm_lightness + back * (look.lightness - look.palm_lightness)
     # The palm of a dark hand is no redder or yellower than other palms: chroma goes with the pigment.
     lab[:, 1] = 13.0 + back * (look.redness - 13.0)
     lab[:, 2] = 16.0 + back * (look.yellowness - 16.0)
-    _flush(lab, back, look)
-    veins = _veins(back, rng)
+    _flush(lab, look)
+    veins = _veins(rng)
     lab += look.veins * veins[:, None] * [-1.6, -1.6, -2.2]
     blotches = noise(texels.places, (0.05, 0.018, 0.007, 0.003), rng=rng)
     lab += look.blotches * blotches[:, None] * [1.0, -0.6, 0.2]
-    lines = np.clip(line_depth(back, rng), 0.0, 1.0)
+    lines = np.clip(line_depth(rng), 0.0, 1.0)
     # Pigment gathers in the lines; how dark they are goes with the contrast that the skin has room for.
     lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
-    height = look.relief * relief(back) - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
+    height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
     height += look.relief * 2e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
     paint = _Paint(lab, np.full(len(back), look.roughness), height)
     _nails(paint, look)
     if forearm is not None and forearm.sleeve < forearm.length:
         _sleeve(paint, forearm, rng)
     width, rows = skin_atlas().size
-    return SkinTexture(
-        lab_to_srgb(paint.lab.reshape(rows, width, 3)),
-        np.rint(255.0 * paint.roughness).astype(np.uint8).reshape(rows, width),
-        normal_map(paint.height, side),
-    )
+    rough = np.rint(255.0 * paint.roughness).astype(np.uint8).reshape(rows, width)
+    return lab_to_srgb(paint.lab.reshape(rows, width, 3)), rough, paint.height
 
 
 def lab_to_srgb(lab: NDArray[np.float64]) -> UInt8[np.ndarray, "H W 3"]:
@@ -87,9 +94,10 @@ def lab_to_srgb(lab: NDArray[np.float64]) -> UInt8[np.ndarray, "H W 3"]:
     return color
 
 
-def _flush(lab: NDArray[np.float64], back: NDArray[np.float64], look: SkinLook) -> None:
+def _flush(lab: NDArray[np.float64], look: SkinLook) -> None:
     """Blood in the finger tips, knuckles and balls of the hand; knuckles are darker, too."""
     texels = skin_texels()
+    back = texels.back
     for number, digit in enumerate(texels.digits):
         first, middle, end = np.cumsum(digit.lengths)
         mine = digit.texels
@@ -110,9 +118,10 @@ def _flush(lab: NDArray[np.float64], back: NDArray[np.float64], look: SkinLook) 
     lab += look.flush * balls[:, None] * [-0.5, 2.2, 0.0]
 
 
-def _veins(back: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+def _veins(rng: np.random.Generator) -> NDArray[np.float64]:
     """How much of a vein shows at each texel: three of them wind along the back of hand and forearm."""
     texels = skin_texels()
+    back = texels.back
     x, y = texels.places[:, 0], texels.places[:, 1]
     near = np.flatnonzero((back > 0.5) & (x > -0.16) & (x < 0.085))
     x, y = x[near], y[near]

@@ -19,7 +19,7 @@ from render.exposure import Exposure, expose, linear_of
 from render.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.frames import BodyTruth, Pictures, RenderedFrame
 from render.lights import Lighting
-from render.painter import paint, put_before
+from render.painter import Painter, paint, put_before
 from render.rasteriser import NEAR, join, rasterise
 from render.shown_take import ShownTake
 from render.truth import hand_truth
@@ -57,6 +57,7 @@ class Studio:
         people: How each of its hands looks.
         body_colors: Of each of its things, sRGB in [0, 1].
         passes: Some of `PASSES`.
+        painter: Who paints colours.
     """
 
     def __init__(
@@ -65,8 +66,9 @@ class Studio:
         people: Sequence[Appearance],
         body_colors: Sequence[tuple[float, float, float]],
         passes: Sequence[str] = PASSES,
+        painter: Painter = "compiled",
     ) -> None:
-        self.take, self.passes = take, tuple(passes)
+        self.take, self.passes, self.painter = take, tuple(passes), painter
         self._people = tuple(people)
         first = np.cumsum([0, *(len(hand.attachment.points) for hand in take.hands)])
         self._hands = [
@@ -180,7 +182,7 @@ class Studio:
         self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
     ) -> UInt8[np.ndarray, "H W 3"]:
         """The perfect colour picture."""
-        painted = [paint(face, drawn, choices.lighting) for face in faces_for(camera)]
+        painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
         whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
         return put_before(whole, _background(choices.background, camera.size))
 

@@ -19,6 +19,7 @@ from gloves.captures.markers import labelled_capture
 from gloves.take import SUFFIX
 from gloves.tracked_take import TrackedTake, save_tracked_take
 from handsim.errors import CaptureError, HandSimError
+from handsim.interrupts import interrupt_told
 from handsim.progress import progress_bar
 from handsim.topology import Side
 from track.body_file import load_bodies
@@ -156,19 +157,20 @@ def _track_live(url: str, seconds: float | None, watch: Stopwatch) -> tuple[Trac
     """What a stream brings until it ends, time is up or somebody interrupts."""
     recorder = TakeRecorder(watch)
     console = Console(stderr=True)
-    with closing(open_stream(url)) as stream, console.status("waiting for the first frame") as status:
+    with (
+        closing(open_stream(url)) as stream,
+        console.status("waiting for the first frame") as status,
+        interrupt_told() as interrupted,  # what came so far is not lost
+    ):
         began, shown = perf_counter(), 0.0
-        try:
-            for frame, tracked in follow(stream, watch):
-                recorder.add(frame, tracked)
-                elapsed = perf_counter() - began if frame.silent else recorder.duration
-                if seconds is not None and elapsed >= seconds:
-                    break
-                if frame.silent or perf_counter() > shown + _REFRESH:
-                    shown = perf_counter()
-                    status.update(_word(frame, tracked))
-        except KeyboardInterrupt:  # what came so far is not lost
-            pass
+        for frame, tracked in follow(stream, watch):
+            recorder.add(frame, tracked)
+            elapsed = perf_counter() - began if frame.silent else recorder.duration
+            if interrupted() or (seconds is not None and elapsed >= seconds):
+                break
+            if frame.silent or perf_counter() > shown + _REFRESH:
+                shown = perf_counter()
+                status.update(_word(frame, tracked))
     if recorder.num_frames < 2:
         raise CaptureError(f"{url}: {recorder.num_frames} frames came, wanted two or more")
     notes = []

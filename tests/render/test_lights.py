@@ -54,7 +54,7 @@ def draw(lighting: Lighting) -> np.ndarray:
         indices=skin.faces,
         texcoord_0=skin.uv,
         color_0=shade_colors(skin.shade),
-        material=skin_material(skin_texture(SkinLook())),
+        material=skin_material(skin_texture(SkinLook())).for_pyrender(),
     )
     scene.add(pyrender.Mesh([primitive]))
     camera = pyrender.PerspectiveCamera(view.field_of_view, znear=0.05, zfar=10.0)

@@ -30,7 +30,7 @@ def test_no_relief_is_the_skins_own_normals() -> None:
 def test_relief_stays_under_a_millimetre_and_off_the_palm() -> None:
     texels = skin_texels()
     back = np.clip(texels.dorsal, 0.0, 1.0)
-    height = relief(back)
+    height = relief()
     assert 3e-4 < height.max() < 1e-3
     assert -1e-3 < height.min()
     assert np.abs(height[texels.dorsal < -0.5]).max() < 1e-9
@@ -66,7 +66,7 @@ def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> No
             normals=skin.normals,
             indices=skin.faces,
             texcoord_0=skin.uv,
-            material=skin_material(paint),
+            material=skin_material(paint).for_pyrender(),
         )
         scene.add(pyrender.Mesh([primitive]))
         camera = pyrender.PerspectiveCamera(view.field_of_view, znear=0.05, zfar=10.0)

@@ -186,11 +186,11 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys):
 
 
 def test_an_interrupt_writes_what_there_is(capture, tmp_path):
-    out = tmp_path / "live.npz"
+    out, before = tmp_path / "live.npz", signal.getsignal(signal.SIGINT)
     with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
 
         def interrupt() -> None:
-            while not server._clients:
+            while not server._clients or signal.getsignal(signal.SIGINT) is before:
                 time.sleep(0.01)
             time.sleep(0.3)
             os.kill(os.getpid(), signal.SIGINT)
