@@ -31,6 +31,7 @@ class Triangles:
     vertices: Float[np.ndarray, "V 3"]
     """In the world [m]."""
     faces: Int[np.ndarray, "F 3"]
+    """Counter-clockwise from outside."""
     normals: Float[np.ndarray, "V 3"]
     """Unit normals in the world."""
     parts: UInt8[np.ndarray, "F"]
@@ -55,7 +56,7 @@ def rasterise(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
 
     Args:
         camera: The camera; whoever wants another lens draws pinhole pictures first (`render.warp`).
-        surface: What there is to see. Both sides of a triangle are seen.
+        surface: What there is to see, closed; the backs of its faces are not drawn.
         with_normals: Whether they are wanted.
 
     Raises:
@@ -91,7 +92,7 @@ def nearest_faces(
     Args:
         corners: Pixels and nearness of the vertices; the nearness must be linear over a triangle's picture,
             as is one over the depth, or the depth itself where rays are parallel. NaN hides a vertex's faces.
-        faces: Triangles.
+        faces: Triangles that run counter-clockwise in the picture, where y is down, are drawn.
         size: Width and height of the picture [px].
         farthest: Nearness of nothing.
     """
@@ -123,8 +124,8 @@ def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
         bx, by, bz = corners[b, 0] - ax, corners[b, 1] - ay, corners[b, 2] - az
         cx, cy, cz = corners[c, 0] - ax, corners[c, 1] - ay, corners[c, 2] - az
         area = bx * cy - by * cx
-        if not abs(area) > 0.0:
-            continue
+        if not area < 0.0:
+            continue  # the back of a face, or none
         low_x, high_x = min(0.0, bx, cx) + ax, max(0.0, bx, cx) + ax
         low_y, high_y = min(0.0, by, cy) + ay, max(0.0, by, cy) + ay
         if high_x < 0.0 or high_y < 0.0 or low_x > width or low_y > height:

@@ -23,9 +23,10 @@ TO_DISPLAY: Final = np.linspace(0.0, 1.0, _LEVELS) ** (2.0 / GAMMA)
 """Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
 
 SPOT: Final = 21
-"""How many numbers a spot on a surface takes on its way to the eye: pixel and nearness (3), place (3) and unit
-normal (3) in the camera's axes, tint (3), place in the texture (2), linear colour (3), roughness, and the
-texture's normal (3)."""
+"""How many numbers a spot of a surface takes on its way to the eye.
+
+Pixel and nearness (3), place (3) and unit normal (3) in the camera's axes, tint (3), place in the texture
+(2), linear colour (3), roughness, the texture's normal (3)."""
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -41,7 +41,7 @@ def shadow_map(
     """
     aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
-    rotation = np.stack([aside, np.cross(towards, aside), towards])
+    rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
     turned = points @ rotation.T
     low, high = turned[:, :2].min(axis=0), turned[:, :2].max(axis=0)
     scale = (_TEXELS - 2.0 * _MARGIN) / max(float((high - low).max()), 1e-6)
