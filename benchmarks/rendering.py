@@ -20,7 +20,7 @@ import functools
 import os
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
@@ -29,23 +29,25 @@ import numpy as np
 import trimesh
 from machine import describe
 
-from gloves.take import save_take
 from handsim.processes import in_processes
 from render._gl import load_pyrender, offscreen_renderer
 from render.figures import sample_people
+from render.frames import RenderedFrame
 from render.rasteriser import join, rasterise
 from render.scene import OPENGL_FROM_OPENCV
-from render.session import RenderConfig, draw_shard, render_take
+from render.session import RenderConfig, draw_shard
 from render.shown_take import ShownTake, show_simulated
 from render.skin_look import ALL_TONES
 from render.studio import Studio
 from render.viewpoints import ViewConfig, Viewpoints
+from render.writer import open_writer
 from train.twins import TwinConfig, simulate_twin
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
 PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None)
-PASSES: Final = {"depth": ("depth",), "colours, depth, ids, keypoints": ("rgb", "depth", "ids")}
+COLORS: Final = ("rgb", "depth", "ids")
+PASSES: Final = {"depth": ("depth",), "colours, depth, ids, keypoints": COLORS}
 
 
 @functools.lru_cache(maxsize=1)
@@ -53,13 +55,22 @@ def a_take(frames: int) -> ShownTake:
     return show_simulated(simulate_twin(TwinConfig(kind="hand-hand", num_frames=frames)))
 
 
-def draw(passes: tuple[str, ...], frames: int, shard: int) -> int:
+def pictures(passes: tuple[str, ...], frames: int, shard: int) -> Iterator[RenderedFrame]:
     """One worker's share."""
     take = a_take(frames)
     config = dataclasses.replace(PLAIN, passes=passes)
     viewpoints = Viewpoints(config.view, take, rng=np.random.default_rng(0))
-    for _ in draw_shard(take, viewpoints, config, shard, range(frames)):
+    return draw_shard(take, viewpoints, config, shard, range(frames))
+
+
+def draw(passes: tuple[str, ...], frames: int, shard: int) -> int:
+    for _ in pictures(passes, frames, shard):
         pass
+    return shard
+
+
+def draw_and_write(folder: Path, frames: int, shard: int) -> int:
+    open_writer("webdataset", folder).write(shard, pictures(COLORS, frames, shard))
     return shard
 
 
@@ -122,22 +133,17 @@ def mujoco_loop(take: ShownTake, color: bool) -> None:
 def speed(frames: int) -> None:
     take, cores = a_take(frames), os.cpu_count() or 1
     print(f"\nimages a second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
-    for name, passes in PASSES.items():
-        job = functools.partial(draw, passes, frames)
-        alone = rate(lambda job=job: job(0), frames)
-        together = rate_in_processes(job, cores, frames)
-        print(f"  {name:32s} {alone:8.1f} {together:8.1f}")
+    with tempfile.TemporaryDirectory() as folder:
+        jobs = {name: functools.partial(draw, passes, frames) for name, passes in PASSES.items()}
+        jobs["the same, written as WebDataset"] = functools.partial(draw_and_write, Path(folder), frames)
+        for name, job in jobs.items():
+            alone = rate(lambda job=job: job(0), frames)
+            print(f"  {name:32s} {alone:8.1f} {rate_in_processes(job, cores, frames):8.1f}")
     for color, name in ((False, "depth"), (True, "colours")):
         print(
             f"  plain pyrender loop, {name:11s} {rate(lambda c=color: plain_pyrender(take, c), frames):8.1f}"
         )
         print(f"  MuJoCo's renderer, {name:13s} {rate(lambda c=color: mujoco_loop(take, c), frames):8.1f}")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "take.truth.npz"
-        save_take(path, simulate_twin(TwinConfig(kind="hand-hand", num_frames=frames)))
-        start = time.perf_counter()
-        render_take(path, Path(folder) / "out", ["webdataset"], PLAIN)
-        print(f"  all passes, written as WebDataset {'':7s}{frames / (time.perf_counter() - start):8.1f}")
 
 
 def accuracy(frames: int) -> None:
@@ -180,7 +186,7 @@ def memory(images: int) -> None:
     print(f"\nresident memory over {images} pictures (colours, depth, ids)")
     page = os.sysconf("SC_PAGE_SIZE")
     for shard in range(images // frames):
-        draw(PASSES["colours, depth, ids, keypoints"], frames, shard)
+        draw(COLORS, frames, shard)
         if shard % max(1, images // frames // 8) == 0:
             pages = int(Path("/proc/self/statm").read_text().split()[1])
             print(f"  {(shard + 1) * frames:6d}: {pages * page / 2**20:.1f} MB", flush=True)

@@ -34,14 +34,13 @@ _JPEG_QUALITY: Final = 95
 
 def encode_png(picture: UInt8[np.ndarray, "H W 3"]) -> bytes:
     """An sRGB picture as PNG."""
-    return _encode(".png", picture[..., ::-1])
+    return _encode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
 
 
 def encode_jpeg(picture: UInt8[np.ndarray, "H W *C"], *, quality: int = _JPEG_QUALITY) -> bytes:
     """An sRGB or grey picture as JPEG."""
-    return _encode(
-        ".jpg", picture[..., ::-1] if picture.ndim == 3 else picture, [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )
+    ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
+    return _encode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 
 def encode_depth(depth: Float32[np.ndarray, "H W"], *, metres_per_unit: float = METRES_PER_UNIT) -> bytes:

@@ -118,7 +118,16 @@ def rounded(values: NDArray[np.floating], decimals: int) -> Any:
 
 def to_json(content: Any) -> str:
     """JSON of plain values and arrays; null for NaN, which strict readers refuse."""
-    return json.dumps(_plain(content), allow_nan=False, separators=(",", ":"))
+    try:
+        return json.dumps(content, default=_listed, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError):  # something the quick way has no word for
+        return json.dumps(_plain(content), allow_nan=False, separators=(",", ":"))
+
+
+def _listed(content: Any) -> Any:
+    if isinstance(content, np.ndarray | np.generic):
+        return content.tolist()
+    raise TypeError
 
 
 def _plain(content: Any) -> Any:
