@@ -15,6 +15,7 @@ from render.shadow_map import lit_share
 
 GAMMA: Final = 2.2
 _FACING: Final = 0.04  # what a surface that is no metal mirrors when one looks straight at it
+_LIFT: Final = 1.7  # slanting surfaces are read this much above themselves, lest they shade themselves [bias]
 _LEVELS: Final = 2048
 _BYTES = np.arange(256) / 255.0
 TO_LINEAR: Final = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
@@ -112,7 +113,10 @@ def light_up(
         occlusion = 4.0 * (facing * (1.0 - k) + k) * (slope * (1.0 - k) + k)
         mirrored = slope * fresnel * square / (np.pi * peak * peak * occlusion)
         scattered = slope * (1.0 - fresnel) * (1.0 - _FACING) / np.pi
-        lit = lit_share(to_map, nearest, bias, px, py, pz) if lamp == 0 else 1.0
+        lit = 1.0
+        if lamp == 0:
+            lift = _LIFT * bias * np.sqrt(1.0 - min(slope, 1.0) ** 2)
+            lit = lit_share(to_map, nearest, bias, px + lift * nx, py + lift * ny, pz + lift * nz)
         light[0] += (scattered * red + mirrored) * (lit * lamps[lamp, 3] + lamps[lamp, 6])
         light[1] += (scattered * green + mirrored) * (lit * lamps[lamp, 4] + lamps[lamp, 7])
         light[2] += (scattered * blue + mirrored) * (lit * lamps[lamp, 5] + lamps[lamp, 8])
