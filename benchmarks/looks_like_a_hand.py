@@ -2,9 +2,10 @@
 
     python benchmarks/looks_like_a_hand.py OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
 
-Writes two sets of 640 x 480 pictures of one hand each, with COCO keypoints: OUT/clean (plain and graded
-backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand among them). Five kinds of pose
-x palm, back and edge views x six skin tones x both sides; the hand's box takes 20 to 30 % of the frame.
+Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:
+OUT/clean (plain and graded backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand
+among them). Five kinds of pose x palm, back and edge views x six skin tones x both sides; the hand's box takes
+20 to 30 % of the frame. OUT/*/judged.json is the COCO file with the view, pose and tone of each picture.
 
 The judge is a program of the user's own: `judge --images DIR --annotations COCO --report JSON` finds hands in
 the pictures without being told where they are. With --judge it is run, and its figures are printed by view,
@@ -14,28 +15,34 @@ pose, tone and side; without, its command lines are.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
-from one_hand_picture import paint, record
 
+from gloves.attach import attach
+from gloves.layout import load_layout
 from handsim.errors import ShapeError
 from handsim.model import HandModel, join_qpos
 from handsim.shape import sample_shape
 from handsim.topology import SIDES, Side
 from poses.library import gesture
 from poses.validity import make_valid
-from render.backgrounds import BackgroundConfig, draw_background, sample_background
+from render.backgrounds import Background, BackgroundConfig, sample_background
 from render.camera import Camera, preset
-from render.forearm import sample_forearm
-from render.keypoints import KEYPOINT_NAMES, SKELETON, hand_keypoints
+from render.exposure import ExposureConfig, sample_exposure
+from render.figures import sample_people
+from render.frames import RenderedFrame
 from render.lights import sample_lighting
-from render.skin_look import TONES, sample_skin_look
+from render.shown_take import ShownHand, ShownTake
+from render.skin_look import TONES
+from render.studio import FrameChoices, Studio
+from render.writer import open_writer
 
 POSES: Final[dict[str, tuple[str, ...]]] = {
     "open": ("flat", "spread", "stretched", "four", "asl_b", "count_thumb_5"),
@@ -54,7 +61,7 @@ SETS: Final = {
 }
 FILL: Final = (0.2, 0.3)  # the hand's box over the frame
 TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way
-DEPTH_SLACK: Final = 0.02  # keypoints lie in the flesh [m]
+JUDGED: Final = "judged.json"
 GROUPS: Final = ("view", "pose", "tone", "side")
 
 
@@ -120,58 +127,49 @@ def place_camera(model: HandModel, qpos: np.ndarray, view: str, rng: np.random.G
     return camera.at(pose)
 
 
-def annotation(case: Case, depth: np.ndarray) -> dict[str, Any]:
-    points = hand_keypoints(case.model, case.qpos[None])[0]
-    pixels = case.camera.project(points)
-    row, column = np.clip(pixels[:, ::-1].astype(int), 0, np.array(depth.shape) - 1).T
-    seen = case.camera.local(points)[:, 2] <= depth[row, column] + DEPTH_SLACK
-    box = case.camera.project(case.model.skin(case.qpos[None])[0])
-    low, high = box.min(axis=0), box.max(axis=0)
-    return {
-        "keypoints": np.column_stack([pixels, 1 + seen]).round(2).ravel().tolist(),
-        "num_keypoints": len(points),
-        "bbox": [*low.round(2).tolist(), *(high - low).round(2).tolist()],
-        "category_id": 1,
-        "side": case.side,
-    }
+def photograph(
+    number: int, case: Case, background: Background, *, shown: bool, rng: np.random.Generator
+) -> RenderedFrame:
+    """A picture of the hand, or of what is behind it."""
+    qpos = case.qpos[None] if shown else np.full((1, len(case.qpos)), np.nan)
+    hand = ShownHand(case.model, attach(load_layout("dense19"), case.model), qpos)
+    nothing = np.empty((1, 0, 3)), np.empty((1, 0), dtype=np.int64), ()
+    people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
+    studio = Studio(ShownTake(60.0, np.zeros(1), (hand,), (), *nothing), people, [], ("rgb", "ids", "depth"))
+    exposure = sample_exposure(ExposureConfig(), rng=rng)
+    choices = FrameChoices(
+        sample_lighting(rng=rng), background, exposure, None, None, int(rng.integers(2**31))
+    )
+    return dataclasses.replace(studio.photograph(0, case.camera, choices), number=number)
 
 
-def write_set(name: str, hands: int, empty: int, seed: int, out: Path) -> None:
-    """Pictures and coco.json of one set; pictures without a hand come last."""
-    out.mkdir(parents=True, exist_ok=True)
-    images, annotations = [], []
+def frames_of(name: str, hands: int, empty: int, seed: int, cases: list[Case]) -> Iterator[RenderedFrame]:
+    """The pictures of one set, those without a hand last; what they show is added to `cases`."""
     for number in range(hands + empty):
         rng = np.random.default_rng([seed, list(SETS).index(name), number])
         background = sample_background(SETS[name], rng=rng)
-        image: dict[str, Any] = {"id": number, "file_name": f"{number:05d}.png", "width": 640, "height": 480}
-        if number < hands:
-            case = make_case(number, rng)
-            look, forearm = sample_skin_look(TONES[case.tone], rng=rng), sample_forearm(rng=rng)
-            lighting = sample_lighting(rng=rng)
-            picture, depth = paint(case.model, case.qpos, case.camera, look, forearm, lighting, background)
-            image |= {"pose": case.pose, "view": case.view, "tone": case.tone, "gesture": case.gesture}
-            image["choices"] = record(look, forearm, lighting, background)
-            annotations.append({"id": len(annotations), "image_id": number, **annotation(case, depth)})
-        else:
-            picture = (255.0 * draw_background(background, (640, 480)) ** (1 / 2.2)).astype(np.uint8)
-        images.append(image)
-        cv2.imwrite(str(out / image["file_name"]), picture[..., ::-1])
+        cases.append(make_case(number, rng))
+        yield photograph(number, cases[-1], background, shown=number < hands, rng=rng)
         if sys.stderr.isatty():
             print(f"\r{name}: {number + 1} of {hands + empty}", end="", file=sys.stderr)
-    category = {
-        "id": 1,
-        "name": "hand",
-        "keypoints": KEYPOINT_NAMES,
-        "skeleton": [[a + 1, b + 1] for a, b in SKELETON],
-    }
-    coco = {"images": images, "annotations": annotations, "categories": [category]}
-    (out / "coco.json").write_text(json.dumps(coco), encoding="utf-8")
+
+
+def write_set(name: str, hands: int, empty: int, seed: int, out: Path) -> None:
+    """Pictures and judged.json of one set."""
+    writer, cases = open_writer("coco", out), []
+    writer.write(0, frames_of(name, hands, empty, seed, cases))
+    writer.finish()
+    coco = json.loads((out / "annotations.json").read_text(encoding="utf-8"))
+    for image, case in zip(coco["images"], cases, strict=True):
+        image["file_name"] = f"images/{image['file_name']}"
+        image |= {"pose": case.pose, "view": case.view, "tone": case.tone, "gesture": case.gesture}
+    (out / JUDGED).write_text(json.dumps(coco), encoding="utf-8")
 
 
 def judge(program: Path | None, out: Path) -> None:
     """Run the judge on a set and print its figures, or print how to run it."""
     report = out / "report.json"
-    line = ["--images", str(out), "--annotations", str(out / "coco.json"), "--report", str(report)]
+    line = ["--images", str(out), "--annotations", str(out / JUDGED), "--report", str(report)]
     line += [word for group in GROUPS for word in ("--by", group)]
     if program is None:
         print("JUDGE", *line)

@@ -88,7 +88,7 @@ class HandFigure:
     def __init__(self, hand: ShownHand, look: Appearance, *, first_marker: int) -> None:
         self.hand, self.look = hand, look
         self._skin = SkinMesh(hand.model, look.forearm)
-        self._material, self._balls = functools.cache(self._painted), functools.cache(ball_material)
+        self._painted: Material | None = None
         bones = hand.attachment.bone_indices[
             np.arange(len(hand.attachment.bone_indices)), hand.attachment.bone_weights.argmax(axis=1)
         ]
@@ -123,12 +123,14 @@ class HandFigure:
         markers: NDArray[np.float64] = self.hand.attachment.markers(self.hand.model, transforms)[0][0]
         return markers
 
-    def _painted(self) -> Material:
-        look, side = self.look, self.hand.model.shape.side
-        texture = skin_texture(look.skin, look.forearm, side=side)
-        if look.glove is not None:
-            texture = glove_texture(look.glove, texture, look.forearm, side=side)
-        return skin_material(texture)
+    def _material(self) -> Material:
+        if self._painted is None:
+            look, side = self.look, self.hand.model.shape.side
+            texture = skin_texture(look.skin, look.forearm, side=side)
+            if look.glove is not None:
+                texture = glove_texture(look.glove, texture, look.forearm, side=side)
+            self._painted = skin_material(texture)
+        return self._painted
 
     def _drawn_markers(self, qpos: NDArray[np.float64], number: int) -> Drawn:
         balls = sphere_surface(self.markers(qpos), self.hand.attachment.layout.radius, level=_BALL_LEVEL)
@@ -136,7 +138,7 @@ class HandFigure:
         parts = (1 + PARTS_A_HAND * number + self._marker_bones).astype(np.uint8)
         instances = np.full(len(balls.faces), 1 + number, dtype=np.uint8)
         numbers = np.repeat(self._marker_numbers, each)
-        return _drawn_balls(balls, np.repeat(parts, each), instances, numbers, self._balls)
+        return _drawn_balls(balls, np.repeat(parts, each), instances, numbers)
 
 
 class BodyFigure:
@@ -150,7 +152,6 @@ class BodyFigure:
     def __init__(self, body: ShownBody, color: tuple[float, float, float]) -> None:
         self.body = body
         self._material = functools.cache(functools.partial(plain_material, color))
-        self._balls = functools.cache(ball_material)
         if body.thing is not None:
             self._normals = vertex_normals(body.thing.vertices, body.thing.faces)
 
@@ -167,7 +168,7 @@ class BodyFigure:
         if len(self.body.markers):
             balls = sphere_surface(self.body.markers @ rotation.T + place, _BODY_BALLS, level=_BALL_LEVEL)
             zeros = np.zeros(len(balls.faces), dtype=np.uint8)
-            drawn.append(_drawn_balls(balls, zeros, zeros + np.uint8(instance), zeros, self._balls))
+            drawn.append(_drawn_balls(balls, zeros, zeros + np.uint8(instance), zeros))
         return drawn
 
 
@@ -176,12 +177,11 @@ def _drawn_balls(
     parts: UInt8[np.ndarray, "F"],
     instances: UInt8[np.ndarray, "F"],
     markers: UInt8[np.ndarray, "F"],
-    material: Callable[[], Material],
 ) -> Drawn:
     triangles = Triangles(balls.vertices, balls.faces, balls.normals, parts, instances, markers)
     colors = np.ones((len(balls.vertices), 4), dtype=np.float32)
     colors[:, :3] = linear(MARKER_COLOR)
-    return Drawn(triangles, colors, None, material)
+    return Drawn(triangles, colors, None, ball_material)
 
 
 def digit_of_part(parts: UInt8[np.ndarray, "*shape"], number: int) -> NDArray[np.int64]:

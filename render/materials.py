@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -105,6 +106,7 @@ def plain_material(color: tuple[float, float, float]) -> Material:
     return Material(linear(color), 0.5)
 
 
+@functools.cache
 def ball_material() -> Material:
     """Markers, coloured by vertex; they glow a little, so that no shadow swallows them."""
     return Material(np.ones(3), 0.45, glow=0.2)

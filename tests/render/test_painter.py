@@ -61,7 +61,7 @@ def test_light_from_everywhere_shows_a_surface_in_its_own_colour(level: float, s
 def test_a_wall_that_faces_the_lamp_sends_back_its_colour_and_a_glint() -> None:
     wall = thing(trimesh.creation.box((8.0, 8.0, 0.1)).apply_translation([0, 0, 2.0]), plain(), smooth=False)
     shown = paint(CAMERA, [wall], Lighting((Lamp((0.0, 0.0, -1.0), 1.0),), DARK))[36, 48]
-    # Head-on: half of the wall's 0.5 but what is mirrored, and the microfacets' peak, a quarter of 0.04 for chalk.
+    # What is not mirrored of its 0.5, and the peak of chalk's microfacets: a quarter of 0.04.
     light = 0.5 * 0.96 * 0.96 + 0.04 / 4
     assert np.abs(shown[:3] - 255.0 * light ** (1 / 2.2)).max() <= 1.5
     behind = paint(CAMERA, [wall], Lighting((Lamp((0.0, 0.0, 1.0), 1.0),), DARK))[36, 48]
