@@ -4,8 +4,8 @@
 
 Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:
 OUT/clean (plain and graded backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand
-among them). Five kinds of pose x palm, back and edge views x six skin tones x both sides; the hand's box takes
-20 to 30 % of the frame. OUT/*/judged.json is the COCO file with the view, pose and tone of each picture.
+among them). Five kinds of pose x palm, back and edge views x six skin tones x both sides; the hand's box
+takes 20 to 30 % of the frame. OUT/*/judged.json is the COCO file with each picture's view, pose and tone.
 
 The judge is a program of the user's own: `judge --images DIR --annotations COCO --report JSON` finds hands in
 the pictures without being told where they are. With --judge it is run, and its figures are printed by view,
