@@ -63,9 +63,10 @@ def line_depth(rng: np.random.Generator) -> NDArray[np.float64]:
         mine, joints = digit.texels, np.cumsum(digit.lengths)[:2]
         pad = 1.0 - back[mine]
         waves = 0.0006 * np.sin(3.0 * digit.turn + rng.uniform(0.0, 6.0))
-        creases = [(joints[0], 1.0), (joints[0] + 0.0024, 0.6), (joints[1] - 0.001, 0.9)]
+        # Palmar creases lie off the joints: Bugbee and Botte 1993, Clin. Orthop. Relat. Res. 296:122.
+        creases = [(joints[0] - 0.0025, 1.0), (joints[0] + 0.0004, 0.5)]
         if number:
-            creases.append((0.47 * digit.lengths[0], 0.9))
+            creases += [(joints[1] - 0.0075, 0.9), (0.017, 0.9)]
         for place, strength in creases:
             here = strength * pad * digit.share * bump(digit.along - place - waves, 0.0009)
             depth[mine] = np.maximum(depth[mine], here)
