@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,13 @@ def claim(path: Path, settings: dict[str, Any], *, noun: str, error: type[HandSi
             begun = f"{noun} begun with other settings ({', '.join(differing)})"
             raise error(f"{out} holds a {begun}; use them or another folder")
         for leftover in out.glob(".*.tmp-*"):
-            leftover.unlink(missing_ok=True)
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+            if leftover.is_dir():
+                shutil.rmtree(leftover, ignore_errors=True)
+            else:
+                leftover.unlink(missing_ok=True)
+    elif out.exists() and not out.is_dir():
+        raise error(f"{out} is a file, wanted a folder")
+    elif out.is_dir() and any(out.iterdir()):
         raise error(f"{out} is not empty and holds no {noun}; name another folder")
     else:
         save_json(path, settings)

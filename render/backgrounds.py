@@ -6,6 +6,7 @@ picture.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -188,18 +189,35 @@ def _clutter(
     return picture * (1.0 + 0.06 * _octaves(size, 1, 0.8, rng))
 
 
-def _pick_photo(folder: Path, rng: np.random.Generator) -> Path:
-    """A random photograph that can be read."""
+@functools.lru_cache(maxsize=2)
+def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Photographs in a folder and its subfolders: those that are some by their first bytes, and the others.
+
+    Raises:
+        HandSimError: There is no such folder, or none in it is readable.
+    """
     if not folder.is_dir():
         raise HandSimError(f"{folder}: no such folder of photographs")
-    files: list[Path] = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
+    good = tuple(file for file in files if cv2.haveImageReader(str(file)))
+    if not good:
+        raise _no_photo(folder)
+    return good, tuple(file for file in files if file not in set(good))
+
+
+def _pick_photo(folder: Path, rng: np.random.Generator) -> Path:
+    """A random photograph that can be read whole."""
+    files, _ = photo_files(folder)
     for place in rng.permutation(len(files))[:_TRIES]:
         if _read(files[place]) is not None:
             readable: Path = files[place]
             return readable
-    raise HandSimError(
-        f"{folder}: no photograph that can be read; wanted files that end in {', '.join(PHOTO_SUFFIXES)}"
-    )
+    raise _no_photo(folder)
+
+
+def _no_photo(folder: Path) -> HandSimError:
+    endings = ", ".join(PHOTO_SUFFIXES)
+    return HandSimError(f"{folder}: no photograph that can be read; wanted files that end in {endings}")
 
 
 def _read(file: Path) -> NDArray[np.uint8] | None:

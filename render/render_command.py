@@ -11,7 +11,7 @@ from rich.console import Console
 
 from handsim.errors import HandSimError, choices
 from handsim.progress import progress_bar
-from render.backgrounds import KINDS, BackgroundConfig, BackgroundKind
+from render.backgrounds import KINDS, BackgroundConfig, BackgroundKind, photo_files
 from render.blur import ShutterConfig
 from render.depth_noise import SENSORS, DepthNoiseConfig
 from render.exposure import ExposureConfig
@@ -91,6 +91,8 @@ def render(
         seed=seed,
     )
     start = time.perf_counter()
+    if photos is not None:
+        _tell_left_out(photos)
     with progress_bar("images") as (bar, task):
         count = render_take(
             take,
@@ -125,6 +127,15 @@ def _backgrounds(kinds: tuple[BackgroundKind, ...], photos: Path | None) -> Back
         return BackgroundConfig()
     wanted = kinds or ("photo",)
     return BackgroundConfig(**{kind: float(kind in wanted) for kind in KINDS}, photos=folder)
+
+
+def _tell_left_out(photos: Path) -> None:
+    _, broken = photo_files(photos)
+    if broken:
+        more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
+        Console(stderr=True).print(
+            f"left out: {broken[0]}{more}, no readable photographs", soft_wrap=True, markup=False
+        )
 
 
 def _sensors(names: tuple[str, ...]) -> DepthNoiseConfig | None:

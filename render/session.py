@@ -16,7 +16,7 @@ import numpy as np
 from handsim.errors import HandSimError, ShapeError, choices
 from handsim.json_files import claim
 from handsim.processes import in_processes
-from render.backgrounds import BackgroundConfig, sample_background
+from render.backgrounds import BackgroundConfig, photo_files, sample_background
 from render.blur import ShutterConfig, sample_shutter
 from render.contact_sheet import contact_sheet
 from render.depth_noise import DepthNoiseConfig, sample_depth_noise
@@ -30,7 +30,7 @@ from render.shown_take import ShownTake, load_shown_take
 from render.skin_look import ALL_TONES
 from render.studio import PASSES, FrameChoices, Studio
 from render.viewpoints import ViewConfig, Viewpoints
-from render.writer import FORMATS, open_writer
+from render.writer import FORMATS, NEED_COLORS, open_writer
 
 Progress = Callable[[int, int], None]
 """Called with pictures done and pictures wanted."""
@@ -105,16 +105,14 @@ def render_take(
     Raises:
         HandSimError: The take or the settings cannot be drawn; shards that are finished are kept.
     """
-    for name in formats:
-        if name not in FORMATS:
-            raise HandSimError(choices(name, FORMATS, noun="format"))
-    if not formats or len(set(formats)) < len(formats):
-        raise HandSimError(f"formats are {', '.join(formats) or 'none'}, wanted at least one, each once")
+    _check_formats(formats, config)
     take = load_shown_take(path)
-    settings = {"take": path.name, "frames": take.num_frames, "formats": list(formats)}
-    claim(out / CONFIG, settings | dataclasses.asdict(config), noun="rendering", error=HandSimError)
+    if config.background.photo > 0.0:
+        photo_files(Path(str(config.background.photos)))
     shards = _shards(take, config)
     views = len(_viewpoints(take, config).cameras(0))
+    settings = {"take": path.name, "frames": take.num_frames, "formats": list(formats)}
+    claim(out / CONFIG, settings | dataclasses.asdict(config), noun="rendering", error=HandSimError)
     job = functools.partial(_render_shard, path, out, tuple(formats), config)
     done = _finished(out, formats)
     count = views * sum(len(shards[number]) for number in done if number < len(shards))
@@ -128,6 +126,16 @@ def render_take(
         open_writer(name, _folder(out, formats, name)).finish()
     _write_sheet(out, take, config, shards)
     return total
+
+
+def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
+    for name in formats:
+        if name not in FORMATS:
+            raise HandSimError(choices(name, FORMATS, noun="format"))
+        if name in NEED_COLORS and "rgb" not in config.passes:
+            raise HandSimError(f"the format {name} needs colour pictures; add rgb to the passes")
+    if not formats or len(set(formats)) < len(formats):
+        raise HandSimError(f"formats are {', '.join(formats) or 'none'}, wanted at least one, each once")
 
 
 def _folder(out: Path, formats: Sequence[str], name: str) -> Path:

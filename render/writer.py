@@ -52,6 +52,8 @@ WRITERS: Final[dict[str, Callable[[Path], FrameWriter]]] = {
     "png": PngWriter,
 }
 FORMATS: Final = tuple(WRITERS)
+NEED_COLORS: Final = ("coco", "freihand", "interhand")
+"""Formats of colour pictures."""
 
 
 def open_writer(name: str, folder: str | Path) -> FrameWriter:

@@ -15,7 +15,9 @@ import pytest
 from gloves.archives import write_archive
 from gloves.captures import Capture, write_capture
 from gloves.layout import load_layout, save_layout
+from gloves.take import save_take
 from handsim.cli import main
+from train.twins import TwinConfig, simulate_twin
 
 GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
@@ -73,6 +75,11 @@ def folder(tmp_path, monkeypatch):
     for name, content in files.items():
         (tmp_path / name).write_text(content)
     write_archive(tmp_path / "tracked.npz", "tracked take", 1, {}, {})
+    write_archive(tmp_path / "newer.npz", "tracked take", 99, {}, {})
+    take = simulate_twin(TwinConfig(num_frames=2))
+    save_take(tmp_path / "good.truth.npz", take)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "broken.jpg").write_text("no picture")
     save_layout(tmp_path / "copy.toml", load_layout("dense19"))
     return tmp_path
 
@@ -152,6 +159,26 @@ CASES = {
     "a user in another kind of file": ["calibrate", "good.trc", "--out", "user.toml"],
     "a capture without hands": ["calibrate", "good.trc", "--out", "user.json"],
     "a tracked take as truth": ["evaluate", "tracked.npz", "--json", "out.json"],
+    "a take of another version to draw": ["render", "newer.npz", "--out", "out"],
+    "a capture to draw": ["render", "good.trc", "--out", "out"],
+    "no take to draw": ["render", "missing.npz", "--out", "out"],
+    "a damaged take to draw": ["render", "damaged.truth.npz", "--out", "out"],
+    "an unknown pass": ["render", "good.truth.npz", "--passes", "rgb", "heat", "--out", "out"],
+    "an unknown format": ["render", "good.truth.npz", "--format", "gif", "--out", "out"],
+    "a format twice": ["render", "good.truth.npz", "--format", "png", "png", "--out", "out"],
+    "a format without its pictures": [
+        *("render", "good.truth.npz", "--format", "coco", "--passes", "depth", "--out", "out"),
+    ],
+    "an unknown camera": ["render", "good.truth.npz", "--camera", "kinect9", "--out", "out"],
+    "an unknown depth sensor": ["render", "good.truth.npz", "--depth-sensor", "sonar", "--out", "out"],
+    "an unknown skin tone": ["render", "good.truth.npz", "--tones", "green", "--out", "out"],
+    "an unknown rig to draw": [
+        *("render", "good.truth.npz", "--placement", "rig", "--rig", "figure6", "--out", "out"),
+    ],
+    "a camera too near": ["render", "good.truth.npz", "--distance", "0.01", "0.01", "--out", "out"],
+    "no folder of photographs": ["render", "good.truth.npz", "--photos", "missing", "--out", "out"],
+    "a folder of broken photographs": ["render", "good.truth.npz", "--photos", "photos", "--out", "out"],
+    "pictures into a file": ["render", "good.truth.npz", "--out", "good.trc"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }
 

@@ -57,7 +57,6 @@ def test_hands_are_tracked_to_a_millimetre(truth, tracked):
         assert off.mean() <= MOST_MILLIMETRES
 
 
-@pytest.mark.usefixtures("drawing")
 def test_pictures_of_tracked_hands_have_their_keypoints_where_the_truth_is(truth, tracked):
     take, folder = truth
     shown = load_shown_take(folder / "tracked.npz")

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import resource
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -18,8 +22,6 @@ from render.shown_take import load_shown_take
 from render.viewpoints import ViewConfig, Viewpoints
 from train.twins import TwinConfig, simulate_twin
 
-pytestmark = pytest.mark.usefixtures("drawing")
-
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
@@ -28,6 +30,7 @@ def path(tmp_path_factory):
     return file
 
 
+MAIN = "import sys; from handsim.cli import main; sys.exit(main())"
 PLAIN = RenderConfig(
     view=ViewConfig(camera="vga", views=2), depth_sensor=None, color_sensor=None, every=12, frames_per_shard=2
 )
@@ -98,6 +101,43 @@ def test_a_rendering_goes_on_where_it_stopped_and_comes_out_the_same(path, tmp_p
     assert names == sorted(file.relative_to(parted) for file in parted.rglob("*") if file.is_file())
     for name in names:
         assert (whole / name).read_bytes() == (parted / name).read_bytes(), name
+
+
+def test_a_full_disk_is_one_sentence_and_finished_tars_are_kept(path, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(done: int, wanted: int) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+
+    try:
+        with pytest.raises(HandSimError, match=r"writing shard 1 failed: File too large; shards that were"):
+            render_take(path, tmp_path / "out", ["webdataset"], PLAIN, workers=1, progress=fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["render.json", "shard-00000.tar"]
+    kept = (tmp_path / "out" / "shard-00000.tar").read_bytes()
+    assert render_take(path, tmp_path / "out", ["webdataset"], PLAIN, workers=1) == 8
+    assert (tmp_path / "out" / "shard-00000.tar").read_bytes() == kept
+    assert (tmp_path / "out" / "shard-00001.tar").is_file()
+
+
+def test_no_driver_is_one_sentence_where_opengl_is_wanted(path, tmp_path):
+    command = [sys.executable, "-c", MAIN, "render", str(path), "--out", str(tmp_path / "out")]
+    environment = {**os.environ, "PYOPENGL_PLATFORM": "egl", "EGL_DEVICE_ID": "4711"}
+    for painter, code in (("opengl", 1), ("compiled", 0)):
+        done = subprocess.run(
+            [*command, "--every", "48", "--workers", "1", "--painter", painter],
+            capture_output=True,
+            text=True,
+            env=environment,
+            check=False,
+        )
+        assert done.returncode == code, done
+        (tmp_path / "out" / "render.json").unlink()
+        said = done.stderr.strip()
+        if painter == "opengl":
+            assert said.startswith("handsim render: drawing without a screen failed (egl: ")
+            assert "apt-get install libegl1" in said and "\n" not in said
 
 
 def test_depth_on_disk_is_in_metres(path, tmp_path):
