@@ -1,4 +1,4 @@
-"""Generate, train small, label a capture file, evaluate: one chain through the command line."""
+"""Generate, train small, label, evaluate, track, draw: one chain, most of it through the command line."""
 
 from __future__ import annotations
 
@@ -9,8 +9,19 @@ import pytest
 import torch
 
 from gloves.captures import Capture, read_capture, write_capture
+from gloves.take import save_take
+from gloves.tracked_take import save_tracked_take
 from handsim.cli import main
+from render.keypoints import hand_keypoints
+from render.session import RenderConfig, draw_shard
+from render.shown_take import load_shown_take
+from render.viewpoints import ViewConfig, Viewpoints
+from track.capture_tracking import track
+from track.evaluation import true_users
+from track.tracker import Tracker
+from train.labeler import load_labeler
 from train.shards import Dataset
+from train.twins import TwinConfig, simulate_twin
 
 SMALL = [
     "--samples",
@@ -87,6 +98,27 @@ def test_empty_frames_are_labelled_as_empty(run):
     labelled = read_capture(run / "out.trc")
     assert np.isnan(labelled.positions[3:7]).all()
     assert np.isfinite(labelled.positions[:3]).any(axis=(1, 2)).all()
+
+
+def test_a_small_labeler_tracks_to_a_millimetre_and_pictures_agree(run):
+    truth = simulate_twin(TwinConfig(num_frames=240))
+    save_take(run / "one.truth.npz", truth)
+    columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
+    capture = Capture(columns, truth.points, truth.rate)
+    tracker = Tracker(true_users(truth), load_labeler(run / "run"))
+    save_tracked_take(run / "tracked.npz", track(capture, tracker))
+    shown, true = load_shown_take(run / "tracked.npz"), load_shown_take(run / "one.truth.npz").hands[0]
+    mine = shown.hands[0].qpos
+    there = np.isfinite(mine[:, 0])
+    assert there.mean() > 0.95
+    off = hand_keypoints(true.model, mine[there]) - hand_keypoints(true.model, true.qpos[there])
+    assert 1e3 * np.linalg.norm(off, axis=-1).mean() < 1.0
+    config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("depth", "ids"), depth_sensor=None)
+    viewpoints = Viewpoints(config.view, shown, rng=np.random.default_rng(0))
+    for frame in draw_shard(shown, viewpoints, config, 0, np.flatnonzero(there)[::60].tolist()):
+        points = hand_keypoints(true.model, true.qpos[frame.number : frame.number + 1])[0]
+        assert np.linalg.norm(frame.camera.project(points) - frame.hands[0].pixels, axis=-1).mean() < 2.0
+        assert frame.hands[0].visible.sum() >= 5
 
 
 def test_training_goes_on_to_the_same_weights(run, tmp_path):
