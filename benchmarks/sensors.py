@@ -19,7 +19,7 @@ from machine import describe
 
 from render.blur import combine, shutter_times
 from render.camera import Camera, pinhole
-from render.depth_noise import SENSORS, apply_depth_noise, named_sensor
+from render.depth_noise import SENSORS, apply_depth_noise, named_sensor, reflectance_of
 from render.exposure import Exposure, expose, linear_of
 from render.lens import Lens
 from render.warp import faces_for, warp, warp_depth, warp_normals
@@ -67,7 +67,9 @@ def main() -> None:
         noise = named_sensor(name)
         clock(
             name,
-            lambda noise=noise: apply_depth_noise(depth, normals, noise, camera=camera, rgb=rgb, rng=rng),
+            lambda noise=noise: apply_depth_noise(
+                depth, normals, noise, camera=camera, reflectance=reflectance_of(rgb), rng=rng
+            ),
             repeats,
         )
 

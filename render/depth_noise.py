@@ -94,7 +94,7 @@ def apply_depth_noise(
     noise: DepthNoise | None,
     *,
     camera: Camera,
-    rgb: UInt8[np.ndarray, "H W 3"] | None = None,
+    reflectance: Float32[np.ndarray, "H W"] | None = None,
     rng: np.random.Generator,
 ) -> Float32[np.ndarray, "H W"]:
     """Depth as a sensor has it [m], 0 where it has none.
@@ -104,15 +104,15 @@ def apply_depth_noise(
         normals: Of the surfaces in the camera's axes; without them, all surfaces face the camera.
         noise: The sensor; None leaves everything as it is.
         camera: Whose picture it is.
-        rgb: Its colours, sRGB, which tell a time-of-flight sensor how dark surfaces are; without them, all
-            are white.
+        reflectance: Share of infrared light that surfaces send back, for time-of-flight sensors; without it,
+            all are white. See `reflectance_of`.
         rng: Randomness.
 
     Raises:
         ShapeError: A picture is not as large as the camera's.
     """
     shape = camera.size[1], camera.size[0]
-    for name, picture in (("depth", depth), ("normals", normals), ("rgb", rgb)):
+    for name, picture in (("depth", depth), ("normals", normals), ("reflectance", reflectance)):
         if picture is not None and picture.shape[:2] != shape:
             raise ShapeError(
                 f"{name} has shape {picture.shape}, wanted {shape} as camera '{camera.name}' has"
@@ -122,7 +122,6 @@ def apply_depth_noise(
     cosines = None if normals is None else _facing(normals, camera)
     if isinstance(noise, StructuredLight):
         return structured_light.measure(depth, cosines, noise, float(camera.K[0, 0]), rng=rng)
-    reflectance = None if rgb is None else _reflectance(rgb)
     return time_of_flight.measure(depth, cosines, reflectance, noise, rng=rng)
 
 
@@ -149,8 +148,8 @@ def _back(
     return back
 
 
-def _reflectance(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Share of light that surfaces send back, taken from how bright they look."""
+def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+    """Share of infrared light that surfaces send back, guessed from how bright they look in sRGB."""
     light: NDArray[np.float32] = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
     return light
 

@@ -31,7 +31,7 @@ def render(
     placement: Placement = "still",
     camera: str = "vga",
     views: int = 1,
-    distance: tuple[float, float] = (0.45, 0.75),
+    distance: tuple[float, float] = (0.55, 0.9),
     rig: str = "six",
     dress: Literal["skin", "glove"] = "skin",
     tones: tuple[str, ...] = (),

@@ -179,6 +179,20 @@ def _render_shard(path: Path, out: Path, formats: tuple[str, ...], config: Rende
     return shard
 
 
+def draw_frames(
+    take: ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
+) -> Iterator[RenderedFrame]:
+    """Some frames of a take, seen by all its cameras.
+
+    Args:
+        take: What happens.
+        config: What to draw.
+        frames: Numbers of frames in the take.
+        shard: People change with the shard, as does all else that does not vary by frame.
+    """
+    return draw_shard(take, _viewpoints(take, config), config, shard, frames)
+
+
 def draw_shard(
     take: ShownTake, viewpoints: Viewpoints, config: RenderConfig, shard: int, frames: Sequence[int]
 ) -> Iterator[RenderedFrame]:

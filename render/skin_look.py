@@ -81,6 +81,15 @@ class SkinLook:
         """Individual typology angle of the back of the hand [deg]."""
         return float(np.rad2deg(np.arctan2(self.lightness - 50.0, self.yellowness)))
 
+    @property
+    def infrared(self) -> float:
+        """Reflectance near 850 nm, where tones differ little.
+
+        Pigment absorbs less and less towards 1 um (Jacquez et al. 1955, J. Appl. Physiol. 8:297); the two
+        ends are our choice.
+        """
+        return float(np.interp(self.lightness, (25.0, 75.0), (0.45, 0.6)))
+
 
 def sample_skin_look(tones: tuple[float, float] = ALL_TONES, *, rng: np.random.Generator) -> SkinLook:
     """A random person's skin.

@@ -14,7 +14,7 @@ from handsim.errors import HandSimError
 from render.backgrounds import Background, draw_background
 from render.blur import Shutter, combine, shutter_times
 from render.camera import Camera
-from render.depth_noise import DepthNoise, apply_depth_noise
+from render.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
 from render.exposure import Exposure, expose, linear_of
 from render.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.frames import BodyTruth, Pictures, RenderedFrame
@@ -92,6 +92,9 @@ class Studio:
         rng = np.random.default_rng(choices.seed)
         drawn = self._drawn(frame, 0.0)
         _check_outside(camera, drawn, frame)
+        present = [
+            number for number, figure in enumerate(self._hands) if self._pose(figure, frame) is not None
+        ]
         noisy = "depth" in self.passes and choices.depth_noise is not None
         truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
@@ -100,12 +103,10 @@ class Studio:
             noisy_rgb = self._exposed(frame, camera, rgb, choices, rng)
         if "depth" in self.passes and choices.depth_noise is not None:
             assert truth.depth is not None
+            infrared = self._infrared(truth, rgb, present)
             noisy_depth = apply_depth_noise(
-                truth.depth, truth.normals, choices.depth_noise, camera=camera, rgb=rgb, rng=rng
+                truth.depth, truth.normals, choices.depth_noise, camera=camera, reflectance=infrared, rng=rng
             )
-        present = [
-            number for number, figure in enumerate(self._hands) if self._pose(figure, frame) is not None
-        ]
         hands = tuple(
             hand_truth(self._hands[number], self.take.hands[number].qpos[frame], place, camera, truth)
             for place, number in enumerate(present)
@@ -177,6 +178,18 @@ class Studio:
             warp_normals(camera, normals) if normals else None,
             *ids,
         )
+
+    def _infrared(
+        self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]
+    ) -> Float32[np.ndarray, "H W"]:
+        """What surfaces send back to a depth sensor; bare skin does not go by its colours."""
+        assert truth.instances is not None
+        shape = truth.instances.shape
+        infrared = np.ones(shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
+        for place, number in enumerate(present):
+            if self._people[number].glove is None:
+                infrared[truth.instances == place + 1] = self._people[number].skin.infrared
+        return infrared
 
     def _colors_of(
         self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices

@@ -47,7 +47,7 @@ class ViewConfig:
     """One of `render.camera.PRESETS`."""
     views: int = 1
     """How many cameras look at the hands at once; a rig has its own number."""
-    distance: tuple[float, float] = (0.45, 0.75)
+    distance: tuple[float, float] = (0.55, 0.9)
     """From the middle of the hands [m], drawn evenly."""
     rig: str = "six"
     """A shipped rig or a .toml file, for the placement `rig`."""

@@ -10,9 +10,9 @@ from gloves.take import load_take
 from gloves.tracked_take import load_tracked_take, save_tracked_take
 from handsim.model import HandModel
 from render.keypoints import hand_keypoints
-from render.session import RenderConfig, draw_shard
+from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
-from render.viewpoints import ViewConfig, Viewpoints
+from render.viewpoints import ViewConfig
 from track.capture_tracking import track
 from track.evaluation import true_users
 from track.tracker import Tracker
@@ -61,9 +61,8 @@ def test_pictures_of_tracked_hands_have_their_keypoints_where_the_truth_is(truth
     take, folder = truth
     shown = load_shown_take(folder / "tracked.npz")
     config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("rgb", "depth", "ids"))
-    viewpoints = Viewpoints(config.view, shown, rng=np.random.default_rng(0))
     off = []
-    for frame in draw_shard(shown, viewpoints, config, 0, range(10, FRAMES, 20)):
+    for frame in draw_frames(shown, config, range(10, FRAMES, 20)):
         assert frame.camera.size == (640, 480) and len(frame.hands) == 2
         for hand in frame.hands:
             true = next(one for one in take.hands if one.shape.side == hand.shape.side)

@@ -14,6 +14,7 @@ from render.depth_noise import (
     DepthNoiseConfig,
     apply_depth_noise,
     named_sensor,
+    reflectance_of,
     sample_depth_noise,
 )
 from render.structured_light import StructuredLight, shadowed
@@ -189,7 +190,7 @@ def test_dark_surfaces_are_noisier_and_then_gone():
     noise = dataclasses.replace(named_sensor("azure_kinect"), step=0.0)
 
     def out(level):
-        return noisy(depth, normals, noise, rgb=np.full((*SHAPE, 3), level, np.uint8))
+        return noisy(depth, normals, noise, reflectance=reflectance_of(np.full((*SHAPE, 3), level, np.uint8)))
 
     grey = (128 / 255) ** 2.2
     assert out(128).std() == pytest.approx(2e-3 * np.sqrt(0.8 / grey), rel=0.05)

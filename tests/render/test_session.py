@@ -14,11 +14,13 @@ import pytest
 
 from gloves.take import save_take
 from handsim.errors import CaptureError, HandSimError
+from render.depth_noise import DepthNoiseConfig
 from render.figures import digit_of_part
 from render.keypoints import KEYPOINT_DIGITS
 from render.png_depth import read_depth
 from render.session import SHEET, RenderConfig, draw_shard, render_take
 from render.shown_take import load_shown_take
+from render.skin_look import TONES
 from render.viewpoints import ViewConfig, Viewpoints
 from train.twins import TwinConfig, simulate_twin
 
@@ -83,6 +85,18 @@ def test_sensors_and_lenses(path):
         assert frame.noisy.depth.shape == frame.ideal.depth.shape
         assert frame.ideal.normals is None
         assert all(hand.visible.any() for hand in frame.hands)
+
+
+def test_depth_sensors_see_hands_of_all_tones_alike(path):
+    seen = []
+    for tone in ("very light", "dark"):
+        config = dataclasses.replace(
+            PLAIN, tones=TONES[tone], depth_sensor=DepthNoiseConfig(("azure_kinect",))
+        )
+        frame = drawn(path, config)[0]
+        hands = (frame.ideal.instances == 1) | (frame.ideal.instances == 2)
+        seen.append((frame.noisy.depth[hands] > 0.0).mean())
+    assert min(seen) > 0.7 and abs(seen[0] - seen[1]) < 0.02
 
 
 def test_a_rendering_goes_on_where_it_stopped_and_comes_out_the_same(path, tmp_path):

@@ -13,9 +13,9 @@ from gloves.take import save_take
 from gloves.tracked_take import save_tracked_take
 from handsim.cli import main
 from render.keypoints import hand_keypoints
-from render.session import RenderConfig, draw_shard
+from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
-from render.viewpoints import ViewConfig, Viewpoints
+from render.viewpoints import ViewConfig
 from track.capture_tracking import track
 from track.evaluation import true_users
 from track.tracker import Tracker
@@ -114,8 +114,7 @@ def test_a_small_labeler_tracks_to_a_millimetre_and_pictures_agree(run):
     off = hand_keypoints(true.model, mine[there]) - hand_keypoints(true.model, true.qpos[there])
     assert 1e3 * np.linalg.norm(off, axis=-1).mean() < 1.0
     config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("depth", "ids"), depth_sensor=None)
-    viewpoints = Viewpoints(config.view, shown, rng=np.random.default_rng(0))
-    for frame in draw_shard(shown, viewpoints, config, 0, np.flatnonzero(there)[::60].tolist()):
+    for frame in draw_frames(shown, config, np.flatnonzero(there)[::60].tolist()):
         points = hand_keypoints(true.model, true.qpos[frame.number : frame.number + 1])[0]
         assert np.linalg.norm(frame.camera.project(points) - frame.hands[0].pixels, axis=-1).mean() < 2.0
         assert frame.hands[0].visible.sum() >= 5
