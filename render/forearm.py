@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
+LONGEST: Final = 0.5
+"""[m]"""
 _WRIST_GIRTH: Final = 1.92  # [hand breadths]
 _ARM_GIRTH: Final = 3.0
 _WIDEST: Final = 1.05  # how far behind the wrist the arm is widest [hand lengths]
@@ -49,15 +51,18 @@ class Forearm:
     """sRGB in [0, 1]."""
 
     def __post_init__(self) -> None:
-        if not 0.02 <= self.length <= 0.5:
-            raise HandSimError(f"a forearm of {self.length:g} m, wanted 0.02 to 0.5")
+        if not 0.02 <= self.length <= LONGEST:
+            raise HandSimError(f"a forearm of {self.length:g} m, wanted 0.02 to {LONGEST:g}")
         if not self.girth > 0.0:
             raise HandSimError(f"a forearm's girth is {self.girth:g}, wanted a positive factor")
 
 
 def sample_forearm(*, rng: np.random.Generator) -> Forearm:
-    """A random forearm: 16 to 25 cm of it, wrists within half their range, a sleeve on one in three."""
-    length = rng.uniform(0.16, 0.25)
+    """A random forearm: wrists within half their range, a sleeve on one in three.
+
+    It is straight and longer than an arm is to the elbow, so that it leaves the picture as arms do.
+    """
+    length = rng.uniform(0.38, 0.48)
     flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
     girth = float(np.exp(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15)))
     sleeve = rng.uniform(0.035, 0.12) if rng.random() < 1 / 3 else 1.0

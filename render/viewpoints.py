@@ -16,6 +16,7 @@ from handsim.cameras import load_rig, look_at
 from handsim.errors import ShapeError, choices
 from handsim.transforms import quaternion_matrix
 from render.camera import Camera, preset
+from render.forearm import LONGEST
 from render.shown_take import ShownTake
 
 if TYPE_CHECKING:
@@ -30,6 +31,8 @@ _PAST: Final = np.deg2rad(50.0)  # between a head's line of sight and a forearm,
 _SWAY: Final = 1.0  # [s] over which a head follows the hands
 _TURN: Final = 12.0  # [s] of a camera that goes round once
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
+_TRIES: Final = 20
+_CLEAR: Final = 0.15  # [m] that they keep away from the middle of an arm
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,13 +176,28 @@ def _past_forearms(take: ShownTake, offset: NDArray[np.float64]) -> NDArray[np.f
 def _anywhere(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     centres, paths = hand_centres(take), []
     for _ in range(config.views):
-        turns = rng.uniform(-np.pi, np.pi, take.num_frames)
-        rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), take.num_frames))
-        distance = rng.uniform(*config.distance, take.num_frames)
-        directions = [_spherical(*one) for one in zip(turns, rise, strict=True)]
-        places = centres + distance[:, None] * np.array(directions)
+        places = np.empty_like(centres)
+        left = np.arange(take.num_frames)
+        for _ in range(_TRIES):
+            turns = rng.uniform(-np.pi, np.pi, len(left))
+            rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), len(left)))
+            distance = rng.uniform(*config.distance, len(left))
+            directions = [_spherical(*one) for one in zip(turns, rise, strict=True)]
+            places[left] = centres[left] + distance[:, None] * np.array(directions)
+            left = left[_near_arms(take, places)[left]]
+            if not len(left):
+                break
         paths.append(np.array([look_at(*pair) for pair in zip(places, centres, strict=True)]))
     return paths
+
+
+def _near_arms(take: ShownTake, places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each frame's place is where a forearm may be."""
+    wrists, behind = take.wrists()[..., :3], -_along(take)
+    away = places[:, None] - wrists
+    share = np.clip((away * behind).sum(axis=-1, keepdims=True), 0.0, LONGEST)
+    near: NDArray[np.bool_] = (np.linalg.norm(away - share * behind, axis=-1) < _CLEAR).any(axis=1)
+    return near  # NaN, where there is no hand, is never near
 
 
 def _rig(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:

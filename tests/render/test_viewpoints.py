@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import ShapeError
+from handsim.transforms import quaternion_matrix
 from render.shown_take import ShownTake, show_simulated
 from render.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, hand_centres
 from train.twins import TwinConfig, simulate_twin
@@ -44,6 +45,16 @@ def test_cameras_anywhere_keep_their_distance(take):
     viewpoints, centres = Viewpoints(config, take, rng=np.random.default_rng(0)), hand_centres(take)
     away = [np.linalg.norm(viewpoints.cameras(n)[0].T_world_camera[:3, 3] - centres[n]) for n in range(60)]
     assert min(away) >= 0.5 - 1e-9 and max(away) <= 0.6 + 1e-9
+
+
+def test_cameras_anywhere_keep_clear_of_arms(take):
+    viewpoints = Viewpoints(ViewConfig("anywhere", views=8), take, rng=np.random.default_rng(3))
+    poses = take.wrists()
+    for frame in range(take.num_frames):
+        for qpos in poses[frame][np.isfinite(poses[frame, :, 0])]:
+            arm = qpos[:3] - np.linspace(0.0, 0.5, 51)[:, None] * quaternion_matrix(qpos[None, 3:7])[0, :, 0]
+            for camera in viewpoints.cameras(frame):
+                assert np.linalg.norm(arm - camera.T_world_camera[:3, 3], axis=1).min() > 0.14
 
 
 def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
