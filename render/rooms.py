@@ -1,21 +1,52 @@
 """Pictures of made-up rooms: walls, floor and ceiling with patterns, and boxes for furniture, ray by ray.
 
-A third of the picture's resolution is enough: a background is out of focus.
+Half of the picture's resolution is enough: a background is out of focus.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import cv2
+import numba
 import numpy as np
 
 if TYPE_CHECKING:
     from jaxtyping import Float32
     from numpy.typing import NDArray
 
-_REDUCED: Final = 3
+_REDUCED: Final = 2
 _FURNITURE: Final = (4, 14)
+_PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls
+_FRAME: Final = 0.06  # of a picture or window, as a share of its sides
+
+
+class _Walls(NamedTuple):
+    """What is painted on the six sides: from the room's origin and from its far corner, for x, y and z."""
+
+    patterns: NDArray[np.int64]
+    pitches: NDArray[np.float64]
+    """Of stripes, tiles and boards (6,) [m]."""
+    colors: NDArray[np.float64]
+    """Two of each (6, 2, 3), linear."""
+    boards: NDArray[np.float64]
+    """Tones of boards (512,)."""
+    frames: NDArray[np.float64]
+    """Pictures and windows (6, 3, 11): left, low, width, height, colours of frame and glass, slope; width 0:
+    none."""
+
+
+class _Boxes(NamedTuple):
+    """Furniture: B boxes."""
+
+    corners: NDArray[np.float64]
+    """Low and high (B, 2, 3) [m]."""
+    colors: NDArray[np.float64]
+    """Linear (B, 2, 3)."""
+    bands: NDArray[np.float64]
+    """How many drawers or shelves, and what share of each has the second colour (B, 2)."""
+    shades: NDArray[np.float64]
+    """Of the faces along x, y and z (B, 3)."""
 
 
 def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.ndarray, "H W 3"]:
@@ -29,16 +60,12 @@ def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.
     room = rng.uniform((2.5, 2.5, 2.3), (7.0, 7.0, 3.2))  # [m], corner at the origin, z up
     eye = room * rng.uniform((0.25, 0.05, 0.35), (0.75, 0.3, 0.75))
     rays = _rays(width, height, rng)
-    picture, reach = _walls(eye, rays, room, rng)
-    for _ in range(int(rng.integers(*_FURNITURE))):
-        _add_box(picture, reach, eye, rays, room, rng)
     # Lamps and windows leave some places darker than others.
-    lamp = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0))
-    points = eye + reach[:, None] * rays
-    light = 1.0 / (0.35 + 0.09 * ((points - lamp) ** 2).sum(axis=1))
-    picture *= (light * rng.uniform(0.55, 1.1))[:, None]
-    grain = 1.0 + 0.05 * rng.standard_normal((height, width, 1), dtype=np.float32)
-    small = picture.reshape(height, width, 3).astype(np.float32) * grain
+    lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
+    light = np.empty((height * width, 3), dtype=np.float32)
+    _cast(rays, eye, room, *_paint_walls(room, rng), *_place_boxes(room, eye, rng), lamp, strength, light)
+    small = light.reshape(height, width, 3)
+    small *= 1.0 + np.float32(0.05) * rng.standard_normal((height, width, 1), dtype=np.float32)
     small = cv2.GaussianBlur(small, (0, 0), 0.7)  # or edges would show the coarse pixels
     drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
     return drawn
@@ -60,91 +87,133 @@ def _rays(width: int, height: int, rng: np.random.Generator) -> NDArray[np.float
     return rays
 
 
-def _walls(
-    eye: NDArray[np.float64], rays: NDArray[np.float32], room: NDArray[np.float64], rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """What the room's six sides look like along each ray, and how far away they are."""
-    ways = np.where(rays > 0.0, room - eye, -eye).astype(np.float32) / rays
-    axis = ways.argmin(axis=1)
-    reach = ways.min(axis=1)
-    points = eye.astype(np.float32) + reach[:, None] * rays
-    picture = np.zeros_like(rays)
-    for wall in range(6):
-        side, far = wall // 2, wall % 2
-        mine = np.flatnonzero((axis == side) & ((rays[:, side] > 0.0) == bool(far)))
-        first, second = (other for other in range(3) if other != side)
-        places = points[mine][:, [first, second]]
-        picture[mine] = _surface(places, room[[first, second]], rng, pictures=side != 2)
-    return picture, reach
+def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
+    frames = np.zeros((6, 3, 11))
+    for wall in range(4):  # not on floor and ceiling
+        across = room[1 - wall // 2]
+        for number in range(int(rng.integers(0, 4))):
+            wide, high = rng.uniform((0.3, 0.3), (1.4, 1.2))
+            left, low = rng.uniform(0.0, 1.0, 2) * np.maximum([across - wide, room[2] - high], 0.01)
+            window = rng.random() < 0.3
+            glass = np.ones(3) if window else _paint(rng)
+            frames[wall, number] = left, low, wide, high, *_paint(rng), *glass, rng.uniform(-0.5, 0.5)
+    return _Walls(
+        rng.choice([_STRIPES, _TILES, _BOARDS, _PLAIN, _PLAIN], 6),
+        rng.uniform(0.06, 0.5, 6),
+        np.array([[_paint(rng), _paint(rng)] for _ in range(6)], dtype=np.float64),
+        rng.uniform(0.0, 0.5, 512),
+        frames,
+    )
 
 
-def _add_box(
-    picture: NDArray[np.float32],
-    reach: NDArray[np.float32],
-    eye: NDArray[np.float64],
-    rays: NDArray[np.float32],
-    room: NDArray[np.float64],
-    rng: np.random.Generator,
+def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.random.Generator) -> _Boxes:
+    """Furniture that stands on the floor, or hangs on or stands by a wall."""
+    count = int(rng.integers(*_FURNITURE))
+    extents = rng.uniform((0.2, 0.2, 0.1), (1.6, 1.0, 1.9), (count, 3)) * rng.uniform(0.4, 1.0, (count, 1))
+    low = rng.uniform(0.001, 0.999, (count, 3)) * np.maximum(room - extents, 0.01)
+    low[:, 1] = np.maximum(low[:, 1], eye[1] + 0.7)  # ahead of the camera
+    low[rng.random(count) < 0.7, 2] = 0.0
+    return _Boxes(
+        np.stack([low, low + extents], axis=1),
+        np.array([[_paint(rng), _paint(rng)] for _ in range(count)], dtype=np.float64),
+        np.column_stack([rng.integers(0, 5, count), rng.uniform(0.05, 0.5, count)]),
+        rng.uniform(0.55, 1.0, (count, 3)),
+    )
+
+
+# Arrays come one by one: those in a tuple are counted at every access, which costs more than the casting.
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _cast(
+    rays: Any,
+    eye: Any,
+    room: Any,
+    patterns: Any,
+    pitches: Any,
+    colors: Any,
+    boards: Any,
+    frames: Any,
+    corners: Any,
+    box_colors: Any,
+    bands: Any,
+    shades: Any,
+    lamp: Any,
+    strength: float,
+    picture: Any,
 ) -> None:
-    """Draw a piece of furniture that stands on the floor, or hangs on or stands by a wall."""
-    extent = rng.uniform((0.2, 0.2, 0.1), (1.6, 1.0, 1.9)) * rng.uniform(0.4, 1.0)
-    corner = rng.uniform(0.0, 1.0, 3) * np.maximum(room - extent, 0.01)
-    corner[1] = max(corner[1], eye[1] + 0.7)  # ahead of the camera
-    if rng.random() < 0.7:
-        corner[2] = 0.0
-    color, other = _paint(rng), _paint(rng)
-    with np.errstate(over="ignore"):
-        low = ((corner - eye).astype(np.float32)) / rays
-        high = ((corner + extent - eye).astype(np.float32)) / rays
-    enter_each = np.minimum(low, high)
-    enter, leave = enter_each.max(axis=1), np.maximum(low, high).min(axis=1)
-    hit = np.flatnonzero((enter > 0.05) & (enter < leave) & (enter < reach))
-    if not len(hit):
-        return
-    axis = enter_each[hit].argmax(axis=1)
-    points = eye.astype(np.float32) + enter[hit, None] * rays[hit]
-    shade = rng.uniform(0.55, 1.0, 3).astype(np.float32)[axis]
-    # Drawers and shelves: bands of a second colour over the height
-    bands = rng.integers(0, 5)
-    if bands:
-        phase = (points[:, 2] - corner[2]) / extent[2] * bands % 1.0
-        use = (phase < rng.uniform(0.05, 0.5))[:, None]
-        painted = np.where(use, other, color)
-    else:
-        painted = np.broadcast_to(color, (len(hit), 3))
-    picture[hit] = painted * shade[:, None]
-    reach[hit] = enter[hit]
+    """Light (N, 3) that comes along each ray."""
+    place, color = np.empty(3), np.empty(3)
+    for ray in range(len(rays)):
+        reach, wall = np.inf, 0
+        for axis in range(3):
+            far = rays[ray, axis] > 0.0
+            way = ((room[axis] if far else 0.0) - eye[axis]) / rays[ray, axis]
+            if way < reach:
+                reach, wall = way, 2 * axis + int(far)
+        box, side, reach = _nearest_box(rays, ray, eye, corners, reach)
+        light = 0.35
+        for axis in range(3):
+            place[axis] = eye[axis] + reach * rays[ray, axis]
+            light += 0.09 * (place[axis] - lamp[axis]) ** 2
+        light = strength / light
+        if box < 0:
+            _wall_color(place, wall, patterns, pitches, colors, boards, frames, color)
+        else:
+            height = 0.999 * (place[2] - corners[box, 0, 2]) / (corners[box, 1, 2] - corners[box, 0, 2])
+            second = int(bands[box, 0] > 0.0 and (height * bands[box, 0]) % 1.0 < bands[box, 1])
+            light *= shades[box, side]
+            for channel in range(3):
+                color[channel] = box_colors[box, second, channel]
+        for channel in range(3):
+            picture[ray, channel] = light * color[channel]
 
 
-def _surface(
-    places: NDArray[np.float32], extent: NDArray[np.float64], rng: np.random.Generator, *, pictures: bool
-) -> NDArray[np.float32]:
-    """Paint on a wall or a floor: plain, stripes, tiles or planks, and pictures or windows on walls."""
-    first, second = _paint(rng), _paint(rng)
-    pattern, pitch = rng.integers(0, 5), rng.uniform(0.06, 0.5)
-    cells = np.floor(places / pitch).astype(int)
-    if pattern == 0:
-        share = (cells[:, 0] % 2).astype(np.float32)
-    elif pattern == 1:
-        share = (cells.sum(axis=1) % 2).astype(np.float32)
-    elif pattern == 2:  # boards of one wood
-        tones = rng.uniform(0.0, 0.5, 512).astype(np.float32)
-        share = tones[(cells[:, 1] + 7 * (places[:, 0] // (6 * pitch)).astype(int)) % 512]
-    else:
-        share = np.zeros(len(places), dtype=np.float32)
-    color = first + (0.5 * share)[:, None] * (second - first)
-    for _ in range(int(rng.integers(0, 4)) if pictures else 0):
-        wide, high = rng.uniform((0.3, 0.3), (1.4, 1.2))
-        left, low = rng.uniform(0.0, 1.0, 2) * np.maximum(extent - (wide, high), 0.01)
-        aside, above = (places[:, 0] - left) / wide, (places[:, 1] - low) / high
-        inside = (aside > 0.0) & (aside < 1.0) & (above > 0.0) & (above < 1.0)
-        frame = np.minimum(np.minimum(aside, 1.0 - aside), np.minimum(above, 1.0 - above)) < 0.06
-        bright = 1.0 if rng.random() < 0.3 else 0.0  # a window
-        glass = _paint(rng) * (1.0 - bright) + bright
-        slope = (above * rng.uniform(-0.5, 0.5) + 1.0)[:, None]
-        color = np.where(inside[:, None], np.where(frame[:, None], _paint(rng), glass * slope), color)
-    painted: NDArray[np.float32] = color.astype(np.float32)
-    return painted
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _nearest_box(rays: Any, ray: int, eye: Any, corners: Any, reach: float) -> Any:
+    """The first box along a ray within a reach, the axis of its face, and how far it is; -1 for none."""
+    nearest, face = -1, 0
+    for box in range(len(corners)):
+        enter, leave, side = -np.inf, np.inf, 0
+        for axis in range(3):
+            low = (corners[box, 0, axis] - eye[axis]) / rays[ray, axis]
+            high = (corners[box, 1, axis] - eye[axis]) / rays[ray, axis]
+            if min(low, high) > enter:
+                enter, side = min(low, high), axis
+            leave = min(leave, max(low, high))
+        if 0.05 < enter < leave and enter < reach:
+            nearest, face, reach = box, side, enter
+    return nearest, face, reach
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _wall_color(
+    place: Any, wall: int, patterns: Any, pitches: Any, colors: Any, boards: Any, frames: Any, color: Any
+) -> None:
+    """Write what is painted at a place of a wall: plain, stripes, tiles or boards, pictures and windows."""
+    axis = wall // 2
+    first, second = place[1 if axis == 0 else 0], place[1 if axis == 2 else 2]
+    pitch, pattern, share = pitches[wall], patterns[wall], 0.0
+    across, up = int(np.floor(first / pitch)), int(np.floor(second / pitch))
+    if pattern == _STRIPES:
+        share = across % 2
+    elif pattern == _TILES:
+        share = (across + up) % 2
+    elif pattern == _BOARDS:
+        share = boards[(up + 7 * int(first // (6.0 * pitch))) % len(boards)]
+    for channel in range(3):
+        color[channel] = colors[wall, 0, channel]
+        color[channel] += 0.5 * share * (colors[wall, 1, channel] - colors[wall, 0, channel])
+    for number in range(frames.shape[1]):
+        left, low = frames[wall, number, 0], frames[wall, number, 1]
+        wide, high = frames[wall, number, 2], frames[wall, number, 3]
+        if wide == 0.0:
+            continue
+        aside, above = (first - left) / wide, (second - low) / high
+        edge = min(aside, 1.0 - aside, above, 1.0 - above)
+        if edge > 0.0:
+            start = 4 if edge < _FRAME else 7
+            bright = 1.0 if edge < _FRAME else 1.0 + above * frames[wall, number, 10]
+            for channel in range(3):
+                color[channel] = bright * frames[wall, number, start + channel]
 
 
 def _paint(rng: np.random.Generator) -> NDArray[np.float32]:
