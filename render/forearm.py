@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-LONGEST: Final = 0.5
-"""[m]"""
+_LONGEST: Final = 0.5  # [m]
 _WRIST_GIRTH: Final = 1.92  # [hand breadths]
 _ARM_GIRTH: Final = 3.0
 _WIDEST: Final = 1.05  # how far behind the wrist the arm is widest [hand lengths]
@@ -51,8 +50,8 @@ class Forearm:
     """sRGB in [0, 1]."""
 
     def __post_init__(self) -> None:
-        if not 0.02 <= self.length <= LONGEST:
-            raise HandSimError(f"a forearm of {self.length:g} m, wanted 0.02 to {LONGEST:g}")
+        if not 0.02 <= self.length <= _LONGEST:
+            raise HandSimError(f"a forearm of {self.length:g} m, wanted 0.02 to {_LONGEST:g}")
         if not self.girth > 0.0:
             raise HandSimError(f"a forearm's girth is {self.girth:g}, wanted a positive factor")
 

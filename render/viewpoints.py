@@ -16,7 +16,6 @@ from handsim.cameras import load_rig, look_at
 from handsim.errors import ShapeError, choices
 from handsim.transforms import quaternion_matrix
 from render.camera import Camera, preset
-from render.forearm import LONGEST
 from render.shown_take import ShownTake
 
 if TYPE_CHECKING:
@@ -32,7 +31,7 @@ _SWAY: Final = 1.0  # [s] over which a head follows the hands
 _TURN: Final = 12.0  # [s] of a camera that goes round once
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
 _TRIES: Final = 20
-_CLEAR: Final = 0.15  # [m] that they keep away from the middle of an arm
+_ASIDE: Final = np.deg2rad(35.0)  # between their view and a forearm, at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,20 +183,19 @@ def _anywhere(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> 
             distance = rng.uniform(*config.distance, len(left))
             directions = [_spherical(*one) for one in zip(turns, rise, strict=True)]
             places[left] = centres[left] + distance[:, None] * np.array(directions)
-            left = left[_near_arms(take, places)[left]]
+            left = left[_behind_arms(take, places)[left]]
             if not len(left):
                 break
         paths.append(np.array([look_at(*pair) for pair in zip(places, centres, strict=True)]))
     return paths
 
 
-def _near_arms(take: ShownTake, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each frame's place is where a forearm may be."""
-    wrists, behind = take.wrists()[..., :3], -_along(take)
-    away = places[:, None] - wrists
-    share = np.clip((away * behind).sum(axis=-1, keepdims=True), 0.0, LONGEST)
-    near: NDArray[np.bool_] = (np.linalg.norm(away - share * behind, axis=-1) < _CLEAR).any(axis=1)
-    return near  # NaN, where there is no hand, is never near
+def _behind_arms(take: ShownTake, places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each frame's place is where a forearm points, so that little but the arm would be seen."""
+    away = places[:, None] - take.wrists()[..., :3]
+    cosines = -(away * _along(take)).sum(axis=-1) / np.linalg.norm(away, axis=-1)
+    behind: NDArray[np.bool_] = (cosines > np.cos(_ASIDE)).any(axis=1)
+    return behind  # NaN, where there is no hand, never is
 
 
 def _rig(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
