@@ -3,9 +3,9 @@
     MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one a core: depth alone;
-    colours, depth, ids and keypoints; the same written as WebDataset. Beside them the loop that a user would
-    write with pyrender (the same meshes, plain material, one light) and MuJoCo's own renderer (the hand's
-    capsules, no skin), each for depth and for colours.
+    colours, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
+    loop that a user would write with pyrender (the same meshes, plain material, one light) and MuJoCo's own
+    renderer (the hand's capsules, no skin), each for depth and for colours.
 accuracy: depth and ids against embree through trimesh on the same triangles.
 memory: resident memory over many pictures.
 
@@ -35,7 +35,7 @@ from render.figures import sample_people
 from render.frames import RenderedFrame
 from render.rasteriser import join, rasterise
 from render.scene import OPENGL_FROM_OPENCV
-from render.session import RenderConfig, draw_shard
+from render.session import RenderConfig, draw_frames
 from render.shown_take import ShownTake, show_simulated
 from render.skin_look import ALL_TONES
 from render.studio import Studio
@@ -46,8 +46,13 @@ from train.twins import TwinConfig, simulate_twin
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
 PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None)
-COLORS: Final = ("rgb", "depth", "ids")
-PASSES: Final = {"depth": ("depth",), "colours, depth, ids, keypoints": COLORS}
+DEPTH: Final = dataclasses.replace(PLAIN, passes=("depth",))
+COLORS: Final = dataclasses.replace(PLAIN, passes=("rgb", "depth", "ids"))
+KINDS: Final = {
+    "depth": DEPTH,
+    "colours, depth, ids, keypoints": COLORS,
+    "- painted by OpenGL": dataclasses.replace(COLORS, painter="opengl"),
+}
 
 
 @functools.lru_cache(maxsize=1)
@@ -55,22 +60,19 @@ def a_take(frames: int) -> ShownTake:
     return show_simulated(simulate_twin(TwinConfig(kind="hand-hand", num_frames=frames)))
 
 
-def pictures(passes: tuple[str, ...], frames: int, shard: int) -> Iterator[RenderedFrame]:
+def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:
     """One worker's share."""
-    take = a_take(frames)
-    config = dataclasses.replace(PLAIN, passes=passes)
-    viewpoints = Viewpoints(config.view, take, rng=np.random.default_rng(0))
-    return draw_shard(take, viewpoints, config, shard, range(frames))
+    return draw_frames(a_take(frames), config, range(frames), shard=shard)
 
 
-def draw(passes: tuple[str, ...], frames: int, shard: int) -> int:
-    for _ in pictures(passes, frames, shard):
+def draw(config: RenderConfig, frames: int, shard: int) -> int:
+    for _ in pictures(config, frames, shard):
         pass
     return shard
 
 
-def draw_and_write(folder: Path, frames: int, shard: int) -> int:
-    open_writer("webdataset", folder).write(shard, pictures(COLORS, frames, shard))
+def draw_and_write(config: RenderConfig, folder: Path, frames: int, shard: int) -> int:
+    open_writer("webdataset", folder).write(shard, pictures(config, frames, shard))
     return shard
 
 
@@ -134,8 +136,8 @@ def speed(frames: int) -> None:
     take, cores = a_take(frames), os.cpu_count() or 1
     print(f"\nimages a second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
     with tempfile.TemporaryDirectory() as folder:
-        jobs = {name: functools.partial(draw, passes, frames) for name, passes in PASSES.items()}
-        jobs["the same, written as WebDataset"] = functools.partial(draw_and_write, Path(folder), frames)
+        jobs = {name: functools.partial(draw, config, frames) for name, config in KINDS.items()}
+        jobs["- written as WebDataset"] = functools.partial(draw_and_write, COLORS, Path(folder), frames)
         for name, job in jobs.items():
             alone = rate(lambda job=job: job(0), frames)
             print(f"  {name:32s} {alone:8.1f} {rate_in_processes(job, cores, frames):8.1f}")

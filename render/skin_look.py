@@ -1,10 +1,9 @@
 """What somebody's skin looks like, in plain values, and how such people are drawn.
 
 Tones go by the individual typology angle, arctan((L* - 50) / b*) in degrees, and its six classes (Chardon,
-Cretois and Hourseau 1991, Int. J. Cosmet. Sci. 13:191). Redness and yellowness over that angle are values of
-our own that follow what surveys of human skin say in words: chroma is highest in the middle and falls towards
-both ends, most of all for the darkest skin (Xiao et al. 2017, Skin Res. Technol. 23:21). Palms hold little
-pigment in everybody, so that dark hands have palms much lighter than their backs.
+Cretois and Hourseau 1991, Int. J. Cosmet. Sci. 13:191). Redness and yellowness over that angle are our own
+choice: chroma is highest in the middle and falls towards both ends. Palms hold little pigment in everybody, so
+that dark hands have palms much lighter than their backs.
 """
 
 from __future__ import annotations
