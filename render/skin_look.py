@@ -2,8 +2,8 @@
 
 Tones go by the individual typology angle, arctan((L* - 50) / b*) in degrees, and its six classes (Chardon,
 Cretois and Hourseau 1991, Int. J. Cosmet. Sci. 13:191). Redness and yellowness over that angle are our own
-choice: chroma is highest in the middle and falls towards both ends. Palms hold little pigment in everybody, so
-that dark hands have palms much lighter than their backs.
+choice: chroma is highest in the middle and falls towards both ends. Palms hold little pigment in everybody,
+so that dark hands have palms much lighter than their backs.
 """
 
 from __future__ import annotations
