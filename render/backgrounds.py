@@ -142,15 +142,17 @@ def _octaves(
 ) -> NDArray[np.float32]:
     """Noise of all scales, each half as large as the one before and `fall` times as strong; spread 1."""
     width, height = size
-    total = np.zeros((height, width, channels), dtype=np.float32)
     cells, strength, squares = 3, 1.0, 0.0
+    total = np.zeros((cells, max(2, cells * width // height), channels), dtype=np.float32)
     while cells < height:
-        knots = rng.standard_normal((cells, max(2, cells * width // height), channels), dtype=np.float32)
-        layer = cv2.resize(knots, (width, height), interpolation=cv2.INTER_CUBIC)
-        total += np.float32(strength) * layer.reshape(total.shape)
+        shape = (max(2, cells * width // height), cells)
+        total = cv2.resize(total, shape, interpolation=cv2.INTER_CUBIC).reshape(cells, shape[0], channels)
+        total += np.float32(strength) * rng.standard_normal(total.shape, dtype=np.float32)
         squares += strength**2
         cells, strength = 2 * cells, fall * strength
-    return total / np.float32(np.sqrt(squares))
+    total *= np.float32(1.0 / np.sqrt(squares))
+    whole: NDArray[np.float32] = cv2.resize(total, size, interpolation=cv2.INTER_CUBIC)
+    return whole.reshape(height, width, channels)
 
 
 def _noise(
@@ -178,15 +180,26 @@ def _clutter(
         outline = np.stack([np.cos(turn), stretch * np.sin(turn)], axis=1) * reach
         lean = rng.uniform(0.0, 2.0 * np.pi)
         axes = np.array([[np.cos(lean), np.sin(lean)], [-np.sin(lean), np.cos(lean)]])
-        points = np.rint(16.0 * (outline @ axes + centre)).astype(np.int32)
-        mask = np.zeros((height, size[0]), dtype=np.float32)
-        cv2.fillPoly(mask, [points + np.int32(16 * 0.02 * height)], 0.5, cv2.LINE_AA, 4)
-        picture *= 1.0 - cv2.blur(mask, (9, 9))[..., None]  # its shadow
-        mask[:] = 0.0
-        cv2.fillPoly(mask, [points], 1.0, cv2.LINE_AA, 4)
         light = np.float32(rng.uniform(0.8, 1.15))
-        picture += mask[..., None] * (light * color - picture)
+        _lay_down(picture, outline @ axes + centre, light * color)
     return picture * (1.0 + 0.06 * _octaves(size, 1, 0.8, rng))
+
+
+def _lay_down(picture: NDArray[np.float32], outline: NDArray[np.float64], color: NDArray[np.float32]) -> None:
+    """Paint a thing over a picture, with its shadow to the right and below."""
+    height, width = picture.shape[:2]
+    offset = 0.02 * height
+    low = np.clip(np.floor(outline.min(axis=0)).astype(int) - 8, 0, (width, height))
+    high = np.clip(np.ceil(outline.max(axis=0) + offset).astype(int) + 8, 0, (width, height))
+    if (low >= high).any():
+        return
+    part = picture[low[1] : high[1], low[0] : high[0]]
+    mask = np.zeros(part.shape[:2], dtype=np.float32)
+    cv2.fillPoly(mask, [np.rint(16.0 * (outline + offset - low)).astype(np.int32)], 0.5, cv2.LINE_AA, 4)
+    part *= 1.0 - cv2.blur(mask, (9, 9))[..., None]
+    mask[:] = 0.0
+    cv2.fillPoly(mask, [np.rint(16.0 * (outline - low)).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
+    part += mask[..., None] * (color - part)
 
 
 @functools.lru_cache(maxsize=2)

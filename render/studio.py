@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+import cv2
 import numpy as np
 
 from handsim.errors import HandSimError
@@ -21,6 +22,7 @@ from render.frames import BodyTruth, Pictures, RenderedFrame
 from render.lights import Lighting
 from render.painter import Painter, paint, put_before
 from render.rasteriser import NEAR, join, rasterise
+from render.shading import GAMMA
 from render.shown_take import ShownTake
 from render.truth import hand_truth
 from render.warp import faces_for, warp, warp_depth, warp_normals
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PASSES: Final = ("rgb", "depth", "normals", "ids")
-_GAMMA: Final = 2.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +265,6 @@ def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
 @functools.lru_cache(maxsize=2)
 def _background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """SRGB from 0 to 255."""
-    drawn: NDArray[np.float32] = (255.0 * draw_background(background, size) ** (1.0 / _GAMMA)).astype(
-        np.float32
-    )
+    display = cv2.pow(draw_background(background, size), 1.0 / GAMMA)
+    drawn: NDArray[np.float32] = np.multiply(display, np.float32(255.0), out=display)
     return drawn
