@@ -93,20 +93,17 @@ class Studio:
         rng = np.random.default_rng(choices.seed)
         drawn = self._drawn(frame, 0.0)
         _check_outside(camera, drawn, frame)
-        present = [
-            number for number, figure in enumerate(self._hands) if self._pose(figure, frame) is not None
-        ]
+        present = [n for n, hand in enumerate(self._hands) if self._pose(hand, frame) is not None]
         noisy = "depth" in self.passes and choices.depth_noise is not None
         truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self.passes:
             rgb = self._colors_of(camera, drawn, choices)
             noisy_rgb = self._exposed(frame, camera, rgb, choices, rng)
-        if "depth" in self.passes and choices.depth_noise is not None:
-            assert truth.depth is not None
-            infrared = self._infrared(truth, rgb, present)
+        if noisy and truth.depth is not None:
+            light, sensor = self._infrared(truth, rgb, present), choices.depth_noise
             noisy_depth = apply_depth_noise(
-                truth.depth, truth.normals, choices.depth_noise, camera=camera, reflectance=infrared, rng=rng
+                truth.depth, truth.normals, sensor, camera=camera, reflectance=light, rng=rng
             )
         hands = tuple(
             hand_truth(self._hands[number], self.take.hands[number].qpos[frame], place, camera, truth)
