@@ -33,15 +33,16 @@ from handsim.shape import sample_shape
 from handsim.topology import SIDES, Side
 from poses.library import gesture
 from poses.validity import make_valid
-from render.backgrounds import Background, BackgroundConfig, sample_background
+from render.backgrounds import Background, BackgroundConfig
 from render.camera import Camera, preset
 from render.exposure import ExposureConfig, sample_exposure
 from render.figures import sample_people
 from render.frames import RenderedFrame
-from render.lights import sample_lighting
+from render.lights import Lighting
 from render.shown_take import ShownHand, ShownTake
 from render.skin_look import TONES
 from render.studio import FrameChoices, Studio
+from render.surroundings import sample_surroundings
 from render.writer import open_writer
 
 POSES: Final[dict[str, tuple[str, ...]]] = {
@@ -128,7 +129,13 @@ def place_camera(model: HandModel, qpos: np.ndarray, view: str, rng: np.random.G
 
 
 def photograph(
-    number: int, case: Case, background: Background, *, shown: bool, rng: np.random.Generator
+    number: int,
+    case: Case,
+    background: Background,
+    lighting: Lighting,
+    *,
+    shown: bool,
+    rng: np.random.Generator,
 ) -> RenderedFrame:
     """A picture of the hand, or of what is behind it."""
     qpos = case.qpos[None] if shown else np.full((1, len(case.qpos)), np.nan)
@@ -147,9 +154,9 @@ def frames_of(name: str, hands: int, empty: int, seed: int, cases: list[Case]) -
     """The pictures of one set, those without a hand last; what they show is added to `cases`."""
     for number in range(hands + empty):
         rng = np.random.default_rng([seed, list(SETS).index(name), number])
-        background = sample_background(SETS[name], rng=rng)
+        behind = sample_surroundings(SETS[name], rng=rng)
         cases.append(make_case(number, rng))
-        yield photograph(number, cases[-1], background, shown=number < hands, rng=rng)
+        yield photograph(number, cases[-1], *behind, shown=number < hands, rng=rng)
         if sys.stderr.isatty():
             print(f"\r{name}: {number + 1} of {hands + empty}", end="", file=sys.stderr)
 

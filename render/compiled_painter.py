@@ -50,13 +50,12 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, counts, strict=False)])
     vertices = np.concatenate([mesh.vertices[:, :6] for mesh in meshes])
     nearness, first = nearest_faces(vertices[:, :3], faces, (2 * width, 2 * height), farthest=0.0)
-    lamps = _lamp_table(lighting)
+    lamps, around = _lamp_table(lighting), np.zeros((9, 3))
+    around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
     shadows = shadow_map(vertices[:, 3:], faces, lamps[0, :3])
     sums = np.zeros((height, width, 4), dtype=np.float32)
     for mesh in meshes:
-        _shade(
-            nearness, first, *mesh, lamps, np.array(lighting.ambient), *shadows, TO_LINEAR, TO_DISPLAY, sums
-        )
+        _shade(nearness, first, *mesh, lamps, around, *shadows, TO_LINEAR, TO_DISPLAY, sums)
     painted: NDArray[np.uint8] = np.rint(63.75 * sums).astype(np.uint8)
     return painted
 

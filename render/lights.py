@@ -1,7 +1,6 @@
 """The light in a picture: one lamp that casts shadows, a few that do not, and light from everywhere.
 
-pyrender knows no light from pictures of rooms; far lamps from above, from the ground and from the side
-stand in for a room's bright and dark walls. Directions are in the camera's axes (x right, y down, z ahead)
+Directions are in the camera's axes (x right, y down, z ahead)
 and point from the hand to the lamp, so that the same lighting suits every view.
 """
 
@@ -41,17 +40,21 @@ class Lighting:
     """All light of one picture.
 
     Raises:
-        HandSimError: There are more than five lamps.
+        HandSimError: There are more than five lamps, or the surroundings have not nine rows.
     """
 
     lamps: tuple[Lamp, ...]
     """The first casts shadows."""
     ambient: tuple[float, float, float]
     """What a white surface sends back of the light from everywhere, linear."""
+    surroundings: tuple[tuple[float, float, float], ...] = ()
+    """The same by the surface's normal, see `surroundings.irradiance`; OpenGL takes `ambient` for all."""
 
     def __post_init__(self) -> None:
         if len(self.lamps) > _MOST_LAMPS:
             raise HandSimError(f"{len(self.lamps)} lamps, wanted at most {_MOST_LAMPS}")
+        if len(self.surroundings) not in (0, 9):
+            raise HandSimError(f"{len(self.surroundings)} rows of light from around, wanted none or nine")
 
 
 STUDIO: Final = Lighting(

@@ -16,7 +16,7 @@ import numpy as np
 from handsim.errors import HandSimError, ShapeError, choices
 from handsim.json_files import claim
 from handsim.processes import in_processes
-from render.backgrounds import BackgroundConfig, photo_files, sample_background
+from render.backgrounds import BackgroundConfig, photo_files
 from render.blur import ShutterConfig, sample_shutter
 from render.contact_sheet import contact_sheet
 from render.depth_noise import DepthNoiseConfig, sample_depth_noise
@@ -24,11 +24,11 @@ from render.exposure import ExposureConfig, sample_exposure
 from render.figures import sample_people
 from render.frames import RenderedFrame
 from render.labels import write_png
-from render.lights import sample_lighting
 from render.painter import Painter
 from render.shown_take import ShownTake, load_shown_take
 from render.skin_look import ALL_TONES
 from render.studio import PASSES, FrameChoices, Studio
+from render.surroundings import sample_surroundings
 from render.viewpoints import ViewConfig, Viewpoints
 from render.writer import FORMATS, NEED_COLORS, open_writer
 
@@ -212,9 +212,10 @@ def draw_shard(
 
 
 def _choices(config: RenderConfig, rng: np.random.Generator) -> FrameChoices:
+    background, lighting = sample_surroundings(config.background, rng=rng)
     return FrameChoices(
-        lighting=sample_lighting(rng=rng),
-        background=sample_background(config.background, rng=rng),
+        lighting=lighting,
+        background=background,
         exposure=None if config.color_sensor is None else sample_exposure(config.color_sensor, rng=rng),
         shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
         depth_noise=None if config.depth_sensor is None else sample_depth_noise(config.depth_sensor, rng=rng),

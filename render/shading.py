@@ -81,7 +81,7 @@ def light_up(
         spot: See `SPOT`.
         glow: See `Material.glow`.
         lamps: Rows (9): unit vector to the lamp, and its light with and without shadows.
-        ambient: Light from everywhere (3,).
+        ambient: Light from everywhere by the normal (9, 3), see `surroundings.irradiance`.
         to_map: The first lamp's `ShadowMap`, as the next two.
         nearest: The same.
         bias: The same.
@@ -94,11 +94,11 @@ def light_up(
     rough = max(spot[17], 0.04)
     square, k = rough**4, (rough + 1.0) ** 2 / 8.0
     red, green, blue = spot[14], spot[15], spot[16]
-    light[0], light[1], light[2] = (
-        red * (ambient[0] + glow),
-        green * (ambient[1] + glow),
-        blue * (ambient[2] + glow),
-    )
+    for i in range(3):
+        around = ambient[0, i] + nx * ambient[1, i] + ny * ambient[2, i] + nz * ambient[3, i]
+        around += nx * ny * ambient[4, i] + ny * nz * ambient[5, i] + nx * nz * ambient[6, i]
+        around += (nx * nx - ny * ny) * ambient[7, i] + (3.0 * nz * nz - 1.0) * ambient[8, i]
+        light[i] = spot[14 + i] * (max(around, 0.0) + glow)
     for lamp in range(len(lamps)):
         lx, ly, lz = lamps[lamp, 0], lamps[lamp, 1], lamps[lamp, 2]
         slope = nx * lx + ny * ly + nz * lz
