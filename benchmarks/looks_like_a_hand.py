@@ -144,9 +144,7 @@ def photograph(
     people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
     studio = Studio(ShownTake(60.0, np.zeros(1), (hand,), (), *nothing), people, [], ("rgb", "ids", "depth"))
     exposure = sample_exposure(ExposureConfig(), rng=rng)
-    choices = FrameChoices(
-        sample_lighting(rng=rng), background, exposure, None, None, int(rng.integers(2**31))
-    )
+    choices = FrameChoices(lighting, background, exposure, None, None, int(rng.integers(2**31)))
     return dataclasses.replace(studio.photograph(0, case.camera, choices), number=number)
 
 
