@@ -75,6 +75,7 @@ def _differences(grid: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 def relief() -> NDArray[np.float64]:
     """Height [m] of what every hand has: tendons to the four fingers, knuckles, and hollows between them."""
     texels, shape = skin_texels(), named_shape("M")
+    back = smooth(texels.dorsal, -0.25, 0.35)  # of each digit, the thumb's turned aside
     places = texels.places[:, :2]
     height = np.zeros(len(places))
     knuckles = shape.knuckles[1:, :2]
@@ -86,13 +87,13 @@ def relief() -> NDArray[np.float64]:
         height += 0.0005 * bump(np.linalg.norm(places - knuckle, axis=1), 0.0065)
     for hollow in 0.5 * (knuckles[:-1] + knuckles[1:]) + [0.004, 0.0]:
         height -= 0.0004 * bump(np.linalg.norm(places - hollow, axis=1), 0.0055)
-    height *= texels.back * texels.palm
+    height *= back * texels.palm
     for digit in texels.digits:
         for joint, high, wide in zip(
             np.cumsum(digit.lengths)[:2], (0.0005, 0.0003), (0.006, 0.0045), strict=True
         ):
             knob = high * bump(digit.along - joint, wide) * bump(digit.turn, 1.0)
-            height[digit.texels] += knob * texels.back[digit.texels] * digit.share
+            height[digit.texels] += knob * back[digit.texels] * digit.share
     return height
 
 

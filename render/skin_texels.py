@@ -76,7 +76,9 @@ def skin_texels() -> Texels:
     places, normals, dorsal, weights = grid[:, :3], grid[:, 3:6], grid[:, 6], grid[:, 7:]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     digits = tuple(_digit_texels(model, digit, places, weights) for digit in range(len(DIGITS)))
-    return Texels(places, normals, dorsal, smooth(dorsal, -0.25, 0.35), weights[:, 0], digits)
+    # The thumb's own back is turned aside, but what of it is seen from the hand's back is no palm's skin.
+    back = smooth(np.maximum(dorsal, normals[:, 2]), -0.25, 0.35)
+    return Texels(places, normals, dorsal, back, weights[:, 0], digits)
 
 
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -66,7 +66,7 @@ def _painted(
     lab = np.empty((len(back), 3))
     lab[:, 0] = look.palm_lightness + back * (look.lightness - look.palm_lightness)
     # The palm of a dark hand is no redder or yellower than other palms: chroma goes with the pigment.
-    lab[:, 1] = 13.0 + back * (look.redness - 13.0)
+    lab[:, 1] = 15.0 + back * (look.redness - 15.0)
     lab[:, 2] = 16.0 + back * (look.yellowness - 16.0)
     _flush(lab, look)
     veins = _veins(rng)
@@ -78,7 +78,7 @@ def _painted(
     lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
     height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
     height += look.relief * 2e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
-    paint = _Paint(lab, np.full(len(back), look.roughness), height)
+    paint = _Paint(lab, np.minimum(look.roughness + 0.1 * (1.0 - back), 1.0), height)
     _nails(paint, look)
     if forearm is not None and forearm.sleeve < forearm.length:
         _sleeve(paint, forearm, rng)
@@ -138,7 +138,7 @@ def _nails(paint: _Paint, look: SkinLook) -> None:
     """Nail plates: pinker and smoother than the skin, a pale moon, a whiter free edge, and a dark fold."""
     for number, digit in enumerate(skin_texels().digits):
         joint, tip = np.cumsum(digit.lengths)[1:]
-        start, end = joint + 0.42 * (tip - joint), tip - 0.0012
+        start, end = joint + 0.34 * (tip - joint), tip - 0.0012
         middle, half = 0.5 * (start + end), 0.5 * (end - start)
         wide = 1.0 if number else 1.12
         a = (digit.along - middle) / half
