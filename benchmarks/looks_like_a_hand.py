@@ -42,7 +42,7 @@ from render.lights import Lighting
 from render.shown_take import ShownHand, ShownTake
 from render.skin_look import TONES
 from render.studio import FrameChoices, Studio
-from render.surroundings import sample_surroundings
+from render.surroundings import expose_for, sample_surroundings
 from render.writer import open_writer
 
 POSES: Final[dict[str, tuple[str, ...]]] = {
@@ -144,6 +144,7 @@ def photograph(
     people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
     studio = Studio(ShownTake(60.0, np.zeros(1), (hand,), (), *nothing), people, [], ("rgb", "ids", "depth"))
     exposure = sample_exposure(ExposureConfig(), rng=rng)
+    lighting = expose_for(lighting, people[0].skin)
     choices = FrameChoices(lighting, background, exposure, None, None, int(rng.integers(2**31)))
     return dataclasses.replace(studio.photograph(0, case.camera, choices), number=number)
 
@@ -152,9 +153,9 @@ def frames_of(name: str, hands: int, empty: int, seed: int, cases: list[Case]) -
     """The pictures of one set, those without a hand last; what they show is added to `cases`."""
     for number in range(hands + empty):
         rng = np.random.default_rng([seed, list(SETS).index(name), number])
-        behind = sample_surroundings(SETS[name], rng=rng)
+        background, lighting = sample_surroundings(SETS[name], None, rng=rng)
         cases.append(make_case(number, rng))
-        yield photograph(number, cases[-1], *behind, shown=number < hands, rng=rng)
+        yield photograph(number, cases[-1], background, lighting, shown=number < hands, rng=rng)
         if sys.stderr.isatty():
             print(f"\r{name}: {number + 1} of {hands + empty}", end="", file=sys.stderr)
 

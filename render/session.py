@@ -26,7 +26,7 @@ from render.frames import RenderedFrame
 from render.labels import write_png
 from render.painter import Painter
 from render.shown_take import ShownTake, load_shown_take
-from render.skin_look import ALL_TONES
+from render.skin_look import ALL_TONES, SkinLook
 from render.studio import PASSES, FrameChoices, Studio
 from render.surroundings import sample_surroundings
 from render.viewpoints import ViewConfig, Viewpoints
@@ -202,17 +202,18 @@ def draw_shard(
     people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in take.bodies]
     studio = Studio(take, people, colors, config.passes, painter=config.painter)
-    kept = _choices(config, rng)
+    skin = people[0].skin if config.dress == "skin" else None
+    kept = _choices(config, skin, rng)
     for frame, seed in zip(frames, seeds[1:], strict=True):
         own = np.random.default_rng(seed)
-        chosen = _choices(config, own) if config.vary == "frame" else kept
+        chosen = _choices(config, skin, own) if config.vary == "frame" else kept
         for camera in viewpoints.cameras(frame):
             fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
             yield studio.photograph(frame, camera, fresh)
 
 
-def _choices(config: RenderConfig, rng: np.random.Generator) -> FrameChoices:
-    background, lighting = sample_surroundings(config.background, rng=rng)
+def _choices(config: RenderConfig, skin: SkinLook | None, rng: np.random.Generator) -> FrameChoices:
+    background, lighting = sample_surroundings(config.background, skin, rng=rng)
     return FrameChoices(
         lighting=lighting,
         background=background,

@@ -14,6 +14,7 @@ import numpy as np
 
 from render.backgrounds import Background, BackgroundConfig, draw_background, sample_background
 from render.lights import Lighting, sample_lighting
+from render.skin_look import SkinLook
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 _SIZE: Final = (64, 48)  # of the picture that gives light
 _DIRECTIONS: Final = 1024
+_MIDDLE_SKIN: Final = 0.3  # reflectance
+_METERED: Final = 0.5
 _SHARE: Final = (0.2, 0.8)  # of the light from everywhere that has the picture's colours
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 # What a matt surface makes of each order, and the integrals of the squared functions over the sphere.
@@ -28,18 +31,35 @@ _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])
 _SQUARES: Final = np.pi * np.array([4.0, *[4.0 / 3.0] * 3, *[4.0 / 15.0] * 3, 16.0 / 15.0, 16.0 / 5.0])
 
 
-def sample_surroundings(config: BackgroundConfig, *, rng: np.random.Generator) -> tuple[Background, Lighting]:
+def sample_surroundings(
+    config: BackgroundConfig, skin: SkinLook | None, *, rng: np.random.Generator
+) -> tuple[Background, Lighting]:
     """A random background, and random lamps in the light that it gives.
 
     Args:
         config: Which backgrounds.
+        skin: Whose hands the picture is exposed for; None for gloves.
         rng: Where the choices come from.
 
     Raises:
         HandSimError: There is no photograph that can be read.
     """
     background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng)
-    return background, surround(lighting, draw_background(background, _SIZE), rng.uniform(*_SHARE))
+    lighting = surround(lighting, draw_background(background, _SIZE), rng.uniform(*_SHARE))
+    return background, lighting if skin is None else expose_for(lighting, skin)
+
+
+def expose_for(lighting: Lighting, skin: SkinLook) -> Lighting:
+    """The light as a camera has it that looks at a hand: more of it for dark skin, less for light.
+
+    Cameras meter the picture's middle and what is around it; half of what skins differ by is made up for.
+    """
+    reflectance = ((skin.lightness + 16.0) / 116.0) ** 3  # CIELAB's definition
+    gain = float((_MIDDLE_SKIN / reflectance) ** _METERED)
+    lamps = tuple(dataclasses.replace(lamp, strength=gain * lamp.strength) for lamp in lighting.lamps)
+    red, green, blue = (gain * level for level in lighting.ambient)
+    around = tuple((gain * r, gain * g, gain * b) for r, g, b in lighting.surroundings)
+    return Lighting(lamps, (red, green, blue), around)
 
 
 def surround(lighting: Lighting, picture: Float[np.ndarray, "H W 3"], share: float) -> Lighting:

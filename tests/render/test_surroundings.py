@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from handsim.errors import HandSimError
 from render.backgrounds import BackgroundConfig
 from render.lights import Lighting, sample_lighting
-from render.surroundings import irradiance, sample_surroundings, surround
+from render.skin_look import SkinLook
+from render.surroundings import expose_for, irradiance, sample_surroundings, surround
 
 
 def sent_back(rows: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -65,5 +66,20 @@ def test_a_dark_picture_gives_no_light_that_is_none() -> None:
 
 
 def test_surroundings_repeat() -> None:
-    first, again = (sample_surroundings(BackgroundConfig(), rng=np.random.default_rng(3)) for _ in range(2))
+    first, again = (
+        sample_surroundings(BackgroundConfig(), None, rng=np.random.default_rng(3)) for _ in range(2)
+    )
     assert first == again and len(first[1].surroundings) == 9
+
+
+def test_pictures_are_exposed_for_the_hand() -> None:
+    lighting = surround(sample_lighting(rng=np.random.default_rng(0)), np.full((4, 4, 3), 0.3), 0.5)
+    dark, light = (
+        expose_for(lighting, SkinLook(lightness=level, palm_lightness=66.0)) for level in (35.0, 75.0)
+    )
+    gain = np.array(dark.ambient) / light.ambient
+    np.testing.assert_allclose(
+        gain, (((75 + 16) / (35 + 16)) ** 3) ** (1 / 3)
+    )  # a third of what they differ by
+    np.testing.assert_allclose(dark.lamps[0].strength / light.lamps[0].strength, gain[0])
+    np.testing.assert_allclose(np.array(dark.surroundings), gain[0] * np.array(light.surroundings))
