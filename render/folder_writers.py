@@ -8,7 +8,7 @@ from typing import Any
 
 from handsim.errors import HandSimError
 from render.annotations import coco, hands_json, interhand
-from render.annotations.common import to_json
+from render.annotations.common import to_json, without_colors
 from render.exr import write_exr
 from render.frames import RenderedFrame
 from render.png_depth import encode_pictures
@@ -155,7 +155,7 @@ def _write_pictures(folder: Path, frame: RenderedFrame, *, lossless: bool) -> No
 
 def _need_colours(frame: RenderedFrame, name: str) -> None:
     if frame.ideal.rgb is None and frame.noisy.rgb is None:
-        raise HandSimError(f"the format {name} needs colour pictures; add rgb to the passes")
+        raise without_colors(name)
 
 
 def _coco_file(

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from handsim.errors import DatasetError, HandSimError
-from render.annotations.common import as_sensed, hand_mask, to_json
+from render.annotations.common import as_sensed, hand_mask, to_json, without_colors
 from render.annotations.freihand import LISTS, SET, hand_entries
 from render.frames import RenderedFrame
 from render.png_depth import encode_depth, encode_jpeg
@@ -131,7 +131,7 @@ def _is_pair(value: Any) -> bool:
 def _pictures(frame: RenderedFrame, hand: int) -> dict[str, bytes]:
     sensed = as_sensed(frame)
     if sensed.rgb is None:
-        raise HandSimError("the format freihand needs colour pictures; add rgb to the passes")
+        raise without_colors("freihand")
     files = {"rgb": encode_jpeg(sensed.rgb)}
     mask = hand_mask(frame, hand)
     if mask is not None:  # JPEG, because FreiHAND's readers ask for it; its best keeps black and white apart

@@ -16,6 +16,7 @@ import numpy as np
 from handsim.errors import HandSimError, ShapeError, choices
 from handsim.json_files import claim
 from handsim.processes import in_processes
+from render.annotations.common import without_colors
 from render.backgrounds import BackgroundConfig, photo_files
 from render.blur import ShutterConfig, sample_shutter
 from render.contact_sheet import contact_sheet
@@ -133,7 +134,7 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
         if name not in FORMATS:
             raise HandSimError(choices(name, FORMATS, noun="format"))
         if name in NEED_COLORS and "rgb" not in config.passes:
-            raise HandSimError(f"the format {name} needs colour pictures; add rgb to the passes")
+            raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, wanted at least one, each once")
 

@@ -98,6 +98,11 @@ def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:
     return hands
 
 
+def without_colors(name: str) -> HandSimError:
+    """What to say where a format is asked for that is nothing without colour pictures."""
+    return HandSimError(f"the format {name} needs colour pictures; add rgb to the passes")
+
+
 def rigid_record(transform: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
     """A rigid transform as quaternion (wxyz) and translation [m]."""
     return {
