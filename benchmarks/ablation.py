@@ -5,7 +5,7 @@
     handsim train SET --rig-share 1 --samples 700000 --out RIG
     python benchmarks/ablation.py --runs DROPS RIG [--captures FOLDER]
 
-Prints one table a figure: test sets down, labelers across. FOLDER holds labelled captures; without it only
+Prints one table a figure: test sets down, labelers across. FOLDER holds labeled captures; without it only
 the simulated twins are tested.
 """
 
@@ -18,10 +18,10 @@ import tyro
 from machine import describe
 
 from gloves.captures.collection import find_captures, read_markers
-from train.augmentation import Corruption
-from train.evaluation import Report, evaluate_labeler, evaluate_takes
-from train.labeler import load_labeler
-from train.twins import KINDS, TwinConfig, simulate_twin
+from train.data.augmentation import Corruption
+from train.evaluation.labeler_evaluation import Report, evaluate_labeler, evaluate_takes
+from train.labelers.storage import load_labeler
+from train.simulation.twins import KINDS, TwinConfig, simulate_twin
 
 FIGURES = {
     "slot_accuracy": "slot accuracy",

@@ -16,14 +16,14 @@ from machine import describe
 
 from gloves.attach import attach
 from gloves.layout import load_layout
-from gloves.visibility import free_rays
-from handsim.cameras import named_rig
-from handsim.model import HandModel, join_qpos
-from handsim.shape import EVERYBODY
-from handsim.transforms import random_quaternions
-from poses.couplings import HIGH, LOW
-from poses.validity import sample_valid_angles
-from train.synthesis import sample_hands
+from gloves.optics.visibility import free_rays
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import EVERYBODY
+from handsim.space.cameras import named_rig
+from handsim.space.transforms import random_quaternions
+from poses.shapes.couplings import HIGH, LOW
+from poses.shapes.validity import sample_valid_angles
+from train.simulation.synthesis import sample_hands
 
 CHECKED = 20  # frames a hand that MuJoCo repeats
 

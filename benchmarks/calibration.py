@@ -4,7 +4,8 @@
         [--picture FILE.png] [--captures FOLDER]
 
 Each user is one hand, right and left in turn: a size's mean hand made 8 % larger or smaller, with the
-individual spreads of `handsim.shape.sample_shape`, in a glove whose markers sit 5 mm from where they belong,
+individual spreads of `handsim.hand.shape.sample_shape`, in a glove whose markers sit 5 mm from where they
+belong,
 along the skin, and 0.3 mm above or below it. It makes a capture of touches and free motion before the 16
 cameras of "figure5"; labels are the truth's. The calibration begins with the size's mean hand and the glove
 as designed. Another capture of the same user holds the touches that the gaps are told for: of all frames in
@@ -12,10 +13,10 @@ which the true flesh of thumb and finger meets, how far the flesh of the tracked
 or dug in, and how far the distance of its skins is from that of the true hand's.
 
 The same capture is calibrated three times more: from the mean hand of the next size, farther from the truth;
-with 1 % of labels wrong, neighbours having exchanged their names for a while; and with flesh that moves every
+with 1 % of labels wrong, neighbors having exchanged their names for a while; and with flesh that moves every
 marker by 0.5 mm RMS as its digit bends.
 
-FOLDER holds labelled dense19 captures of real people, one sub-folder each (right hands, *_right.trc): the
+FOLDER holds labeled dense19 captures of real people, one sub-folder each (right hands, *_right.trc): the
 first half of each calibrates, the second is tracked. There the truth is not known, only what markers are off.
 """
 
@@ -31,21 +32,21 @@ from machine import describe
 from people import right_hands
 
 from gloves.attach import attach
+from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, load_layout
-from gloves.take import Take
-from handsim.model import HandModel, join_qpos
-from handsim.shape import SIZES, HandShape, sample_shape, shape_from_measures
-from handsim.topology import BONES, SIDES
-from handsim.transforms import quaternion_matrix
-from poses.touch import FINGERS, is_touching, thumb_contact
-from track.calibration import calibrate
-from track.calibration_picture import save_picture
-from track.contacts import meet, place_contacts
-from track.hand_errors import hand_errors
-from track.inverse_kinematics import PoseSolver
-from track.skin_walk import SkinPatch, slip
-from track.user import UserHand, usual_hand
-from train.calibration_take import CalibrationTakeConfig, simulate_calibration
+from gloves.takes.take import Take
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import SIZES, HandShape, sample_shape, shape_from_measures
+from handsim.hand.topology import BONES, SIDES
+from handsim.space.transforms import quaternion_matrix
+from poses.shapes.touch import FINGERS, is_touching, thumb_contact
+from track.calibration.contacts import meet, place_contacts
+from track.calibration.picture import save_picture
+from track.calibration.skin_walk import SkinPatch, slip
+from track.calibration.user_calibration import calibrate
+from track.evaluation.hand_errors import hand_errors
+from track.kinematics.pose_solver import PoseSolver
+from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
 OFF, SLIP, LIFT = 0.08, 0.005, 0.0003
 WRONG, LASTING = 0.01, 30  # share of labels, frames that an exchange lasts on the average
@@ -70,19 +71,19 @@ def draw_shape(size: str, factor: float, rng: np.random.Generator) -> HandShape:
 
 def draw_user(
     number: int, layout: MarkerLayout, rng: np.random.Generator
-) -> tuple[UserHand, UserHand, UserHand]:
+) -> tuple[GloveFit, GloveFit, GloveFit]:
     """Somebody's hand in its glove, the hand that a calibration begins with, and one a size farther off."""
     sizes, index, side = list(SIZES), 1 + number % 3, SIDES[1 - number % 2]
     grown = 1 if number % 4 < 2 else -1
     shape = draw_shape(sizes[index], 1.0 + OFF * grown, rng)
     model = HandModel(shape)
     worn = slip(attach(layout, model), shape, SLIP, LIFT, rng=rng)
-    starts = (usual_hand(layout, size, side) for size in (sizes[index], sizes[index - grown]))
-    return UserHand(model, worn).with_side(side), *starts
+    starts = (nominal_fit(layout, size, side) for size in (sizes[index], sizes[index - grown]))
+    return GloveFit(model, worn).with_side(side), *starts
 
 
-def exchange_labels(markers: np.ndarray, true: UserHand, rng: np.random.Generator) -> np.ndarray:
-    """Markers of which neighbours exchange their names for a while, until `WRONG` of all labels are wrong."""
+def exchange_labels(markers: np.ndarray, true: GloveFit, rng: np.random.Generator) -> np.ndarray:
+    """Markers of which neighbors exchange their names for a while, until `WRONG` of all labels are wrong."""
     points, wrong = true.attachment.points, np.zeros(markers.shape[:2], dtype=bool)
     apart = np.linalg.norm(points[:, None] - points, axis=2) + np.diag(np.full(len(points), np.inf))
     markers = markers.copy()
@@ -95,7 +96,7 @@ def exchange_labels(markers: np.ndarray, true: UserHand, rng: np.random.Generato
     return markers
 
 
-def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: UserHand, rng: np.random.Generator) -> np.ndarray:
+def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: GloveFit, rng: np.random.Generator) -> np.ndarray:
     """Markers moved with their digit's hinges, each in its own way; the palm's with the fingers' knuckles."""
     turns, moved = quaternion_matrix(qpos[:, 3:7]), markers.copy()
     for marker, bone in enumerate(true.attachment.bone_indices[:, 0]):
@@ -107,7 +108,7 @@ def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: UserHand, rng: np.ra
     return moved
 
 
-def held_out_gaps(hand: UserHand, true: UserHand, take: Take) -> np.ndarray:
+def held_out_gaps(hand: GloveFit, true: GloveFit, take: Take) -> np.ndarray:
     """Means over each finger's touches (4, 2) [m]: flesh from touching, skins from the true ones."""
     markers, qpos = take.observed(take.hand_labels[0]), take.hands[0].qpos
     gaps = np.full((len(FINGERS), 2), np.nan)
@@ -116,7 +117,7 @@ def held_out_gaps(hand: UserHand, true: UserHand, take: Take) -> np.ndarray:
         enough = np.isfinite(markers[..., 0]).sum(axis=1) >= markers.shape[1] - 3
         frames = np.flatnonzero(touching & enough)[::EVERY]
         if len(frames):
-            tracked = PoseSolver(hand.model, hand.attachment).solve(markers[frames]).qpos
+            tracked = PoseSolver(hand).solve(markers[frames]).qpos
             flesh = thumb_contact(hand.model, tracked[:, 7:], finger).overlap
             off = skin_gaps(hand.model, tracked, finger) - skin_gaps(true.model, qpos[frames], finger)
             gaps[number] = np.abs(flesh).mean(), np.abs(off).mean()
@@ -132,7 +133,7 @@ def skin_gaps(model: HandModel, qpos: np.ndarray, finger: str) -> np.ndarray:
     return meet(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
 
 
-def tell(name: str, hand: UserHand, true: UserHand, held_out: Take) -> list[float]:
+def tell(name: str, hand: GloveFit, true: GloveFit, held_out: Take) -> list[float]:
     """Print how far a hand is from the truth; returns what is averaged over users."""
     errors, gaps = hand_errors(hand, true), 1e3 * held_out_gaps(hand, true, held_out)
     places, lengths = 1e3 * errors.places, 100.0 * np.abs(errors.lengths)
@@ -150,7 +151,7 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
     """Simulate a user, calibrate in every way, print; what is averaged over users, by the way."""
     rng = np.random.default_rng((arguments.seed, number))
     true, start, farther = draw_user(number, layout, rng)
-    worn = ((true.model, true.attachment),)
+    worn = (true,)
     made = CalibrationTakeConfig(free=arguments.free, rounds=arguments.rounds)
     take = simulate_calibration(worn, made, rng=rng)
     held_out = simulate_calibration(worn, CalibrationTakeConfig(free=3.0, rounds=4), rng=rng)
@@ -183,11 +184,8 @@ def tell_people(captures: Path, layout: MarkerLayout) -> None:
     for name, markers in right_hands(captures, layout.names).items():
         half = len(markers) // 2
         seen = markers[half:][np.isfinite(markers[half:, :, 0]).all(axis=1)][::EVERY]
-        result = calibrate(markers[:half], usual_hand(layout, "M", "right"), 120.0)
-        off = [
-            1e3 * PoseSolver(hand.model, hand.attachment).solve(seen).rms
-            for hand in (result.start, result.hand)
-        ]
+        result = calibrate(markers[:half], nominal_fit(layout, "M", "right"), 120.0)
+        off = [1e3 * PoseSolver(hand).solve(seen).rms for hand in (result.start, result.hand)]
         print(f"{name}: {len(seen)} held-out frames, 3D RMS median {np.median(off[0]):.2f} mm before, "
               f"{np.median(off[1]):.2f} mm after (p95 {np.percentile(off[1], 95):.2f}); "
               f"{len(result.touches)} touches found")  # fmt: skip

@@ -10,7 +10,7 @@ system tells apart. The next one then takes its place, somewhere else. The marke
 are.
 
 Who labels such a take by hand takes a ghost within 3 mm of a marker that has no point for the marker; that is
-the truth of the simulated room as well (`train.room`), and here.
+the truth of the simulated room as well (`train.simulation.room`), and here.
 """
 
 from __future__ import annotations
@@ -21,12 +21,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from gloves.attach import attach
-from gloves.identities import number_runs
-from gloves.mirrors import reflect
-from gloves.take import Take
-from handsim.model import HandModel
-from train.room import _owned
+from gloves.optics.identities import number_runs
+from gloves.optics.mirrors import reflect
+from gloves.takes.take import Take
+from train.simulation.room import _owned
 
 NUMBER = 20  # ghosts a frame
 BORN = (0.010, 0.050)  # [m] from a marker
@@ -63,8 +61,7 @@ def with_drum(take: Take, first: int, *, rng: np.random.Generator) -> Take:
 def _places(take: Take, number: int) -> np.ndarray:
     """Where the markers of a hand truly are (T, M, 3) [m]."""
     hand = take.hands[number]
-    model = HandModel(hand.shape)
-    return attach(hand.layout, model).centres(model, model.forward_kinematics(hand.qpos))
+    return hand.fit.markers(hand.qpos)[0]
 
 
 def _life(take: Take, markers: np.ndarray, frame: int, rng: np.random.Generator) -> np.ndarray:

@@ -15,16 +15,16 @@ from machine import describe
 
 from gloves.captures.collection import find_captures, read_markers
 from gloves.layout import load_layout
-from train.batches import draw_batch
 from train.config import TrainConfig
-from train.kinds import labeler_of
+from train.data.batches import draw_batch
+from train.data.shards import Dataset
+from train.evaluation.paper import AUGMENTATIONS, TABLE2
+from train.evaluation.tables import measure_augmentations
+from train.labelers.kinds import labeler_of
 from train.loop import start_fabric
-from train.paper import AUGMENTATIONS, TABLE2
-from train.shards import Dataset
-from train.synthesis import DatasetConfig, generate_dataset
-from train.tables import measure_augmentations
+from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation.unseen import unseen_markers
 from train.training_state import TrainingState
-from train.unseen import unseen_markers
 
 GLOVE = "dense19"
 EVERY = 40_000  # samples between two looks

@@ -3,7 +3,8 @@
     python benchmarks/generation.py [--frames 170330]
 
 The floor of a frame is what cannot be left out: its rays, 19 markers x 16 cameras, each against 21 capsules,
-and its row on the disk. Then come the stages of `train.synthesis` for a hand alone, a new person every 128
+and its row on the disk. Then come the stages of `train.simulation.synthesis` for a hand alone, a new person
+every 128
 frames, in microseconds of processor time a frame, and `handsim generate` whole: single hands with one worker
 and with two, then the default mix of hands alone, together and holding something.
 """
@@ -22,17 +23,17 @@ import numpy as np
 from machine import describe
 
 from gloves.attach import wear
-from gloves.ghosts import sample_ghosts
 from gloves.layout import load_layout
-from gloves.optics import reconstruct
-from gloves.visibility import free_rays, pack_cameras, visible_cameras
-from handsim.cameras import named_rig
-from handsim.model import join_qpos
-from handsim.transforms import random_quaternions
-from poses.validity import sample_valid_angles
-from train.scenes import SceneMix
-from train.shards import row_dtype
-from train.synthesis import DatasetConfig, generate_dataset, sample_hands
+from gloves.optics.ghosts import sample_ghosts
+from gloves.optics.reconstruction import reconstruct
+from gloves.optics.visibility import free_rays, pack_cameras, visible_cameras
+from handsim.hand.model import join_qpos
+from handsim.space.cameras import named_rig
+from handsim.space.transforms import random_quaternions
+from poses.shapes.validity import sample_valid_angles
+from train.data.shards import row_dtype
+from train.simulation.scenes import SceneMix
+from train.simulation.synthesis import DatasetConfig, generate_dataset, sample_hands
 
 CONFIG = DatasetConfig()
 HANDS = 48
@@ -58,7 +59,7 @@ class Stopwatch:
 
 
 def one_hand(watch: Stopwatch, rng: np.random.Generator) -> None:
-    """What `train.synthesis` does for one person, stage by stage."""
+    """What `train.simulation.synthesis` does for one person, stage by stage."""
     layout, rig = load_layout(CONFIG.glove), named_rig(CONFIG.rig)
     with watch.stage("person: shape, skeleton, room at rest"):
         model = sample_hands(CONFIG.population, rng=rng)[0]

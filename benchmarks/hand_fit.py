@@ -2,7 +2,7 @@
 
     python benchmarks/hand_fit.py CAPTURES [--frames 400 --held-out 400 --seed 0]
 
-CAPTURES is a folder of labelled dense19 captures, one sub-folder a person (right hands, *_right.trc). Shape
+CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (right hands, *_right.trc). Shape
 (bone lengths, knuckles, directions of digits) and marker places are fitted together with the poses of some
 frames by Gauss-Newton with the poses eliminated; then other frames are fitted with shape and places held.
 Priors keep the shape near the mean hand. Residuals are told by marker, hinges by how often they leave their
@@ -21,12 +21,12 @@ from people import right_hands
 
 from gloves.attach import Attachment, attach
 from gloves.layout import MarkerLayout, load_layout
-from handsim.jacobian import skinned_jacobian
-from handsim.model import HandModel
-from handsim.shape import HandShape, shape_from_measures
-from handsim.topology import JOINTS
-from track.inverse_kinematics import PoseFit, solve_poses
-from track.pose_motion import move
+from handsim.hand.jacobian import skinned_jacobian
+from handsim.hand.model import HandModel
+from handsim.hand.shape import HandShape, shape_from_measures
+from handsim.hand.topology import JOINTS
+from track.kinematics.integration import move
+from track.kinematics.pose_solver import PoseFit, solve_poses
 
 ROUNDS = 12
 STEP = 1e-5
@@ -98,10 +98,10 @@ def fit_person(markers: np.ndarray, layout: MarkerLayout) -> tuple[Person, np.nd
     size = np.linalg.norm(markers[:, first] - markers[:, second], axis=1).mean() / 0.0749  # of the mean hand
     person = Person(shape_from_measures(0.187 * size, 0.083 * size), layout)
     parameters = np.zeros(len(person.spread))
-    fit = solve_poses(*person.wear(parameters), markers)
+    fit = solve_poses(person.wear(parameters), markers)
     for _ in range(ROUNDS):
         parameters, qpos = improve(person, parameters, fit)
-        fit = solve_poses(*person.wear(parameters), markers, initial=qpos, iterations=10)
+        fit = solve_poses(person.wear(parameters), markers, initial=qpos, iterations=10)
     return person, parameters
 
 
@@ -137,7 +137,7 @@ def main() -> None:
     for name, markers in right_hands(arguments.captures, layout.names).items():
         chosen = rng.choice(len(markers), arguments.frames + arguments.held_out, replace=False)
         person, parameters = fit_person(markers[chosen[: arguments.frames]], layout)
-        fit = solve_poses(*person.wear(parameters), markers[chosen[arguments.frames :]])
+        fit = solve_poses(person.wear(parameters), markers[chosen[arguments.frames :]])
         tell(name, person, parameters, fit)
         everyone.append(1e3 * fit.rms)
     rms = np.concatenate(everyone)

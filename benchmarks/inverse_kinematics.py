@@ -1,4 +1,4 @@
-"""How quickly a hand's pose is found from labelled markers: ours, MuJoCo's Jacobian, SciPy, mink.
+"""How quickly a hand's pose is found from labeled markers: ours, MuJoCo's Jacobian, SciPy, mink.
 
     OMP_NUM_THREADS=1 python benchmarks/inverse_kinematics.py [--frames 300 --noise 0.3 --hands 10 --seed 0]
 
@@ -23,18 +23,19 @@ from machine import describe
 from scipy.optimize import least_squares
 
 from gloves.attach import Attachment, attach
+from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from handsim.errors import ShapeError
-from handsim.jacobian import skinned_jacobian
-from handsim.mjcf import build_spec
-from handsim.model import HandModel, join_qpos
-from handsim.shape import sample_shape
-from handsim.topology import SIDES
-from handsim.transforms import random_quaternions
-from poses.motions import sample_motion
-from poses.validity import resting_angles, sample_valid_angles
-from track.inverse_kinematics import PoseSolver
-from track.pose_motion import move
+from handsim.errors import ArgumentError
+from handsim.hand.jacobian import skinned_jacobian
+from handsim.hand.mjcf import build_spec
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import sample_shape
+from handsim.hand.topology import SIDES
+from handsim.space.transforms import random_quaternions
+from poses.motion.motions import sample_motion
+from poses.shapes.validity import resting_angles, sample_valid_angles
+from track.kinematics.integration import move
+from track.kinematics.pose_solver import PoseSolver
 
 Solver = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 SMALL = 1e-12  # [m^2] by which the summed squares may still fall when a solver stops
@@ -42,7 +43,7 @@ MOST = 50
 
 
 def ours(model: HandModel, glove: Attachment) -> Solver:
-    solver = PoseSolver(model, glove)
+    solver = PoseSolver(GloveFit(model, glove))
 
     def solve(target: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
         fit = solver.solve(target[None], start[None])
@@ -102,7 +103,7 @@ def scipy_marquardt(model: HandModel, glove: Attachment) -> Solver:
     def solve(target: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, int]:
         def misses(step: np.ndarray) -> np.ndarray:
             bones = model.forward_kinematics(move(start[None], step[None]))
-            return (glove.centres(model, bones)[0] - target).ravel()
+            return (glove.centers(model, bones)[0] - target).ravel()
 
         def slopes(step: np.ndarray) -> np.ndarray:
             bones = model.forward_kinematics(move(start[None], step[None]))
@@ -169,7 +170,7 @@ def follow(
         counts.append(count)
     found = np.array(poses[1:])
     bones, true = model.forward_kinematics(found), model.forward_kinematics(qpos[1:])
-    rms = 1e3 * np.sqrt(((glove.centres(model, bones) - targets[1:]) ** 2).sum(axis=-1).mean(axis=1))
+    rms = 1e3 * np.sqrt(((glove.centers(model, bones) - targets[1:]) ** 2).sum(axis=-1).mean(axis=1))
     joints = 1e3 * np.linalg.norm((bones - true)[..., :3, 3], axis=-1).mean()
     angles = np.rad2deg(np.abs(found - qpos[1:])[:, 7:]).mean()
     print(
@@ -183,7 +184,7 @@ def somebody(rng: np.random.Generator, number: int) -> HandModel:
         model = HandModel(sample_shape(side=SIDES[number % 2], rng=rng))
         try:
             resting_angles(model)
-        except ShapeError:
+        except ArgumentError:
             continue
         return model
 
@@ -199,9 +200,9 @@ def tell_cold_starts(layout: str, hands: int, noise: float, rng: np.random.Gener
             position=rng.normal(size=(count, 3)),
             quaternion=random_quaternions(count, rng=rng),
         )
-        targets = glove.centres(model, model.forward_kinematics(qpos))
+        targets = glove.centers(model, model.forward_kinematics(qpos))
         targets += noise * rng.standard_normal(targets.shape)
-        solver = PoseSolver(model, glove)
+        solver = PoseSolver(GloveFit(model, glove))
         best = solver.solve(targets, qpos).rms
         for frame in range(count):
             begun = time.perf_counter()
@@ -220,8 +221,8 @@ def tell_cold_starts(layout: str, hands: int, noise: float, rng: np.random.Gener
 
 def tell_starts(model: HandModel, glove: Attachment, qpos: np.ndarray, rng: np.random.Generator) -> None:
     """Print how long eight starts of one frame take together."""
-    targets = np.repeat(glove.centres(model, model.forward_kinematics(qpos)), 8, axis=0)
-    solver, times = PoseSolver(model, glove), []
+    targets = np.repeat(glove.centers(model, model.forward_kinematics(qpos)), 8, axis=0)
+    solver, times = PoseSolver(GloveFit(model, glove)), []
     starts = move(np.repeat(qpos, 8, axis=0), 0.03 * rng.standard_normal((len(targets), 26)))
     for frame in range(0, len(targets), 8):
         begun = time.perf_counter()
@@ -256,9 +257,9 @@ def main() -> None:
         shaken = noise * rng.standard_normal((len(qpos), *skin.points.shape))
         print(f"a motion of {len(qpos)} frames, noise {1e3 * noise:g} mm; p50, p99")
         for name, contestant in contestants.items():
-            targets = bound.centres(model, model.forward_kinematics(qpos)) + shaken
+            targets = bound.centers(model, model.forward_kinematics(qpos)) + shaken
             follow(name, contestant(model, bound), model, bound, qpos, targets)
-        targets = skin.centres(model, model.forward_kinematics(qpos)) + shaken
+        targets = skin.centers(model, model.forward_kinematics(qpos)) + shaken
         follow("ours, markers bound as skin is", ours(model, skin), model, skin, qpos, targets)
     tell_starts(model, skin, qpos, rng)
     for layout in ("dense19", "sparse13"):

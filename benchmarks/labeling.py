@@ -17,14 +17,14 @@ import onnxruntime
 import torch
 from machine import describe
 
-from train.cnn_labeling import TrainedCNNLabeler
 from train.config import SetLabelerConfig
-from train.deep_label_cnn import DeepLabelCNN
-from train.kinds import new_network
-from train.labeler import load_labeler, load_network
-from train.onnx_labeler import OnnxLabeler, export_onnx
-from train.set_labeler import LabelScores
-from train.set_labeling import TrainedSetLabeler
+from train.labelers.cnn_labeler import TrainedCNNLabeler
+from train.labelers.cnn_network import DeepLabelCNN
+from train.labelers.kinds import new_network
+from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
+from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_network import LabelScores
+from train.labelers.storage import load_labeler, load_network
 
 
 def main() -> None:

@@ -25,25 +25,25 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gloves.attach import attach
+from gloves.fit import GlovedHand, fit_glove
 from gloves.layout import load_layout
-from handsim.errors import ShapeError
-from handsim.model import HandModel, join_qpos
-from handsim.shape import sample_shape
-from handsim.topology import SIDES, Side
-from poses.library import gesture
-from poses.validity import make_valid
-from render.backgrounds import Background, BackgroundConfig
-from render.camera import Camera, preset
-from render.exposure import ExposureConfig, sample_exposure
-from render.figures import sample_people
+from handsim.errors import ArgumentError
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import sample_shape
+from handsim.hand.topology import SIDES, Side
+from poses.shapes.library import gesture
+from poses.shapes.validity import make_valid
+from render.cameras.camera import Camera, preset
+from render.formats.writer import open_writer
 from render.frames import RenderedFrame
-from render.lights import Lighting
-from render.shown_take import ShownHand, ShownTake
-from render.skin_look import TONES
+from render.painting.figures import sample_people
+from render.painting.lights import Lighting
+from render.scenery.backgrounds import Background, BackgroundConfig
+from render.scenery.surroundings import expose_for, sample_surroundings
+from render.sensors.exposure import ExposureConfig, sample_exposure
+from render.shown_take import ShownTake
+from render.skin.look import TONES
 from render.studio import FrameChoices, Studio
-from render.surroundings import expose_for, sample_surroundings
-from render.writer import open_writer
 
 POSES: Final[dict[str, tuple[str, ...]]] = {
     "open": ("flat", "spread", "stretched", "four", "asl_b", "count_thumb_5"),
@@ -97,7 +97,7 @@ def pose_somebody(name: str, side: Side, rng: np.random.Generator) -> tuple[Hand
         angles = np.clip(gesture(name) + np.deg2rad(rng.normal(0.0, 3.0, 20)), low, high)
         try:
             return model, join_qpos(make_valid(model, angles[None]))[0]
-        except ShapeError:  # fingers too thick for so narrow a palm
+        except ArgumentError:  # fingers too thick for so narrow a palm
             continue
 
 
@@ -139,7 +139,7 @@ def photograph(
 ) -> RenderedFrame:
     """A picture of the hand, or of what is behind it."""
     qpos = case.qpos[None] if shown else np.full((1, len(case.qpos)), np.nan)
-    hand = ShownHand(case.model, attach(load_layout("dense19"), case.model), qpos)
+    hand = GlovedHand(fit_glove(load_layout("dense19"), case.model), qpos)
     nothing = np.empty((1, 0, 3)), np.empty((1, 0), dtype=np.int64), ()
     people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
     studio = Studio(ShownTake(60.0, np.zeros(1), (hand,), (), *nothing), people, [], ("rgb", "ids", "depth"))

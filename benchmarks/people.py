@@ -1,4 +1,4 @@
-"""Labelled captures of several people, one sub-folder each."""
+"""Labeled captures of several people, one sub-folder each."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
     python benchmarks/pose_coverage.py CAPTURES [--poses 100000 --frames 2000 --seed 0]
 
-CAPTURES is a folder of labelled dense19 captures, one sub-folder a person (such as the public
+CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (such as the public
 Mocap_SIG18_Data); only right hands, named *_right.trc, are used. Sampled poses of the mean hand are scaled to
 each person's mean BackHand1-IndexMCP distance, aligned rigidly (Kabsch) and compared by the 3D RMS over the
 19 markers. Candidates come from the nearest pair-distance vectors, 200 a frame; more change nothing.
@@ -20,9 +20,9 @@ from people import right_hands
 
 from gloves.attach import attach
 from gloves.layout import load_layout
-from handsim.model import HandModel, join_qpos
-from handsim.transforms import rigid_fit
-from poses.validity import sample_valid_angles
+from handsim.hand.model import HandModel, join_qpos
+from handsim.space.transforms import rigid_fit
+from poses.shapes.validity import sample_valid_angles
 
 CANDIDATES = 200
 PAIRS = np.triu_indices(19, 1)

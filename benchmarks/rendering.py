@@ -3,9 +3,9 @@
     MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one a core: depth alone;
-    colours, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
+    colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
     loop that a user would write with pyrender (the same meshes, plain material, one light) and MuJoCo's own
-    renderer (the hand's capsules, no skin), each for depth and for colours.
+    renderer (the hand's capsules, no skin), each for depth and for colors.
 accuracy: depth and ids against embree through trimesh on the same triangles.
 memory: resident memory over many pictures.
 
@@ -29,19 +29,19 @@ import numpy as np
 import trimesh
 from machine import describe
 
-from handsim.processes import in_processes
-from render._gl import load_pyrender, offscreen_renderer
-from render.figures import sample_people
+from handsim.app.workers import in_processes
+from render.cameras.viewpoints import ViewConfig, Viewpoints
+from render.formats.writer import open_writer
 from render.frames import RenderedFrame
-from render.rasteriser import join, rasterise
-from render.scene import OPENGL_FROM_OPENCV
+from render.painting.figures import sample_people
+from render.painting.gl import load_pyrender, offscreen_renderer
+from render.painting.rasterizer import join, rasterize
+from render.painting.scene import OPENGL_FROM_OPENCV
 from render.session import RenderConfig, draw_frames
 from render.shown_take import ShownTake, show_simulated
-from render.skin_look import ALL_TONES
+from render.skin.look import ALL_TONES
 from render.studio import Studio
-from render.viewpoints import ViewConfig, Viewpoints
-from render.writer import open_writer
-from train.twins import TwinConfig, simulate_twin
+from train.simulation.twins import TwinConfig, simulate_twin
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
@@ -50,7 +50,7 @@ DEPTH: Final = dataclasses.replace(PLAIN, passes=("depth",))
 COLORS: Final = dataclasses.replace(PLAIN, passes=("rgb", "depth", "ids"))
 KINDS: Final = {
     "depth": DEPTH,
-    "colours, depth, ids, keypoints": COLORS,
+    "colors, depth, ids, keypoints": COLORS,
     "- painted by OpenGL": dataclasses.replace(COLORS, painter="opengl"),
 }
 
@@ -141,7 +141,7 @@ def speed(frames: int) -> None:
         for name, job in jobs.items():
             alone = rate(lambda job=job: job(0), frames)
             print(f"  {name:32s} {alone:8.1f} {rate_in_processes(job, cores, frames):8.1f}")
-    for color, name in ((False, "depth"), (True, "colours")):
+    for color, name in ((False, "depth"), (True, "colors")):
         print(
             f"  plain pyrender loop, {name:11s} {rate(lambda c=color: plain_pyrender(take, c), frames):8.1f}"
         )
@@ -158,7 +158,7 @@ def accuracy(frames: int) -> None:
     for frame in np.linspace(0, take.num_frames - 1, 8).astype(int):
         camera = view.cameras(frame)[0]
         surface = join([one.triangles for one in studio._drawn(int(frame), 0.0)])
-        mine = rasterise(camera, surface)
+        mine = rasterize(camera, surface)
         vertices = np.asarray(surface.vertices, dtype=np.float64)
         caster = RayMeshIntersector(trimesh.Trimesh(vertices, surface.faces, process=False))
         directions = camera.rays().reshape(-1, 3) @ camera.T_world_camera[:3, :3].T
@@ -185,7 +185,7 @@ def bare_studio(take: ShownTake) -> Studio:
 
 def memory(images: int) -> None:
     frames = 200
-    print(f"\nresident memory over {images} pictures (colours, depth, ids)")
+    print(f"\nresident memory over {images} pictures (colors, depth, ids)")
     page = os.sysconf("SC_PAGE_SIZE")
     for shard in range(images // frames):
         draw(COLORS, frames, shard)

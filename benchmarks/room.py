@@ -23,16 +23,16 @@ from machine import describe
 
 from gloves.attach import wear
 from gloves.layout import load_layout
-from gloves.mesh_sight import clear_of_mesh, hand_tree
-from gloves.optics import OpticsConfig, reconstruct
-from gloves.visibility import facing_cameras, visible_cameras
-from handsim.cameras import named_rig
-from handsim.model import join_qpos
-from handsim.transforms import random_quaternions
-from poses.validity import sample_valid_angles
-from train.room import _SKINS, Room
-from train.synthesis import DatasetConfig, sample_hands
-from train.twins import TWINS, TwinConfig, _cast, simulate_twin
+from gloves.optics.mesh_sight import clear_of_mesh, hand_tree
+from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.visibility import facing_cameras, visible_cameras
+from handsim.hand.model import join_qpos
+from handsim.space.cameras import named_rig
+from handsim.space.transforms import random_quaternions
+from poses.shapes.validity import sample_valid_angles
+from train.simulation.room import _SKINS, Room
+from train.simulation.synthesis import DatasetConfig, sample_hands
+from train.simulation.twins import TWINS, TwinConfig, _cast, simulate_twin
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"
@@ -102,7 +102,7 @@ def one_hand(frames: int, seed: int, watch: Stopwatch) -> None:
 
 
 def room_of(kind: str, frames: int, seed: int, watch: Stopwatch) -> None:
-    """The stages of `train.twins.simulate_twin`."""
+    """The stages of `train.simulation.twins.simulate_twin`."""
     rng = np.random.default_rng(seed)
     rig, config = named_rig("figure5"), TWINS[kind].room
     cast = watch("people, gloves, motions", lambda: _cast(kind, load_layout("dense19"), frames, rng))
@@ -139,14 +139,14 @@ def _lines(room: Room, watch: Stopwatch) -> None:
 
     def skins() -> None:
         for piece in pieces:
-            for actor in room.actors:
-                actor.model.skin(actor.motion.qpos[piece])
+            for hand in room.hands:
+                hand.fit.model.skin(hand.qpos[piece])
 
     def refits() -> None:
         for piece in pieces:
             few = len(starts[piece])
-            for actor in room.actors:
-                skin = actor.model.skin(actor.motion.qpos[piece])
+            for hand in room.hands:
+                skin = hand.fit.model.skin(hand.qpos[piece])
                 clear_of_mesh(hand_tree(), skin, starts[piece], cameras, nothing[:few])
 
     watch("  skins", skins)
@@ -189,15 +189,15 @@ def floor(frames: int) -> None:
     for frame in range(frames):
         marker, camera = np.nonzero(wanted[frame])
         starts, ends = markers[frame, marker], room.rig.positions[camera]
-        for actor in room.actors:
-            skin = actor.model.skin(actor.motion.qpos[frame : frame + 1])
+        for hand in room.hands:
+            skin = hand.fit.model.skin(hand.qpos[frame : frame + 1])
             clear_of_mesh(
                 tree, skin, markers[frame : frame + 1], room.rig.positions, wanted[frame : frame + 1]
             )
             corners = skin[0][tree.faces]
             tested += boxes_met(starts, ends, tree.skip, _boxes(corners, tree))
     lines = wanted.sum() / frames
-    size = len(room.actors) * tree.vertices.nbytes
+    size = len(room.hands) * tree.vertices.nbytes
     print(
         f"floor of a frame of two hands and a controller: {markers.shape[1]} markers x "
         f"{len(room.rig.positions)} cameras, {lines:.0f} lines in view and facing, each past two skins: "

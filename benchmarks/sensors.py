@@ -17,23 +17,23 @@ import cv2
 import numpy as np
 from machine import describe
 
-from render.blur import combine, shutter_times
-from render.camera import Camera, pinhole
-from render.depth_noise import SENSORS, apply_depth_noise, named_sensor, reflectance_of
-from render.exposure import Exposure, expose, linear_of
-from render.lens import Lens
-from render.warp import faces_for, warp, warp_depth, warp_normals
+from render.cameras.camera import Camera, pinhole
+from render.cameras.lens import Lens
+from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
+from render.sensors.depth_noise import SENSORS, apply_depth_noise, named_sensor, reflectance_of
+from render.sensors.exposure import Exposure, expose, linear_of
+from render.sensors.shutter import combine, shutter_times
 
 
 def sphere_and_wall(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth, normals and colours."""
-    rays, centre, radius = camera.rays(), np.array([0.0, 0.0, 0.6]), 0.12
-    along = rays @ centre
-    root = along**2 - centre @ centre + radius**2
+    """Depth, normals and colors."""
+    rays, center, radius = camera.rays(), np.array([0.0, 0.0, 0.6]), 0.12
+    along = rays @ center
+    root = along**2 - center @ center + radius**2
     points = rays * (along - np.sqrt(np.maximum(root, 0.0)))[..., None]
     hit = root > 0.0
     depth = np.where(hit, points[..., 2], 0.9).astype(np.float32)
-    normals = np.where(hit[..., None], (points - centre) / radius, [0.0, 0.0, -1.0]).astype(np.float32)
+    normals = np.where(hit[..., None], (points - center) / radius, [0.0, 0.0, -1.0]).astype(np.float32)
     rgb = np.where(hit[..., None], [190, 140, 115], 150).astype(np.uint8)
     return depth, normals, rgb
 
@@ -62,7 +62,7 @@ def main() -> None:
     camera = pinhole("pinhole", size, 0.9 * size[0])
     depth, normals, rgb = sphere_and_wall(camera)
 
-    print(f"\ndepth noise, {size[0]} x {size[1]}, with normals and colours")
+    print(f"\ndepth noise, {size[0]} x {size[1]}, with normals and colors")
     for name in SENSORS:
         noise = named_sensor(name)
         clock(
@@ -73,7 +73,7 @@ def main() -> None:
             repeats,
         )
 
-    print("\ncolour")
+    print("\ncolor")
     light = linear_of(rgb)
     taken = Exposure(0.2, (1.05, 1.0, 0.97), 4000.0, 3.0, 0.2)
     clock("light of sRGB", lambda: linear_of(rgb), repeats)
@@ -101,9 +101,9 @@ def main() -> None:
             f"planned once in {1e3 * planned:.0f} ms"
         )
         drawn = [sphere_and_wall(face.at(np.eye(4))) for face in faces]
-        depths, directions, colours = (list(kind) for kind in zip(*drawn, strict=True))
-        ids = [np.ascontiguousarray(colour[..., 0]) for colour in colours]
-        clock("colours", lambda c=lensed, p=colours: warp(c, p, "linear"), repeats)
+        depths, directions, colors = (list(kind) for kind in zip(*drawn, strict=True))
+        ids = [np.ascontiguousarray(color[..., 0]) for color in colors]
+        clock("colors", lambda c=lensed, p=colors: warp(c, p, "linear"), repeats)
         clock("ids", lambda c=lensed, p=ids: warp(c, p, "nearest"), repeats)
         clock("depth", lambda c=lensed, p=depths: warp_depth(c, p), repeats)
         clock("normals", lambda c=lensed, p=directions: warp_normals(c, p), repeats)

@@ -20,16 +20,16 @@ from machine import describe
 
 from gloves.attach import attach
 from gloves.layout import load_layout
-from gloves.mesh_sight import clear_of_body, clear_of_mesh, hand_tree
-from gloves.visibility import MAX_FACING, free_rays, visible_cameras
-from handsim.cameras import CameraRig, list_rigs, named_rig
-from handsim.model import HandModel, join_qpos
-from handsim.shape import sample_shape
-from handsim.topology import Side
-from handsim.transforms import random_quaternions
-from poses.validity import sample_valid_angles
+from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh, hand_tree
+from gloves.optics.visibility import MAX_FACING, free_rays, visible_cameras
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import sample_shape
+from handsim.hand.topology import Side
+from handsim.space.cameras import CameraRig, list_rigs, named_rig
+from handsim.space.transforms import random_quaternions
+from poses.shapes.validity import sample_valid_angles
 
-CENTRE = np.array([0.0, 0.0, 1.1])
+CENTER = np.array([0.0, 0.0, 1.1])
 POSES_A_HAND = 50
 CHUNK = 128
 
@@ -45,10 +45,10 @@ class Scene(NamedTuple):
     segments: np.ndarray
 
 
-def make_scene(model: HandModel, poses: int, centre: np.ndarray, rng: np.random.Generator) -> Scene:
+def make_scene(model: HandModel, poses: int, center: np.ndarray, rng: np.random.Generator) -> Scene:
     qpos = join_qpos(
         sample_valid_angles(model, poses, rng=rng),
-        position=centre + rng.uniform(-0.3, 0.3, size=(poses, 3)),
+        position=center + rng.uniform(-0.3, 0.3, size=(poses, 3)),
         quaternion=random_quaternions(poses, rng=rng),
     )
     bones = model.forward_kinematics(qpos)
@@ -77,7 +77,7 @@ def agreement(poses: int, rng: np.random.Generator) -> None:
     embree, skin, capsules, asked = [], [], [], []
     for number in range(poses // POSES_A_HAND):
         side: Side = sides[number % 2]  # type: ignore[assignment]
-        scene = make_scene(HandModel(sample_shape(side=side, rng=rng)), POSES_A_HAND, CENTRE, rng)
+        scene = make_scene(HandModel(sample_shape(side=side, rng=rng)), POSES_A_HAND, CENTER, rng)
         everything = np.ones((*scene.markers.shape[:2], len(rig.positions)), dtype=bool)
         clear = clear_of_mesh(hand_tree(), scene.skin, scene.markers, rig.positions, everything)
         reference = embree_clear(scene, rig.positions, everything)
@@ -107,8 +107,8 @@ def agreement(poses: int, rng: np.random.Generator) -> None:
 
 
 def rigs(poses: int, rng: np.random.Generator) -> None:
-    scene = make_scene(HandModel.named("M"), poses, CENTRE, rng)
-    cube = CENTRE + rng.uniform(-0.3, 0.3, size=(100_000, 3))
+    scene = make_scene(HandModel.named("M"), poses, CENTER, rng)
+    cube = CENTER + rng.uniform(-0.3, 0.3, size=(100_000, 3))
     print("\nrigs: cube of half side 0.3 m in >= 2, >= 3 views; markers seen by >= 2, >= 3; cameras a marker")
     for name in list_rigs():
         rig = named_rig(name)
@@ -136,9 +136,9 @@ def speeds(rng: np.random.Generator) -> None:
     hands = []
     for side, offset in (("right", -0.06), ("left", 0.06)):
         model = HandModel.named("M", side=side)  # type: ignore[arg-type]
-        hands.append(make_scene(model, CHUNK, CENTRE, rng))
+        hands.append(make_scene(model, CHUNK, CENTER, rng))
         shift = (
-            CENTRE + np.array([0.0, offset, 0.0]) - hands[-1].qpos[:, None, :3]
+            CENTER + np.array([0.0, offset, 0.0]) - hands[-1].qpos[:, None, :3]
         )  # two hands close together
         hands[-1] = hands[-1]._replace(
             qpos=np.concatenate([hands[-1].qpos[:, :3] + shift[:, 0], hands[-1].qpos[:, 3:]], axis=1),
@@ -163,7 +163,7 @@ def speeds(rng: np.random.Generator) -> None:
     facing = cost(lambda: in_view_and_facing(markers, normals, rig))
     flesh = cost(lambda: [free_rays(markers, cameras, h.segments, h.model.capsules.radii) for h in hands])
     poses = np.tile(np.eye(4), (CHUNK, 1, 1))
-    poses[:, :3, 3] = CENTRE
+    poses[:, :3, 3] = CENTER
     body = cost(lambda: clear_of_body(tree, poses, markers, cameras, wanted))
     whole = bones + skinning + refit + rays
     print(f"\ntwo hands, {markers.shape[1]} markers, {len(cameras)} cameras, two skins of "

@@ -33,11 +33,14 @@ import numpy as np
 from drum_takes import with_drum
 from machine import describe
 
-from gloves.captures import Capture, write_capture
-from gloves.take import Take
-from track.calibration_command import calibrate
+from gloves.captures.capture import Capture
+from gloves.captures.formats import write_capture
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
 from track.capture_tracking import warm_up
-from track.evaluation import (
+from track.commands.calibrate import calibrate
+from track.evaluation.hand_errors import hand_errors
+from track.evaluation.take_evaluation import (
     TrackingReport,
     evaluate_tracker,
     nearest_size,
@@ -45,14 +48,13 @@ from track.evaluation import (
     true_users,
     usual_users,
 )
-from track.hand_errors import hand_errors
+from track.evaluation.trials import FEWEST_FRAMES, first_locks, recoveries, without_body
 from track.tracker import Tracker
-from track.trials import FEWEST_FRAMES, first_locks, recoveries, without_body
-from track.user import UserHand, load_user
-from train.calibration_take import CalibrationTakeConfig, simulate_calibration
-from train.labeler import load_labeler
-from train.labeling import Labeler
-from train.twins import KINDS, Kind, TwinConfig, simulate_twin
+from track.user import load_user
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
+from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
+from train.simulation.twins import KINDS, Kind, TwinConfig, simulate_twin
 
 TRIALS = {"start": (first_locks, 3), "recovery": (recoveries, 5)}
 """What is tried, and the frames within which all should be right."""
@@ -72,7 +74,7 @@ def labeler() -> Labeler:
     return load_labeler("dense19")
 
 
-def follow(take: Take, users: Sequence[UserHand]) -> TrackingReport:
+def follow(take: Take, users: Sequence[GloveFit]) -> TrackingReport:
     return evaluate_tracker(take, users, Tracker(users, labeler()))
 
 
@@ -94,9 +96,9 @@ def head(title: str) -> None:
     )
 
 
-def calibrated_users(take: Take, seed: int, free: float) -> list[UserHand]:
+def calibrated_users(take: Take, seed: int, free: float) -> list[GloveFit]:
     """The people of a take as `handsim calibrate` finds them in a capture that they make for it."""
-    people = tuple((user.model, user.attachment) for user in true_users(take))
+    people = tuple(true_users(take))
     rng = np.random.default_rng((seed, 1))
     made = simulate_calibration(people, CalibrationTakeConfig(free=free), rng=rng)
     with tempfile.TemporaryDirectory() as folder:
@@ -105,7 +107,7 @@ def calibrated_users(take: Take, seed: int, free: float) -> list[UserHand]:
         write_capture(capture, Capture(names, made.points, made.rate))
         calibrate(capture, out=user, size=nearest_size(take.hands[0].shape.length))
         found = {hand.side: hand for hand in load_user(user)}
-    return [found[hand.shape.side] for hand in take.hands]
+    return [found[hand.side] for hand in take.hands]
 
 
 def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> None:

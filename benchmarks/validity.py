@@ -15,17 +15,17 @@ import itertools
 import numpy as np
 from machine import describe
 
-from gloves.take import Take
+from gloves.takes.take import Take
 from handsim.errors import HandSimError
-from handsim.model import HandModel
-from handsim.objects import named_object
-from handsim.shape import EVERYBODY, sample_shape
-from handsim.transforms import quaternion_matrix
-from poses.couplings import HIGH, LOW
-from poses.objects import object_penetration
-from poses.scripts import script_names, scripted_motion
-from poses.two_hands import two_hands_penetration
-from train.twins import KINDS, TwinConfig, simulate_twin
+from handsim.hand.model import HandModel
+from handsim.hand.shape import EVERYBODY, sample_shape
+from handsim.space.objects import named_object
+from handsim.space.transforms import quaternion_matrix
+from poses.contact.two_hands import two_hands_penetration
+from poses.grasps.object_motion import object_penetration
+from poses.motion.scripts import script_names, scripted_motion
+from poses.shapes.couplings import HIGH, LOW
+from train.simulation.twins import KINDS, TwinConfig, simulate_twin
 
 SECONDS = 10.0
 
@@ -48,7 +48,7 @@ def out_of_range(qpos: np.ndarray) -> int:
 
 def overlaps(take: Take) -> tuple[float, float, float]:
     """Deepest in themselves, between hands, and with the object [mm]."""
-    right, left = models = [HandModel(hand.shape) for hand in take.hands]
+    right, left = models = [hand.fit.model for hand in take.hands]
     qpos = [hand.qpos for hand in take.hands]
     own = max(model.penetration(values).max() for model, values in zip(models, qpos, strict=True))
     between = two_hands_penetration(right, left, *qpos).max()

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from handsim.model import HandModel, join_qpos
-from handsim.shape import EVERYBODY, sample_shape
-from poses.library import gesture
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import EVERYBODY, sample_shape
+from poses.shapes.library import gesture
 
 
 def main() -> None:

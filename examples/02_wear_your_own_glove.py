@@ -11,10 +11,10 @@ import numpy as np
 
 from gloves.attach import attach
 from gloves.layout import MarkerLayout, MarkerPlace
-from gloves.visibility import visible_cameras
-from handsim.cameras import named_rig
-from handsim.model import HandModel, join_qpos
-from poses.library import gesture
+from gloves.optics.visibility import visible_cameras
+from handsim.hand.model import HandModel, join_qpos
+from handsim.space.cameras import named_rig
+from poses.shapes.library import gesture
 
 
 def main() -> None:

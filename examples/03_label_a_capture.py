@@ -3,7 +3,7 @@
     python examples/03_label_a_capture.py
 
 A simulated take is generated, corrupted as in the paper (markers dropped, ghosts added, order shuffled),
-labelled frame by frame, and counted.
+labeled frame by frame, and counted.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from train.augmentation import Corruption
-from train.evaluation import evaluate_labeler
-from train.labeler import load_labeler
-from train.shards import Dataset
-from train.synthesis import DatasetConfig, generate_dataset
+from train.data.augmentation import Corruption
+from train.data.shards import Dataset
+from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.labelers.storage import load_labeler
+from train.simulation.synthesis import DatasetConfig, generate_dataset
 
 
 def main() -> None:

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gloves.gaps import count_gaps
-from train.evaluation import evaluate_takes
-from train.labeler import load_labeler
-from train.twins import TWINS, TwinConfig, simulate_twin
+from gloves.captures.gaps import count_gaps
+from train.evaluation.labeler_evaluation import evaluate_takes
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TWINS, TwinConfig, simulate_twin
 
 
 def main() -> None:

@@ -12,12 +12,12 @@ import tempfile
 from pathlib import Path
 
 from train.config import SetLabelerConfig, TrainConfig
-from train.labeler import load_labeler
+from train.data.shards import Dataset
+from train.evaluation.tables import measure_augmentations
+from train.labelers.storage import load_labeler
 from train.loop import train_labeler
-from train.shards import Dataset
-from train.synthesis import DatasetConfig, generate_dataset
-from train.tables import measure_augmentations
-from train.unseen import unseen_markers
+from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation.unseen import unseen_markers
 
 GLOVE = str(Path(__file__).parent / "ten_markers.toml")
 

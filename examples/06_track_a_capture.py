@@ -1,4 +1,4 @@
-"""Follow two hands through a capture of unlabelled points, and compare their motion with the truth.
+"""Follow two hands through a capture of unlabeled points, and compare their motion with the truth.
 
     python examples/06_track_a_capture.py
 
@@ -10,17 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gloves.attach import attach
-from gloves.captures import Capture
+from gloves.captures.capture import Capture
+from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.take import Take
-from gloves.tracked_take import TrackedTake
-from handsim.model import HandModel
+from gloves.takes.take import Take
+from gloves.takes.tracked_take import TrackedTake
+from handsim.hand.model import HandModel
 from track.capture_tracking import track
 from track.tracker import Tracker
-from track.user import UserHand, usual_hand
-from train.labeler import load_labeler
-from train.twins import TwinConfig, simulate_twin
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig, simulate_twin
 
 
 def joints(hand: HandModel, qpos: np.ndarray) -> np.ndarray:
@@ -30,11 +29,11 @@ def joints(hand: HandModel, qpos: np.ndarray) -> np.ndarray:
 
 def tell(name: str, take: TrackedTake, truth: Take) -> None:
     for number, true in enumerate(truth.hands):
-        motion = take.motion(true.shape.side)  # whole, also where the hand was lost for a while
+        motion = take.motion(true.side)  # whole, also where the hand was lost for a while
         ours = joints(HandModel(take.hands[number].shape), motion.qpos)
         off = np.linalg.norm(ours - joints(HandModel(true.shape), true.qpos), axis=-1)
         filled = 100 * take.filled[:, number].mean()
-        print(f"{name}, {true.shape.side}: joints {1e3 * off.mean():.2f} mm off, {filled:.1f} % filled in")
+        print(f"{name}, {true.side}: joints {1e3 * off.mean():.2f} mm off, {filled:.1f} % filled in")
 
 
 def main() -> None:
@@ -42,10 +41,8 @@ def main() -> None:
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)  # no names, many gaps, some ghosts
     labeler = load_labeler("dense19")
-    models = [HandModel(hand.shape) for hand in truth.hands]
-    worn = [attach(hand.layout, model) for hand, model in zip(truth.hands, models, strict=True)]
-    known = [UserHand(*hand) for hand in zip(models, worn, strict=True)]
-    usual = [usual_hand(load_layout("dense19"), "M", hand.shape.side) for hand in truth.hands]
+    known = [hand.fit for hand in truth.hands]
+    usual = [nominal_fit(load_layout("dense19"), "M", hand.side) for hand in truth.hands]
     for name, hands in (("known hands", known), ("hands of size M", usual)):
         tell(name, track(capture, Tracker(hands, labeler)), truth)
 

@@ -13,26 +13,26 @@ from pathlib import Path
 
 import numpy as np
 
-from gloves.captures import Capture
-from gloves.tracked_take import save_tracked_take
-from handsim.model import HandModel
-from render.camera import Camera, preset
+from gloves.captures.capture import Capture
+from gloves.fit import nominal_fit
+from gloves.takes.tracked_take import save_tracked_take
+from handsim.hand.model import HandModel
+from render.cameras.camera import Camera, preset
+from render.cameras.viewpoints import ViewConfig
+from render.formats.png_depth import read_depth
 from render.keypoints import hand_keypoints
-from render.png_depth import read_depth
 from render.session import RenderConfig, render_take
-from render.viewpoints import ViewConfig
 from track.capture_tracking import track
 from track.tracker import Tracker
-from track.user import usual_hand
-from train.labeler import load_labeler
-from train.twins import TwinConfig, simulate_twin
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig, simulate_twin
 
 
 def main() -> None:
     truth = simulate_twin(TwinConfig(kind="hand-hand", num_frames=120))  # 1 s at 120 Hz
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)
-    hands = [usual_hand(hand.layout, "M", hand.shape.side) for hand in truth.hands]  # nobody was calibrated
+    hands = [nominal_fit(hand.layout, "M", hand.side) for hand in truth.hands]  # nobody was calibrated
     config = RenderConfig(view=ViewConfig("orbit"), passes=("rgb", "depth"), every=20, seed=1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -48,10 +48,10 @@ def main() -> None:
                 if hand["image_id"] != image["id"]:
                     continue
                 shown = np.array(hand["keypoints"]).reshape(21, 3)
-                true = next(one for one in truth.hands if one.shape.side == hand["side"])
+                true = next(one for one in truth.hands if one.side == hand["side"])
                 frame = image["frame"]
                 points = hand_keypoints(HandModel(true.shape), true.qpos[frame : frame + 1])[0]
-                # COCO counts pixels from the first one's centre, cameras here from the picture's corner.
+                # COCO counts pixels from the first one's center, cameras here from the picture's corner.
                 off = np.linalg.norm(shown[:, :2] + 0.5 - camera.project(points), axis=1)[shown[:, 2] > 0]
                 print(
                     f"frame {frame}, {hand['side']}: {int((shown[:, 2] == 2).sum())} of 21 keypoints seen, "

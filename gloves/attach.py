@@ -10,10 +10,10 @@ import numpy as np
 
 from gloves.layout import MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
-from handsim.mjcf import Site
-from handsim.model import HandModel
-from handsim.surface import HandSurface, vertex_normals
-from handsim.topology import BONE_NAMES, PALM
+from handsim.hand.mjcf import Site
+from handsim.hand.model import HandModel
+from handsim.hand.skin.surface import HandSurface, vertex_normals
+from handsim.hand.topology import BONE_NAMES, PALM
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -28,7 +28,7 @@ class Attachment:
 
     layout: MarkerLayout
     points: Float[np.ndarray, "M 3"]
-    """Marker centres at zero angles, in the wrist frame [m]: one radius above the skin."""
+    """Marker centers at zero angles, in the wrist frame [m]: one radius above the skin."""
     normals: Float[np.ndarray, "M 3"]
     """Directions in which the markers look away from the skin, at zero angles."""
     bone_indices: Int[np.ndarray, "M 4"]
@@ -36,19 +36,25 @@ class Attachment:
     bone_weights: Float[np.ndarray, "M 4"]
     """Their shares, summing to one."""
 
-    def centres(
+    @property
+    def main_bones(self) -> Int[np.ndarray, "M"]:
+        """The bone that carries most of each marker."""
+        main: np.ndarray = self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)]
+        return main
+
+    def centers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
     ) -> Float[np.ndarray, "T M 3"]:
-        """Marker centres [m] in the world, for poses of the same hand."""
+        """Marker centers [m] in the world, for poses of the same hand."""
         return self._carried(model, T_world_bone, self.points, 1.0)
 
     def markers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
     ) -> tuple[Float[np.ndarray, "T M 3"], Float[np.ndarray, "T M 3"]]:
-        """Marker centres [m] and outward directions in the world, for poses of the same hand."""
+        """Marker centers [m] and outward directions in the world, for poses of the same hand."""
         normals = self._carried(model, T_world_bone, self.normals, 0.0)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-        return self.centres(model, T_world_bone), normals
+        return self.centers(model, T_world_bone), normals
 
     def _carried(
         self, model: HandModel, T_world_bone: NDArray[np.float64], rest: NDArray[np.float64], last: float
@@ -64,7 +70,7 @@ class Attachment:
 
     def sites(self, model: HandModel) -> tuple[Site, ...]:
         """The markers as MuJoCo sites, each on the bone that carries most of it."""
-        bones = self.bone_indices[np.arange(len(self.points)), self.bone_weights.argmax(axis=1)]
+        bones = self.main_bones
         inverse = np.linalg.inv(model.rest_transforms)[bones]
         local = np.einsum("mij,mj->mi", inverse[:, :3, :3], self.points) + inverse[:, :3, 3]
         return tuple(

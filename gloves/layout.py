@@ -1,8 +1,8 @@
 """Where a glove carries its markers: one place a marker on a bone's skin, read from a TOML file.
 
 A layout says nothing about one hand's size: places are fractions of the bone they sit on, so that the same
-glove fits every hand. Angles are degrees in the file and radians in memory, the marker radius millimetres in
-the file and metres in memory.
+glove fits every hand. Angles are degrees in the file and radians in memory, the marker radius millimeters in
+the file and meters in memory.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from handsim._toml import check_keys, number_of, quoted, tables_of, text_of, written
 from handsim.errors import HandSimError, LayoutError, choices
-from handsim.io import atomic_write, read_toml
-from handsim.topology import BONE_NAMES, BONES, DIGITS, PALM
+from handsim.files.atomic import atomic_write, read_toml
+from handsim.files.toml_values import check_keys, number_of, quoted, tables_of, text_of, written
+from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, PALM
 
 FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60
@@ -57,7 +57,7 @@ class MarkerPlace:
 
     name: str
     bone: str
-    """One of `handsim.topology.BONE_NAMES`."""
+    """One of `handsim.hand.topology.BONE_NAMES`."""
     along: float
     """0 at the bone's near end to 1 at its far end, and up to 0.3 beyond either."""
     around: float
@@ -67,7 +67,9 @@ class MarkerPlace:
 
     def __post_init__(self) -> None:
         if not self.name or self.name != self.name.strip() or not self.name.isprintable():
-            raise LayoutError(f"marker name {self.name!r}: wanted printable characters without outer blanks")
+            raise LayoutError(
+                f"marker name {self.name!r}: expected printable characters without outer blanks"
+            )
         if self.bone not in BONE_NAMES:
             raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
         degrees = math.degrees(self.around)
@@ -79,7 +81,7 @@ class MarkerPlace:
             if not low <= value <= high:
                 unit = " degrees" if key == "around" else ""
                 raise LayoutError(
-                    f"marker '{self.name}': {key} is {value:g}, wanted {low:g} to {high:g}{unit}"
+                    f"marker '{self.name}': {key} is {value:g}, expected {low:g} to {high:g}{unit}"
                 )
         if self.across != 0.0 and self.bone != BONES[PALM].name:
             raise LayoutError(
@@ -103,7 +105,7 @@ class MarkerLayout:
     def __post_init__(self) -> None:
         object.__setattr__(self, "markers", tuple(self.markers))
         if not self.name or not self.name.isprintable():
-            raise LayoutError(f"layout name {self.name!r}: wanted printable characters")
+            raise LayoutError(f"layout name {self.name!r}: expected printable characters")
         if not FEWEST_MARKERS <= self.num_markers <= MOST_MARKERS:
             raise LayoutError(
                 f"a layout needs {FEWEST_MARKERS} to {MOST_MARKERS} markers, got {self.num_markers}"
@@ -114,7 +116,7 @@ class MarkerLayout:
         low, high = _RADIUS_RANGE
         if not low <= self.radius <= high:
             raise LayoutError(
-                f"radius_mm is {self.radius * 1e3:g}, wanted {low * 1e3:g} to {high * 1e3:g} millimetres"
+                f"radius_mm is {self.radius * 1e3:g}, expected {low * 1e3:g} to {high * 1e3:g} millimeters"
             )
 
     @property

@@ -6,19 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from handsim.errors import ShapeError, choices
-from handsim.topology import SIDES, Side
+from handsim.errors import ArgumentError
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
-
-
-def check_side(side: str) -> Side:
-    """The side itself, or a `ShapeError` with the valid names."""
-    for valid in SIDES:
-        if side == valid:
-            return valid
-    raise ShapeError(choices(side, SIDES, noun="side"))
 
 
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
@@ -29,7 +20,7 @@ def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> N
         want is not None and want != got for want, got in zip(shape, tail, strict=True)
     ):
         wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        raise ShapeError(f"{name} has shape {values.shape}, wanted (..., {wanted})")
+        raise ArgumentError(f"{name} has shape {values.shape}, expected (..., {wanted})")
     if not np.isfinite(values).all():
-        raise ShapeError(f"{name} holds NaN or infinite values, wanted finite numbers")
+        raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
     return values

@@ -14,7 +14,7 @@ class HandSimError(Exception):
     """Root of every error that handsim raises on purpose."""
 
 
-class ShapeError(HandSimError):
+class ArgumentError(HandSimError):
     """A hand, a pose or an array that is not what it should be."""
 
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from handsim.shape import HandShape
-from handsim.topology import NUM_BONES
-from render.camera import Camera
+from handsim.hand.shape import HandShape
+from handsim.hand.topology import NUM_BONES
+from render.cameras.camera import Camera
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -28,7 +28,7 @@ class Pictures:
     rgb: UInt8[np.ndarray, "H W 3"] | None = None
     """sRGB."""
     depth: Float32[np.ndarray, "H W"] | None = None
-    """Distance along the camera's axis at each pixel's centre [m]; 0 where there is nothing."""
+    """Distance along the camera's axis at each pixel's center [m]; 0 where there is nothing."""
     normals: Float32[np.ndarray, "H W 3"] | None = None
     """Unit normals of the surface in the camera's axes; 0 where there is nothing."""
     parts: UInt8[np.ndarray, "H W"] | None = None
@@ -61,7 +61,7 @@ class HandTruth:
     """Skin in the world [m]."""
     marker_names: tuple[str, ...] = ()
     markers: Float[np.ndarray, "M 3"] = field(default_factory=lambda: np.empty((0, 3)))
-    """Centres of the glove's markers as the pose has them, in the world [m]."""
+    """Centers of the glove's markers as the pose has them, in the world [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,7 +86,7 @@ class RenderedFrame:
     ideal: Pictures
     """As a perfect sensor would have them."""
     noisy: Pictures
-    """Colours and depth as the sensor has them; None for what has no noise."""
+    """Colors and depth as the sensor has them; None for what has no noise."""
     points: Float[np.ndarray, "N 3"]
     """What the optical system saw, in the world [m]."""
     labels: Int[np.ndarray, "N"]

@@ -1,7 +1,7 @@
 """The 21 keypoints of a hand: wrist, and four a digit from its first joint to its tip.
 
 The order is FreiHAND's and MediaPipe's: wrist, thumb, index, middle, ring, little. Joints are the
-centres that the hand turns about; a tip is the far end of the last bone, on the skin.
+centers that the hand turns about; a tip is the far end of the last bone, on the skin.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.model import HandModel
-from handsim.topology import DIGITS, PALM, bones_of
+from handsim.hand.model import HandModel
+from handsim.hand.topology import DIGITS, PALM, bones_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -37,7 +37,7 @@ def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[n
     """Keypoints in the world [m].
 
     Raises:
-        ShapeError: `qpos` is not (T, 27) or not finite.
+        ArgumentError: `qpos` is not (T, 27) or not finite.
     """
     transforms = model.forward_kinematics(qpos)
     points: NDArray[np.float64] = np.empty((len(transforms), NUM_KEYPOINTS, 3))

@@ -13,25 +13,25 @@ from typing import Final, Literal
 import cv2
 import numpy as np
 
-from handsim.errors import HandSimError, ShapeError, choices
-from handsim.json_files import claim
-from handsim.processes import in_processes
-from render.annotations.common import without_colors
-from render.backgrounds import BackgroundConfig, photo_files
-from render.blur import ShutterConfig, sample_shutter
-from render.contact_sheet import contact_sheet
-from render.depth_noise import DepthNoiseConfig, sample_depth_noise
-from render.exposure import ExposureConfig, sample_exposure
-from render.figures import sample_people
+from handsim.app.workers import in_processes
+from handsim.errors import ArgumentError, HandSimError, choices
+from handsim.files.json_files import claim
+from render.cameras.viewpoints import ViewConfig, Viewpoints
+from render.formats.annotations.common import without_colors
+from render.formats.writer import FORMATS, NEED_COLORS, open_writer
 from render.frames import RenderedFrame
-from render.labels import write_png
-from render.painter import Painter
+from render.illustrations.captions import write_png
+from render.illustrations.contact_sheet import contact_sheet
+from render.painting.figures import sample_people
+from render.painting.painter import Painter
+from render.scenery.backgrounds import BackgroundConfig, photo_files
+from render.scenery.surroundings import sample_surroundings
+from render.sensors.depth_noise import DepthNoiseConfig, sample_depth_noise
+from render.sensors.exposure import ExposureConfig, sample_exposure
+from render.sensors.shutter import ShutterConfig, sample_shutter
 from render.shown_take import ShownTake, load_shown_take
-from render.skin_look import ALL_TONES, SkinLook
+from render.skin.look import ALL_TONES, SkinLook
 from render.studio import PASSES, FrameChoices, Studio
-from render.surroundings import sample_surroundings
-from render.viewpoints import ViewConfig, Viewpoints
-from render.writer import FORMATS, NEED_COLORS, open_writer
 
 Progress = Callable[[int, int], None]
 """Called with pictures done and pictures wanted."""
@@ -47,7 +47,7 @@ class RenderConfig:
     """Everything that decides the bytes of a rendering.
 
     Raises:
-        ShapeError: A pass is unknown, or a number is none.
+        ArgumentError: A pass is unknown, or a number is none.
     """
 
     passes: tuple[str, ...] = PASSES
@@ -63,9 +63,9 @@ class RenderConfig:
     depth_sensor: DepthNoiseConfig | None = field(default_factory=DepthNoiseConfig)
     """None: depth is perfect only."""
     color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
-    """None: colours are perfect only."""
+    """None: colors are perfect only."""
     painter: Painter = "compiled"
-    """Who paints colours: opengl is worth it where there is a graphics card."""
+    """Who paints colors: opengl is worth it where there is a graphics card."""
     shutter: ShutterConfig | None = None
     """None: pictures of moments; else motion blur and rolling shutters, which take a drawing a sub-frame."""
     every: int = 1
@@ -76,9 +76,9 @@ class RenderConfig:
     def __post_init__(self) -> None:
         for name in self.passes:
             if name not in PASSES:
-                raise ShapeError(choices(name, PASSES, noun="pass"))
+                raise ArgumentError(choices(name, PASSES, noun="pass"))
         if not self.passes or self.every < 1 or self.frames_per_shard < 1:
-            raise ShapeError("a rendering wants at least one pass, one frame a step and one frame a shard")
+            raise ArgumentError("a rendering wants at least one pass, one frame a step and one frame a shard")
 
 
 def render_take(
@@ -95,7 +95,7 @@ def render_take(
     Args:
         path: A tracked take, or the truth of a simulated one.
         out: Folder; each format has its own in it where there are several.
-        formats: Some of `render.writer.FORMATS`.
+        formats: Some of `render.formats.writer.FORMATS`.
         config: What to draw.
         workers: Processes; all cores when not given.
         progress: Told after every shard.
@@ -136,7 +136,7 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
         if name in NEED_COLORS and "rgb" not in config.passes:
             raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
-        raise HandSimError(f"formats are {', '.join(formats) or 'none'}, wanted at least one, each once")
+        raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
 
 
 def _folder(out: Path, formats: Sequence[str], name: str) -> Path:

@@ -8,28 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gloves.archives import archive_kind
-from gloves.attach import Attachment, attach
-from gloves.take import KIND, Take, load_take
-from gloves.tracked_take import LOST, TrackedTake, load_tracked_take
+from gloves.fit import GlovedHand
+from gloves.takes.archives import archive_kind
+from gloves.takes.take import KIND, Take, load_take
+from gloves.takes.tracked_take import LOST, TrackedTake, load_tracked_take
 from handsim.errors import CaptureError
-from handsim.model import HandModel
-from handsim.objects import RigidObject, named_object, object_names
-from handsim.transforms import quaternion_matrix
+from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.transforms import quaternion_matrix
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ShownHand:
-    """One hand of a take."""
-
-    model: HandModel
-    attachment: Attachment
-    qpos: Float[np.ndarray, "T 27"]
-    """NaN where there is no pose to show."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +42,7 @@ class ShownTake:
     """Frames a second [Hz]."""
     times: Float[np.ndarray, "T"]
     """[s]"""
-    hands: tuple[ShownHand, ...]
+    hands: tuple[GlovedHand, ...]
     bodies: tuple[ShownBody, ...]
     points: Float[np.ndarray, "T N 3"]
     """World [m], NaN where a column has no point."""
@@ -83,32 +72,27 @@ def load_shown_take(path: Path) -> ShownTake:
         else show_tracked(load_tracked_take(path))
     )
     if not np.isfinite(shown.wrists()[..., 0]).any():
-        raise CaptureError(f"{path}: there is no hand in any frame, wanted one to draw")
+        raise CaptureError(f"{path}: there is no hand in any frame, expected one to draw")
     return shown
 
 
 def show_simulated(take: Take) -> ShownTake:
     """The truth of a simulated take."""
-    hands = []
-    for hand in take.hands:
-        model = HandModel(hand.shape)
-        hands.append(ShownHand(model, attach(hand.layout, model), hand.qpos))
-    names = [f"{hand.shape.side}:{name}" for hand in take.hands for name in hand.layout.names]
+    names = [f"{hand.side}:{name}" for hand in take.hands for name in hand.fit.layout.names]
     bodies: tuple[ShownBody, ...] = ()
     if take.body is not None:
         names += [f"{take.body.name}:{name}" for name in take.body.marker_names]
         bodies = (_body(take.body.name, np.empty((0, 3)), take.body.T_world_body),)
     times = np.arange(take.num_frames) / take.rate
     labels = take.labels.astype(np.int64)
-    return ShownTake(take.rate, times, tuple(hands), bodies, take.points, labels, tuple(names))
+    return ShownTake(take.rate, times, take.hands, bodies, take.points, labels, tuple(names))
 
 
 def show_tracked(take: TrackedTake) -> ShownTake:
     """What a tracker made of a capture."""
     hands = tuple(
-        ShownHand(
-            HandModel(hand.shape),
-            hand.attachment,
+        GlovedHand(
+            hand,
             np.where(take.status[:, place, None] == LOST, np.nan, take.qpos[:, place]),
         )
         for place, hand in enumerate(take.hands)

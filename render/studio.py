@@ -11,21 +11,22 @@ from typing import TYPE_CHECKING, Any, Final
 import cv2
 import numpy as np
 
+from gloves.fit import GlovedHand
 from handsim.errors import HandSimError
-from render.backgrounds import Background, draw_background
-from render.blur import Shutter, combine, shutter_times
-from render.camera import Camera
-from render.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
-from render.exposure import Exposure, expose, linear_of
-from render.figures import Appearance, BodyFigure, Drawn, HandFigure
+from render.cameras.camera import Camera
+from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
 from render.frames import BodyTruth, Pictures, RenderedFrame
-from render.lights import Lighting
-from render.painter import Painter, paint, put_before
-from render.rasteriser import NEAR, join, rasterise
-from render.shading import GAMMA
+from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
+from render.painting.lights import Lighting
+from render.painting.painter import Painter, paint, put_before
+from render.painting.rasterizer import NEAR, join, rasterize
+from render.painting.shading import GAMMA
+from render.scenery.backgrounds import Background, draw_background
+from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
+from render.sensors.exposure import Exposure, expose, linear_of
+from render.sensors.shutter import Shutter, combine, shutter_times
 from render.shown_take import ShownTake
 from render.truth import hand_truth
-from render.warp import faces_for, warp, warp_depth, warp_normals
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, UInt8
@@ -41,7 +42,7 @@ class FrameChoices:
     lighting: Lighting
     background: Background
     exposure: Exposure | None
-    """None for a perfect colour sensor."""
+    """None for a perfect color sensor."""
     shutter: Shutter | None
     """None for a picture of a moment."""
     depth_noise: DepthNoise | None
@@ -58,7 +59,7 @@ class Studio:
         people: How each of its hands looks.
         body_colors: Of each of its things, sRGB in [0, 1].
         passes: Some of `PASSES`.
-        painter: Who paints colours.
+        painter: Who paints colors.
     """
 
     def __init__(
@@ -71,9 +72,9 @@ class Studio:
     ) -> None:
         self.take, self.passes, self.painter = take, tuple(passes), painter
         self._people = tuple(people)
-        first = np.cumsum([0, *(len(hand.attachment.points) for hand in take.hands)])
+        first = np.cumsum([0, *(len(hand.fit.attachment.points) for hand in take.hands)])
         self._hands = [
-            HandFigure(hand, look, first_marker=int(number))
+            HandFigure(hand.fit, look, first_marker=int(number))
             for hand, look, number in zip(take.hands, people, first, strict=False)
         ]
         self._bodies = [BodyFigure(body, color) for body, color in zip(take.bodies, body_colors, strict=True)]
@@ -93,7 +94,7 @@ class Studio:
         rng = np.random.default_rng(choices.seed)
         drawn = self._drawn(frame, 0.0)
         _check_outside(camera, drawn, frame)
-        present = [n for n, hand in enumerate(self._hands) if self._pose(hand, frame) is not None]
+        present = [n for n, hand in enumerate(self.take.hands) if self._pose(hand, frame) is not None]
         noisy = "depth" in self.passes and choices.depth_noise is not None
         truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
@@ -129,9 +130,9 @@ class Studio:
             choices=self._record(choices),
         )
 
-    def _pose(self, figure: HandFigure, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
+    def _pose(self, hand: GlovedHand, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
         """Pose of a hand some time after a frame [s]; None where there is none."""
-        pose = _between(figure.hand.qpos, frame, shift * self.take.rate)
+        pose = _between(hand.qpos, frame, shift * self.take.rate)
         if pose is None:
             return None
         pose[3:7] /= np.linalg.norm(pose[3:7])
@@ -140,8 +141,8 @@ class Studio:
     def _drawn(self, frame: int, shift: float) -> list[Drawn]:
         drawn: list[Drawn] = []
         number = 0
-        for figure in self._hands:
-            pose = self._pose(figure, frame, shift)
+        for hand, figure in zip(self.take.hands, self._hands, strict=False):
+            pose = self._pose(hand, frame, shift)
             if pose is not None:
                 drawn += figure.drawn(pose, number)
                 number += 1
@@ -162,7 +163,7 @@ class Studio:
             flat = np.zeros((height, width), dtype=np.uint8)
             bare = np.zeros((height, width, 3), dtype=np.float32)
             return Pictures(None, flat.astype(np.float32), bare, flat, flat, flat)
-        faces = [rasterise(face, surface, with_normals=with_normals) for face in faces_for(camera)]
+        faces = [rasterize(face, surface, with_normals=with_normals) for face in faces_for(camera)]
         if camera.lens.kind == "pinhole":
             return faces[0]
         normals = [face.normals for face in faces if face.normals is not None]
@@ -180,7 +181,7 @@ class Studio:
     def _infrared(
         self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]
     ) -> Float32[np.ndarray, "H W"]:
-        """What surfaces send back to a depth sensor; bare skin does not go by its colours."""
+        """What surfaces send back to a depth sensor; bare skin does not go by its colors."""
         assert truth.instances is not None
         shape = truth.instances.shape
         infrared = np.ones(shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
@@ -192,7 +193,7 @@ class Studio:
     def _colors_of(
         self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """The perfect colour picture."""
+        """The perfect color picture."""
         painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
         whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
         return put_before(whole, _background(choices.background, camera.size))
@@ -249,13 +250,13 @@ def _between(rows: Float[np.ndarray, "T ..."], frame: int, shift: float) -> NDAr
 
 
 def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
-    centre = camera.T_world_camera[:3, 3]
+    center = camera.T_world_camera[:3, 3]
     for one in drawn:
-        nearest = np.linalg.norm(one.triangles.vertices - centre, axis=1).min()
+        nearest = np.linalg.norm(one.triangles.vertices - center, axis=1).min()
         if nearest < 2.0 * NEAR:
             raise HandSimError(
                 f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or thing in frame {frame}, "
-                f"wanted {2e3 * NEAR:.0f} mm or more; place it elsewhere"
+                f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
             )
 
 

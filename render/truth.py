@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from render.camera import Camera
-from render.figures import HandFigure, digit_of_part
+from render.cameras.camera import Camera
 from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures
 from render.keypoints import KEYPOINT_DIGITS, NUM_KEYPOINTS, hand_keypoints
+from render.painting.figures import HandFigure, digit_of_part
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, UInt8
@@ -31,7 +31,7 @@ def hand_truth(
         camera: Who looks.
         pictures: Depth and parts as that camera has them.
     """
-    model = figure.hand.model
+    model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
     pixels = camera.project(keypoints)
     assert pictures.parts is not None
@@ -44,7 +44,7 @@ def hand_truth(
         visible=_visible(keypoints, pixels, number, camera, pictures),
         box=_box(pictures.parts, number),
         vertices=model.skin(qpos[None])[0].astype(np.float32),
-        marker_names=figure.hand.attachment.layout.names if worn else (),
+        marker_names=figure.fit.layout.names if worn else (),
         markers=figure.markers(qpos) if worn else np.empty((0, 3)),
     )
 

@@ -40,7 +40,7 @@ def denormals() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def drawing() -> None:
     """Skips where nothing can be drawn."""
-    from render._gl import offscreen_renderer
+    from render.painting.gl import offscreen_renderer
 
     try:
         offscreen_renderer(16, 16)

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.archives import write_archive
-from gloves.captures import Capture, write_capture
+from gloves.captures.capture import Capture
+from gloves.captures.formats import write_capture
 from gloves.layout import load_layout, save_layout
-from gloves.take import save_take
-from handsim.cli import main
-from train.twins import TwinConfig, simulate_twin
+from gloves.takes.archives import write_archive
+from gloves.takes.take import save_take
+from handsim.app.cli import main
+from train.simulation.twins import TwinConfig, simulate_twin
 
 GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
@@ -60,7 +61,7 @@ def folder(tmp_path, monkeypatch):
         "at_the_hands.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.0, 0.65, 1.1]),
         "damaged.truth.npz": "PK",
         "furlongs.trc": text.replace("\tmm\t", "\tfurlongs\t"),
-        "millimetres.trc": text.replace("\tmm\t", "\tm\t"),
+        "millimeters.trc": text.replace("\tmm\t", "\tm\t"),
         "damaged.onnx": "onnx",
         "empty.trc": "\n".join(text.split("\n")[:5]) + "\n",
         "nothing.trc": "",
@@ -69,7 +70,7 @@ def folder(tmp_path, monkeypatch):
         "renamed.trc": text.replace("ThumbIP", "Thumb_IP"),
         "takes.docx": "x",
         "wand.toml": body("[0, 0, 0]", "[50, 0, 0]", "[0, 80, 0]"),
-        "in_metres.toml": body("[0, 0, 0]", "[0.05, 0, 0]", "[0, 0.08, 0]"),
+        "in_meters.toml": body("[0, 0, 0]", "[0.05, 0, 0]", "[0, 0.08, 0]"),
         "flat_marker.toml": body("[0, 0]", "[50, 0]", "[0, 80]"),
     }
     for name, content in files.items():
@@ -115,8 +116,8 @@ CASES = {
     "no such take": ["evaluate", "missing.truth.npz", "--json", "out.json"],
     "an unknown glove of a table": ["reproduce", "table3", "--glove", "dense91"],
     "a negative seed of a table": ["reproduce", "table3", "--seed", "-1"],
-    "millimetres said to be metres": ["label", "millimetres.trc", "--out", "out.trc"],
-    "millimetres said to be metres, as truth": ["evaluate", "millimetres.trc", "--json", "out.json"],
+    "millimeters said to be meters": ["label", "millimeters.trc", "--out", "out.trc"],
+    "millimeters said to be meters, as truth": ["evaluate", "millimeters.trc", "--json", "out.json"],
     "a damaged ONNX file": ["label", "good.trc", "--labeler", "damaged.onnx", "--out", "out.trc"],
     "an export to another kind of file": ["export", "dense19", "--out", "out.pt"],
     "an export of an unknown labeler": ["export", "dense91", "--out", "out.onnx"],
@@ -133,14 +134,14 @@ CASES = {
     "an address that is none": ["track", "--live", "localhost:1510", "--out", "out.npz"],
     "a tracked take in another kind of file": ["track", "good.trc", "--out", "out.c3d"],
     "a tracked take in place of the truth": ["track", "good.trc", "--out", "good.truth.npz"],
-    "labels in another kind of file": ["track", "good.trc", "--labelled", "out.csv", "--out", "out.npz"],
+    "labels in another kind of file": ["track", "good.trc", "--labeled", "out.csv", "--out", "out.npz"],
     "a hand twice": ["track", "good.trc", "--hands", "left", "left", "--out", "out.npz"],
     "an unknown glove to track": ["track", "good.trc", "--glove", "dense91", "--out", "out.npz"],
-    "millimetres said to be metres, to track": ["track", "millimetres.trc", "--out", "out.npz"],
+    "millimeters said to be meters, to track": ["track", "millimeters.trc", "--out", "out.npz"],
     "a truncated capture to track": ["track", "truncated.trc", "--out", "out.npz"],
     "an unknown body": ["track", "good.trc", "--body", "wand", "--out", "out.npz"],
     "no body's file": ["track", "good.trc", "--body", "missing.toml", "--out", "out.npz"],
-    "a body in metres": ["track", "good.trc", "--body", "in_metres.toml", "--out", "out.npz"],
+    "a body in meters": ["track", "good.trc", "--body", "in_meters.toml", "--out", "out.npz"],
     "a body in a plane of two numbers": [
         "track",
         "good.trc",

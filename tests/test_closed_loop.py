@@ -5,22 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.captures import read_capture, write_capture
-from gloves.take import load_take
-from gloves.tracked_take import load_tracked_take, save_tracked_take
-from handsim.model import HandModel
+from gloves.captures.formats import read_capture, write_capture
+from gloves.takes.take import load_take
+from gloves.takes.tracked_take import load_tracked_take, save_tracked_take
+from handsim.hand.model import HandModel
+from render.cameras.viewpoints import ViewConfig
 from render.keypoints import hand_keypoints
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
-from render.viewpoints import ViewConfig
 from track.capture_tracking import track
-from track.evaluation import true_users
+from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
-from train.labeler import load_labeler
-from train.take_commands import simulate
-from train.twins import TwinConfig
+from train.commands.simulate import simulate
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig
 
-MOST_MILLIMETRES = 1.0
+MOST_MILLIMETERS = 1.0
 MOST_PIXELS = 2.0
 FRAMES = 120
 
@@ -42,7 +42,7 @@ def tracked(truth):
     return load_tracked_take(folder / "tracked.npz"), folder
 
 
-def test_hands_are_tracked_to_a_millimetre(truth, tracked):
+def test_hands_are_tracked_to_a_millimeter(truth, tracked):
     take, _ = truth
     result, _ = tracked
     for hand in take.hands:
@@ -54,7 +54,7 @@ def test_hands_are_tracked_to_a_millimetre(truth, tracked):
             model.forward_kinematics(qpos[there])[..., :3, 3] for qpos in (result.qpos[:, place], hand.qpos)
         ]
         off = 1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1)
-        assert off.mean() <= MOST_MILLIMETRES
+        assert off.mean() <= MOST_MILLIMETERS
 
 
 def test_pictures_of_tracked_hands_have_their_keypoints_where_the_truth_is(truth, tracked):

@@ -54,13 +54,13 @@ def test_wheel_holds_every_source_and_data_file(wheel: zipfile.ZipFile) -> None:
     assert wanted <= set(wheel.namelist())
 
 
-def test_wheel_carries_licence_command_and_one_version(wheel: zipfile.ZipFile) -> None:
+def test_wheel_carries_license_command_and_one_version(wheel: zipfile.ZipFile) -> None:
     stated = re.search(r'__version__ = "(.+)"', (ROOT / "handsim" / "_version.py").read_text())
     assert stated is not None
     about = f"handsim-{stated.group(1)}.dist-info"
     texts = {name: wheel.read(f"{about}/{name}").decode() for name in ("METADATA", "entry_points.txt")}
     assert f"\nVersion: {stated.group(1)}\n" in texts["METADATA"]
-    assert "handsim = handsim.cli:main" in texts["entry_points.txt"]
+    assert "handsim = handsim.app.cli:main" in texts["entry_points.txt"]
     assert f"{about}/licenses/LICENSE" in wheel.namelist()
     assert "version" not in _project_table()  # pyproject.toml repeats no version
     assert f"version: {stated.group(1)}\n" in (ROOT / "CITATION.cff").read_text()
@@ -100,7 +100,7 @@ def test_nobody_pays_for_another_packages_imports(packages: tuple[str, ...], hea
     assert run_python(code + f"print(sorted({set(heavy)} & set(sys.modules)))") == "[]\n"
 
 
-def test_a_neighbour_called_train_is_told(tmp_path: Path) -> None:
+def test_a_neighbor_called_train_is_told(tmp_path: Path) -> None:
     (tmp_path / "train.py").write_text("")
     code = f"import sys; sys.path.append({str(ROOT)!r}); import handsim"
     command = [sys.executable, "-c", code]

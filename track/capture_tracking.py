@@ -2,7 +2,7 @@
 
 Files say nothing of IDs. Every format that is read (.trc, .c3d, Motive's .csv) keeps a trajectory a column,
 so a column is an ID for as long as it has a point; after a gap it is another one, because columns of
-unlabelled points may go on with somebody else. Column names are not used.
+unlabeled points may go on with somebody else. Column names are not used.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gloves.captures import Capture
-from gloves.identities import number_runs
-from gloves.tracked_take import LOST, STATUSES, MarkedBody, TrackedTake, WornGlove
+from gloves.captures.capture import Capture
+from gloves.fit import GloveFit
+from gloves.optics.identities import number_runs
+from gloves.takes.tracked_take import LOST, STATUSES, MarkedBody, TrackedTake
 from handsim.errors import CaptureError
-from handsim.topology import NUM_QPOS
-from track.streaming import StreamedFrame
+from handsim.hand.topology import NUM_QPOS
+from track.streams.point_stream import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
-from track.user import UserHand
-from train.labeling import Labeler, check_unit
+from train.labelers.protocol import Labeler, check_unit
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
@@ -45,7 +45,7 @@ def track(capture: Capture, tracker: Tracker, *, progress: Progress | None = Non
         progress: Called after each frame with how many are done and how many there are.
 
     Raises:
-        ShapeError: The capture is not in metres.
+        ArgumentError: The capture is not in meters.
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
@@ -90,7 +90,7 @@ def follow(frames: Iterable[StreamedFrame], tracker: Tracker) -> Iterator[tuple[
         yield told, tracker.step(frame.points, frame.ids, now)
 
 
-def warm_up(hands: Sequence[UserHand], labeler: Labeler) -> None:
+def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
     """Make ready what a tracker needs: on a machine's first run its kernels are compiled, for half a minute.
 
     Without it the first frames of a stream would wait for that.
@@ -100,7 +100,7 @@ def warm_up(hands: Sequence[UserHand], labeler: Labeler) -> None:
     qpos[:, 0], qpos[:, 3] = _APART * np.arange(len(hands)), 1.0
     points = np.concatenate(
         [
-            hand.attachment.centres(hand.model, hand.model.forward_kinematics(row[None]))[0]
+            hand.attachment.centers(hand.model, hand.model.forward_kinematics(row[None]))[0]
             for hand, row in zip(hands, qpos, strict=True)
         ]
     )
@@ -117,7 +117,7 @@ class TakeRecorder:
     """
 
     def __init__(self, tracker: Tracker) -> None:
-        self._hands = tuple(WornGlove(hand.model.shape, hand.attachment) for hand in tracker.hands)
+        self._hands = tracker.hands
         self._bodies = tuple(MarkedBody(body.name, body.marker_names, body.places) for body in tracker.bodies)
         self._frames: list[tuple[StreamedFrame, TrackedFrame]] = []
 
@@ -149,7 +149,7 @@ class TakeRecorder:
         frames = [frame for frame, _ in self._frames]
         tracked = [one for _, one in self._frames]
         if not frames or (capture is None and len(frames) < 2):
-            raise CaptureError(f"{len(frames)} frames came, wanted two or more")
+            raise CaptureError(f"{len(frames)} frames came, expected two or more")
         times = np.array([frame.time for frame in frames])
         counts = np.array([len(frame.points) for frame in frames])
         there = np.arange(counts.max(initial=0)) < counts[:, None]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from handsim.errors import ShapeError
+from handsim.errors import ArgumentError
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -48,11 +48,13 @@ class Intake:
         """The next frame.
 
         Raises:
-            ShapeError: `points` and `ids` do not fit together: the caller's mistake, not the stream's.
+            ArgumentError: `points` and `ids` do not fit together: the caller's mistake, not the stream's.
         """
         points, ids = np.asarray(points, dtype=np.float64), np.asarray(ids, dtype=np.int64)
         if points.shape != (len(ids), 3):
-            raise ShapeError(f"points have shape {points.shape}, wanted ({len(ids)}, 3) for {len(ids)} IDs")
+            raise ArgumentError(
+                f"points have shape {points.shape}, expected ({len(ids)}, 3) for {len(ids)} IDs"
+            )
         notes = self._tick(float(time))
         with np.errstate(invalid="ignore"):
             usable = np.abs(points).max(axis=1, initial=0.0) < _FARTHEST  # which NaN is not

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from handsim.topology import Side
+from handsim.hand.topology import Side
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -36,9 +36,9 @@ class TrackedHand:
     qpos: Float[np.ndarray, "27"]
     """NaN where the hand is lost."""
     rms: float
-    """3D RMS distance of the labelled markers from the pose's [m]; NaN without a fit."""
+    """3D RMS distance of the labeled markers from the pose's [m]; NaN without a fit."""
     markers: Float[np.ndarray, "M 3"]
-    """The labelled markers [m], and the pose's where they are missing; NaN where the hand is lost."""
+    """The labeled markers [m], and the pose's where they are missing; NaN where the hand is lost."""
     filled: Int[np.ndarray, "F"]
     """Which of these are filled in from the pose."""
 
@@ -59,7 +59,7 @@ class TrackedBody:
     rotation: Float[np.ndarray, "4"]
     """Its orientation, wxyz; NaN where it is lost."""
     rms: float
-    """RMS distance of its labelled points from its markers [m]; NaN without any."""
+    """RMS distance of its labeled points from its markers [m]; NaN without any."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

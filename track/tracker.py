@@ -1,8 +1,9 @@
 """The online tracker: points of a frame in, hands in motion out.
 
 Section 4 of Han et al. 2018, with more memory: names go along with IDs while they fit, new points are named
-by what the hand that is coming explains (`track.naming`), and a hand of which nothing is known is looked for
-with the labeler (`track.finding`).
+by what the hand that is coming explains (`track.association.label_consistency`), and a hand of which nothing
+is known is looked for
+with the labeler (`track.association.initialization`).
 """
 
 from __future__ import annotations
@@ -12,19 +13,19 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.topology import NUM_QPOS
-from handsim.transforms import rotation_quaternions
-from track.advice import Adviser
-from track.finding import MOST_RMS, Found, HandFinder, score_of
-from track.hand_memory import Estimate, HandMemory
+from gloves.fit import GloveFit
+from handsim.hand.topology import NUM_QPOS
+from handsim.space.transforms import rotation_quaternions
+from track.association.candidates import YOUNG
+from track.association.hand_state import Estimate, HandMemory
+from track.association.initialization import MOST_RMS, Found, HandFinder, score_of
+from track.association.label_consistency import fit_names, forget_surprises, targets_of
+from track.association.label_new_points import Following, name_new
+from track.association.labeler_queries import Adviser
+from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.intake import Incoming, Intake
-from track.naming import fit_names, forget_surprises, targets_of
-from track.new_names import Following, name_new
-from track.reaching import YOUNG
-from track.rigid_body import BodyTracker, RigidTemplate
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
-from track.user import UserHand
-from train.labeling import Labeler
+from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -50,7 +51,7 @@ class Tracker:
     """
 
     def __init__(
-        self, hands: Sequence[UserHand], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
+        self, hands: Sequence[GloveFit], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
     ) -> None:
         self.hands = tuple(hands)
         self.bodies = tuple(bodies)
@@ -74,7 +75,7 @@ class Tracker:
             time: Time of the frame [s].
 
         Raises:
-            ShapeError: `points` and `ids` do not fit together.
+            ArgumentError: `points` and `ids` do not fit together.
         """
         frame = self._intake.take(points, ids, time)
         bodies, labels = self._track_bodies(frame)

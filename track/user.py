@@ -5,21 +5,20 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from gloves.attach import Attachment, attach
+from gloves.attach import Attachment
+from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, stored_layout
 from handsim._checks import check_array
 from handsim.errors import HandSimError
-from handsim.io import atomic_write
-from handsim.model import HandModel
-from handsim.shape import HandShape
-from handsim.topology import NUM_BONES, Side
-from handsim.transforms import MIRROR
+from handsim.files.atomic import atomic_write
+from handsim.hand.model import HandModel
+from handsim.hand.shape import HandShape
+from handsim.hand.topology import NUM_BONES
 
 SCHEMA: Final = 1
 _ARRAYS: Final = {"points": (3,), "normals": (3,), "bone_indices": (4,), "bone_weights": (4,)}
@@ -38,34 +37,7 @@ class UserError(HandSimError):
     """A user's file that cannot be read or written."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class UserHand:
-    """One hand of the user in its glove."""
-
-    model: HandModel
-    attachment: Attachment
-
-    @property
-    def side(self) -> Side:
-        """Which hand this is."""
-        return self.model.shape.side
-
-    def with_side(self, side: Side) -> UserHand:
-        """The same hand in its glove on the other (or the same) arm."""
-        if side == self.side:
-            return self
-        worn = self.attachment
-        turned = dataclasses.replace(worn, points=worn.points @ MIRROR, normals=worn.normals @ MIRROR)
-        return UserHand(HandModel(self.model.shape.with_side(side)), turned)
-
-
-def usual_hand(layout: MarkerLayout, size: str, side: Side) -> UserHand:
-    """A hand of one of the five sizes, its glove put on as designed: where a calibration begins."""
-    model = HandModel.named(size, side=side)
-    return UserHand(model, attach(layout, model))
-
-
-def save_user(path: str | Path, hands: Sequence[UserHand], notes: str = "") -> None:
+def save_user(path: str | Path, hands: Sequence[GloveFit], notes: str = "") -> None:
     """Write a user's hands and gloves as JSON; `load_user` gives the same numbers again.
 
     Args:
@@ -80,10 +52,10 @@ def save_user(path: str | Path, hands: Sequence[UserHand], notes: str = "") -> N
     path = Path(path)
     sides = [hand.side for hand in hands]
     if not hands or len(set(sides)) < len(sides):
-        raise UserError(f"hands are {sides}, wanted a left hand, a right hand, or one of each")
+        raise UserError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
     layout = hands[0].attachment.layout
     if any(hand.attachment.layout != layout for hand in hands):
-        raise UserError("the hands wear different gloves, wanted one layout for all")
+        raise UserError("the hands wear different gloves, expected one layout for all")
     content = {
         "schema": SCHEMA,
         "units": "metres, radians; every hand is described as a right one, its markers as they are",
@@ -98,7 +70,7 @@ def save_user(path: str | Path, hands: Sequence[UserHand], notes: str = "") -> N
         raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def load_user(path: str | Path) -> tuple[UserHand, ...]:
+def load_user(path: str | Path) -> tuple[GloveFit, ...]:
     """Hands and gloves that `save_user` wrote.
 
     Raises:
@@ -114,7 +86,7 @@ def load_user(path: str | Path) -> tuple[UserHand, ...]:
     if not isinstance(content, dict) or "schema" not in content:
         raise UserError(f"{path}: not a user's file: it has no schema number")
     if content["schema"] != SCHEMA:
-        raise UserError(f"{path}: a user's file of schema {content['schema']!r}, wanted {SCHEMA}")
+        raise UserError(f"{path}: a user's file of schema {content['schema']!r}, expected {SCHEMA}")
     try:
         layout = stored_layout(content["glove"])
         hands = tuple(_from_json(hand, layout) for hand in content["hands"])
@@ -129,7 +101,7 @@ def _told(error: Exception) -> str:
     return f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
 
 
-def _to_json(hand: UserHand) -> dict[str, Any]:
+def _to_json(hand: GloveFit) -> dict[str, Any]:
     shape = hand.model.shape
     named = {field.name: getattr(shape, field.name) for field in dataclasses.fields(shape)}
     shown = {name: np.asarray(value).tolist() for name, value in named.items()}
@@ -137,7 +109,7 @@ def _to_json(hand: UserHand) -> dict[str, Any]:
     return {"shape": shown, "markers": worn}
 
 
-def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> UserHand:
+def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> GloveFit:
     fields = {field.name for field in dataclasses.fields(HandShape)}
     shape: dict[str, Any] = stored["shape"]
     if set(shape) != fields:
@@ -150,7 +122,7 @@ def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> UserHand:
     for name, array in worn.items():
         if array.shape != (layout.num_markers, *_ARRAYS[name]):
             raise ValueError(
-                f"{name} has shape {array.shape}, wanted ({layout.num_markers}, {_ARRAYS[name][0]})"
+                f"{name} has shape {array.shape}, expected ({layout.num_markers}, {_ARRAYS[name][0]})"
             )
     bones = worn["bone_indices"].astype(np.int64)
     if (bones != worn["bone_indices"]).any() or bones.min() < 0 or bones.max() >= NUM_BONES:
@@ -159,4 +131,4 @@ def _from_json(stored: dict[str, Any], layout: MarkerLayout) -> UserHand:
     if shares.min() < 0.0 or np.abs(shares.sum(axis=1) - 1.0).max() > 1e-6:
         raise ValueError("bone_weights are not shares that sum to one")
     attachment = Attachment(layout, worn["points"], worn["normals"], bones, shares)
-    return UserHand(HandModel(HandShape(**values)), attachment)
+    return GloveFit(HandModel(HandShape(**values)), attachment)

@@ -9,7 +9,8 @@ from typing import Final, Literal
 from handsim.errors import HandSimError
 
 Kind = Literal["set", "cnn"]
-"""`set` is the default labeler (`train.set_labeler`), `cnn` the paper's (`train.deep_label_cnn`)."""
+"""`set` is the default labeler (`train.labelers.set_network`), `cnn` the paper's
+(`train.labelers.cnn_network`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         for name in ("samples", "batch", "devices"):
             if getattr(self, name) < 1:
-                raise HandSimError(f"{name} is {getattr(self, name)}, wanted at least 1")
+                raise HandSimError(f"{name} is {getattr(self, name)}, expected at least 1")
 
 
 Preset = Literal["han2018"]

@@ -18,15 +18,15 @@ from torch import nn
 
 from handsim._version import __version__
 from handsim.errors import DatasetError, WeightsError
-from handsim.json_files import claim
-from train.augmentation import Corruption
-from train.batches import draw_batch, paper_corruption
+from handsim.files.json_files import claim
 from train.config import TrainConfig
-from train.evaluation import Report, evaluate_labeler
-from train.kinds import labeler_of
-from train.labeler import save_network
-from train.run_page import write_run_page
-from train.shards import Dataset
+from train.data.augmentation import Corruption
+from train.data.batches import draw_batch, paper_corruption
+from train.data.shards import Dataset
+from train.evaluation.labeler_evaluation import Report, evaluate_labeler
+from train.labelers.kinds import labeler_of
+from train.labelers.storage import save_network
+from train.reports.run_page import write_run_page
 from train.training_state import TrainingState, paper_report, passed
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def _split(dataset: Dataset, batch: int) -> tuple[NDArray[np.void], NDArray[np.v
     rows = dataset.rows()
     held_out = min(_MOST_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
     if len(rows) - held_out < batch:
-        raise DatasetError(f"{dataset.path} has {len(rows)} frames, wanted at least {batch + held_out + 1}")
+        raise DatasetError(f"{dataset.path} has {len(rows)} frames, expected at least {batch + held_out + 1}")
     return rows[:-held_out], rows[-held_out:]
 
 

@@ -14,13 +14,13 @@ from lightning_fabric import Fabric
 from torch import nn
 
 from handsim.errors import WeightsError
-from handsim.io import atomic_write
-from train.batches import Batch, paper_corruption
+from handsim.files.atomic import atomic_write
 from train.config import TrainConfig
-from train.evaluation import Report, evaluate_labeler
+from train.data.batches import Batch, paper_corruption
+from train.evaluation.labeler_evaluation import Report, evaluate_labeler
 from train.history import History
-from train.kinds import batch_loss, labeler_of, new_network
-from train.labeling import Labeler
+from train.labelers.kinds import batch_loss, labeler_of, new_network
+from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -23,7 +23,7 @@ _LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the l
 def to_native(values: NDArray[np.generic], processor: int) -> NDArray[np.float64]:
     """Floats of a file as doubles; a DEC float has its halves swapped and is four times too big."""
     if processor != _DEC:
-        with np.errstate(invalid="ignore"):  # a damaged file may hold signalling NaNs
+        with np.errstate(invalid="ignore"):  # a damaged file may hold signaling NaNs
             return values.astype(np.float64)
     bits = values.astype(np.uint32)
     swapped = ((bits >> np.uint32(16)) | (bits << np.uint32(16))).astype("<u4")

@@ -13,7 +13,7 @@ from handsim.errors import CaptureError
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-METRES: Final = {
+METERS: Final = {
     "mm": 1e-3,
     "millimeters": 1e-3,
     "millimetres": 1e-3,
@@ -27,13 +27,13 @@ METRES: Final = {
 _BLANK: Final = math.nan
 
 
-def metres_per(unit: str) -> float:
-    """How many metres a file's unit of length is, whatever its case.
+def meters_per(unit: str) -> float:
+    """How many meters a file's unit of length is, whatever its case.
 
     Raises:
-        CaptureError: It is not millimetres, centimetres or metres.
+        CaptureError: It is not millimeters, centimeters or meters.
     """
-    scale = METRES.get(unit.strip().lower())
+    scale = METERS.get(unit.strip().lower())
     if scale is None:
         raise CaptureError(f"unknown unit of length {unit.strip()[:20]!r}; valid units: mm, cm, m")
     return scale
@@ -50,7 +50,7 @@ def positive_rate(text: str, *, name: str) -> float:
     except ValueError:
         rate = math.nan
     if not 0.0 < rate < math.inf:
-        raise CaptureError(f"{name} is '{text.strip()}', wanted a positive number of frames a second")
+        raise CaptureError(f"{name} is '{text.strip()}', expected a positive number of frames a second")
     return rate
 
 
@@ -101,7 +101,7 @@ def parse_table(
         cells = line.split(delimiter)
         if len(cells) > num_columns:
             if any(cell.strip() for cell in cells[num_columns:]):
-                raise CaptureError(f"line {number} has {len(cells)} cells, wanted {num_columns}")
+                raise CaptureError(f"line {number} has {len(cells)} cells, expected {num_columns}")
             del cells[num_columns:]
         for column in text_columns:
             if column < len(cells):
@@ -146,6 +146,6 @@ def _check_finite(
     if len(infinite):
         row, column = (int(place) for place in infinite[0])
         raise CaptureError(
-            f"line {numbered[row][0]}, column {column + 1} ({column_name(column)}): infinite, wanted a "
+            f"line {numbered[row][0]}, column {column + 1} ({column_name(column)}): infinite, expected a "
             "finite number or a blank cell"
         )

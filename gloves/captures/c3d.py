@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.captures._c3d_parameters import FLOAT_DTYPES, INTEGER_DTYPES, Parameters, to_native
-from gloves.captures._text import metres_per, positive_rate
+from gloves.captures._text import meters_per, positive_rate
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
 
@@ -42,7 +42,7 @@ def read_c3d(data: bytes) -> Capture:
     if not units:
         raise CaptureError("the file states no POINT:UNITS")
     missing = points[..., 3] < 0.0
-    positions = points[..., :3] * metres_per(units[0])
+    positions = points[..., :3] * meters_per(units[0])
     positions[missing] = np.nan
     return Capture(
         _labels(parameters, points.shape[1]), positions, positive_rate(repr(rate), name="POINT:RATE")
@@ -50,7 +50,7 @@ def read_c3d(data: bytes) -> Capture:
 
 
 def write_c3d(path: Path, capture: Capture) -> None:
-    """Write float32 millimetres; a missing point gets residual -1.
+    """Write float32 millimeters; a missing point gets residual -1.
 
     A take of more than 65,535 frames states its length in TRIAL:ACTUAL_END_FIELD, as the format has it;
     programs that do not look there (ezc3d 1.7 is one) see the first 65,535 frames.
@@ -119,7 +119,7 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
     num_points = int(parameters.number("POINT", "USED", default=header[1])) & 0xFFFF
     scale = parameters.number("POINT", "SCALE")
     if scale == 0.0:
-        raise CaptureError(f"POINT:SCALE is {scale:g}, wanted a number that is not 0")
+        raise CaptureError(f"POINT:SCALE is {scale:g}, expected a number that is not 0")
     dtype = FLOAT_DTYPES[parameters.processor] if scale < 0.0 else INTEGER_DTYPES[parameters.processor]
     words = 4 * num_points + int(header[2])  # points, then the analog samples of the frame
     start = (int(header[8]) - 1) * _BLOCK

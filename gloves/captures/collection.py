@@ -1,4 +1,4 @@
-"""Many captures as one stack of labelled frames."""
+"""Many captures as one stack of labeled frames."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gloves.captures import READABLE, read_capture
+from gloves.captures.formats import READABLE, read_capture
 from gloves.captures.markers import select_markers
 from handsim.errors import CaptureError
 
@@ -31,15 +31,15 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
             else [path]
         )
         if not inside:
-            raise CaptureError(f"{path} holds no capture; wanted files {', '.join(READABLE)}")
+            raise CaptureError(f"{path} holds no capture; expected files {', '.join(READABLE)}")
         files += inside
     if not files:
-        raise CaptureError("no capture was given; wanted files or folders")
+        raise CaptureError("no capture was given; expected files or folders")
     return files
 
 
 def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    """The named markers of all frames of labelled captures [m], NaN where missing.
+    """The named markers of all frames of labeled captures [m], NaN where missing.
 
     Raises:
         CaptureError: A file cannot be read or lacks a marker; the file is named.

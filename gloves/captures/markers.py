@@ -31,23 +31,23 @@ def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, 
                 f"the glove's marker is not among the columns: {choices(name, bare, noun='column')}"
             )
         if bare.count(name) > 1:
-            raise CaptureError(f"marker '{name}' has {bare.count(name)} columns in the capture, wanted one")
+            raise CaptureError(f"marker '{name}' has {bare.count(name)} columns in the capture, expected one")
     return capture.positions[:, [bare.index(name) for name in names]]
 
 
-def unlabelled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:
+def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:
     """The points of every frame [m], nothing said of whose they are; an empty frame is (0, 3)."""
     there = np.isfinite(capture.positions).all(axis=-1)
     return [points[seen] for points, seen in zip(capture.positions, there, strict=True)]
 
 
-def labelled_capture(
+def labeled_capture(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     labels: Sequence[Int[np.ndarray, "N"]],
     names: Sequence[str],
     rate: float,
 ) -> Capture:
-    """Labelled points as a capture: one column a marker, then columns for the points without one.
+    """Labeled points as a capture: one column a marker, then columns for the points without one.
 
     Args:
         frames: Points of every frame [m].

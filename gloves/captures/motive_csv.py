@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures._text import metres_per, parse_table, positive_rate, split_lines
+from gloves.captures._text import meters_per, parse_table, positive_rate, split_lines
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
 
@@ -21,7 +21,7 @@ _AXES: Final = ["X", "Y", "Z"]
 
 
 def read_motive_csv(data: bytes) -> Capture:
-    """The markers, labelled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
+    """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
     Raises:
         CaptureError: Not a Motive export, without marker columns, cut, or with a cell that is no number.
@@ -33,12 +33,12 @@ def read_motive_csv(data: bytes) -> Capture:
     stated = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
     rate = positive_rate(stated.get(rate_key, ""), name=rate_key)
-    scale = metres_per(stated.get("Length Units") or "Meters")
+    scale = meters_per(stated.get("Length Units") or "Meters")
     end = next((place for place, row in enumerate(rows) if row and row[0] == "Frame"), None)
     if end is None or (end == len(lines) - 1 and not ended):
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
     axes = rows[end]
-    types, names = (_labelled_row(rows[1:end], label, len(axes)) for label in ("Type", "Name"))
+    types, names = (_labeled_row(rows[1:end], label, len(axes)) for label in ("Type", "Name"))
     quantities = _quantities(rows[1:end], len(axes))
     columns = _marker_columns(types, quantities, axes)
 
@@ -64,12 +64,12 @@ def _cells(line: bytes) -> list[str]:
         raise CaptureError(f"a header line cannot be read: {error}") from error
 
 
-def _labelled_row(rows: list[list[str]], label: str, width: int) -> list[str]:
+def _labeled_row(rows: list[list[str]], label: str, width: int) -> list[str]:
     """The header row whose first cell with text is `label`, filled up to `width` cells."""
     for row in rows:
         if next((cell for cell in row if cell), "") == label:
             return row + [""] * (width - len(row))
-    raise CaptureError(f"not a Motive CSV export: no header row is labelled '{label}'")
+    raise CaptureError(f"not a Motive CSV export: no header row is labeled '{label}'")
 
 
 def _quantities(rows: list[list[str]], width: int) -> list[str]:
@@ -94,6 +94,6 @@ def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) ->
     for place in columns:
         if axes[place : place + 3] != _AXES:
             raise CaptureError(
-                f"column {place + 1}: wanted the axes X, Y, Z, got {', '.join(axes[place : place + 3])}"
+                f"column {place + 1}: expected the axes X, Y, Z, got {', '.join(axes[place : place + 3])}"
             )
     return columns

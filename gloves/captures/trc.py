@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures._text import metres_per, parse_table, positive_rate, split_lines
+from gloves.captures._text import meters_per, parse_table, positive_rate, split_lines
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
 
@@ -42,14 +42,14 @@ def read_trc(data: bytes) -> Capture:
     # A header line counts only with its line end: what stands before a cut cannot be believed.
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
-        raise CaptureError(f"the header is cut: wanted {_HEADER_LINES} whole lines, got {whole}")
+        raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
     keys, values, titles, axes = (_cells(line) for line in lines[1:_HEADER_LINES])
     stated = {key.lower(): value for key, value in zip(keys, values, strict=False)}
     for key in ("DataRate", "Units"):
         if not stated.get(key.lower()):
             raise CaptureError(f"the header (lines 2 and 3) states no {key}")
     rate = positive_rate(stated["datarate"], name="DataRate")
-    scale = metres_per(stated["units"])
+    scale = meters_per(stated["units"])
     names = _marker_names(titles, sum(bool(cell) for cell in axes))
 
     def column_name(column: int) -> str:
@@ -70,7 +70,7 @@ def read_trc(data: bytes) -> Capture:
 
 
 def write_trc(path: Path, capture: Capture, *, title: str) -> None:
-    """Write millimetres with five decimals; a marker that was not seen gets three blank cells.
+    """Write millimeters with five decimals; a marker that was not seen gets three blank cells.
 
     Args:
         path: Where to write.
@@ -113,7 +113,7 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
     names = tuple(cell for cell in cells if cell)
     if num_axes != 3 * len(names):
         raise CaptureError(
-            f"line 4 has {len(names)} marker names and line 5 {num_axes} axes, wanted three a name"
+            f"line 4 has {len(names)} marker names and line 5 {num_axes} axes, expected three a name"
         )
     return names
 

@@ -12,11 +12,11 @@ import trimesh
 from gloves.attach import _crossings, _ray, attach, vary_places
 from gloves.layout import load_layout
 from handsim.errors import LayoutError
-from handsim.mjcf import build_spec
-from handsim.model import HandModel, join_qpos
-from handsim.shape import EVERYBODY, sample_shape
-from handsim.surface import linear_blend_skinning
-from handsim.transforms import MIRROR
+from handsim.hand.mjcf import build_spec
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import EVERYBODY, sample_shape
+from handsim.hand.skin.surface import linear_blend_skinning
+from handsim.space.transforms import MIRROR
 
 
 @pytest.mark.parametrize("glove", ["dense19", "sparse13"])
@@ -59,7 +59,7 @@ def test_markers_are_carried_as_the_skin_is(rng):
     np.testing.assert_allclose(markers, linear_blend_skinning(glove.points, *weights), atol=1e-12)
     ahead = linear_blend_skinning(glove.points + glove.normals, *weights) - markers
     np.testing.assert_allclose(normals, ahead / np.linalg.norm(ahead, axis=-1, keepdims=True), atol=1e-12)
-    np.testing.assert_array_equal(glove.centres(model, bones), markers)
+    np.testing.assert_array_equal(glove.centers(model, bones), markers)
 
 
 def test_left_glove_is_the_mirror_image(rng):

@@ -20,7 +20,7 @@ from gloves.layout import (
     stored_layout,
 )
 from handsim.errors import LayoutError
-from handsim.topology import BONE_NAMES
+from handsim.hand.topology import BONE_NAMES
 
 DENSE19 = (
     "ThumbCMC ThumbMCP ThumbIP ThumbTip IndexMCP IndexPIP IndexTip MiddleMCP MiddlePIP MiddleTip "
@@ -118,7 +118,7 @@ BAD = {
     "one table": 'name = "g"\nradius_mm = 3.2\n[marker]\nname = "m"',
     "list of numbers": 'name = "g"\nradius_mm = 3.2\nmarker = [1, 2, 3, 4, 5]',
     "radius too large": text(head='name = "g"\nradius_mm = 32'),
-    "radius in metres": text(head='name = "g"\nradius_mm = 0.0032'),
+    "radius in meters": text(head='name = "g"\nradius_mm = 0.0032'),
     "radius is NaN": text(head='name = "g"\nradius_mm = nan'),
     "radius missing": text(head='name = "g"'),
     "radius is text": text(head='name = "g"\nradius_mm = "3.2"'),

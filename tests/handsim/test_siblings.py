@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def import_in(folder: Path, code: str, *flags: str) -> subprocess.CompletedProcess[str]:
-    """Run `code` as a script's neighbour would, with handsim on the path after the script's own folder."""
+    """Run `code` as a script's neighbor would, with handsim on the path after the script's own folder."""
     script = folder / "script.py"
     script.write_text(code)
     environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"}

@@ -7,10 +7,10 @@ import pytest
 
 from gloves.attach import Attachment, attach
 from gloves.layout import load_layout
-from handsim.cameras import look_at
-from handsim.model import HandModel, join_qpos
-from handsim.topology import Side
-from render.camera import Camera, pinhole
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import Side
+from handsim.space.cameras import look_at
+from render.cameras.camera import Camera, pinhole
 from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
 from render.keypoints import hand_keypoints
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from render.writer import FORMATS, open_writer
+from render.formats.writer import FORMATS, open_writer
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")

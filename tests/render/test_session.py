@@ -12,17 +12,17 @@ import sys
 import numpy as np
 import pytest
 
-from gloves.take import save_take
+from gloves.takes.take import save_take
 from handsim.errors import CaptureError, HandSimError
-from render.depth_noise import DepthNoiseConfig
-from render.figures import digit_of_part
+from render.cameras.viewpoints import ViewConfig, Viewpoints
+from render.formats.png_depth import read_depth
 from render.keypoints import KEYPOINT_DIGITS
-from render.png_depth import read_depth
+from render.painting.figures import digit_of_part
+from render.sensors.depth_noise import DepthNoiseConfig
 from render.session import SHEET, RenderConfig, draw_shard, render_take
 from render.shown_take import load_shown_take
-from render.skin_look import TONES
-from render.viewpoints import ViewConfig, Viewpoints
-from train.twins import TwinConfig, simulate_twin
+from render.skin.look import TONES
+from train.simulation.twins import TwinConfig, simulate_twin
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def path(tmp_path_factory):
     return file
 
 
-MAIN = "import sys; from handsim.cli import main; sys.exit(main())"
+MAIN = "import sys; from handsim.app.cli import main; sys.exit(main())"
 PLAIN = RenderConfig(
     view=ViewConfig(camera="vga", views=2), depth_sensor=None, color_sensor=None, every=12, frames_per_shard=2
 )
@@ -154,7 +154,7 @@ def test_no_driver_is_one_sentence_where_opengl_is_wanted(path, tmp_path):
             assert "apt-get install libegl1" in said and "\n" not in said
 
 
-def test_depth_on_disk_is_in_metres(path, tmp_path):
+def test_depth_on_disk_is_in_meters(path, tmp_path):
     render_take(path, tmp_path / "out", ["png"], dataclasses.replace(PLAIN, passes=("depth",)), workers=1)
     depth = read_depth(next((tmp_path / "out").rglob("*depth*.png")))
     assert 0.2 < np.median(depth[depth > 0]) < 1.5

@@ -7,23 +7,29 @@ import itertools
 import numpy as np
 import pytest
 
-from gloves.attach import attach
-from gloves.captures import Capture, read_capture, write_capture
-from gloves.take import Take
-from gloves.tracked_take import LOST, STATUSES, TRACKED, TrackedTake, load_tracked_take, save_tracked_take
-from handsim.errors import CaptureError, ShapeError
-from handsim.model import HandModel
-from handsim.objects import named_object
-from handsim.transforms import quaternion_matrix
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from gloves.takes.tracked_take import (
+    LOST,
+    STATUSES,
+    TRACKED,
+    TrackedTake,
+    load_tracked_take,
+    save_tracked_take,
+)
+from handsim.errors import ArgumentError, CaptureError
+from handsim.space.objects import named_object
+from handsim.space.transforms import quaternion_matrix
+from track.bodies.rigid_body import RigidTemplate
 from track.capture_tracking import TakeRecorder, capture_frames, follow, track
-from track.natnet_server import ReplayServer
-from track.rigid_body import RigidTemplate
-from track.streaming import StreamedFrame, open_stream
+from track.streams.natnet_server import ReplayServer
+from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import Status
 from track.tracker import Tracker
-from track.user import UserHand
-from train.labeler import load_labeler
-from train.twins import TwinConfig, simulate_twin
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig, simulate_twin
 
 FRAMES = 60
 
@@ -39,9 +45,8 @@ def truth() -> Take:
 
 
 @pytest.fixture(scope="module")
-def user(truth) -> list[UserHand]:
-    models = [HandModel(hand.shape) for hand in truth.hands]
-    return [UserHand(m, attach(hand.layout, m)) for m, hand in zip(models, truth.hands, strict=True)]
+def user(truth) -> list[GloveFit]:
+    return [hand.fit for hand in truth.hands]
 
 
 @pytest.fixture(scope="module")
@@ -118,9 +123,9 @@ def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler,
     assert nothing.num_frames == 2
 
 
-def test_millimetres_are_told(capture, user, labeler):
+def test_millimeters_are_told(capture, user, labeler):
     large = Capture(capture.names, 1e3 * capture.positions, capture.rate)
-    with pytest.raises(ShapeError, match="millimetres"):
+    with pytest.raises(ArgumentError, match="millimeters"):
         track(large, Tracker(user, labeler))
 
 
@@ -164,7 +169,7 @@ def test_time_goes_on_when_a_recording_begins_anew():
 def test_too_few_frames_have_no_rate(user, capture, labeler):
     tracker = Tracker(user, labeler)
     recorder = TakeRecorder(tracker)
-    with pytest.raises(CaptureError, match="0 frames came, wanted two or more"):
+    with pytest.raises(CaptureError, match="0 frames came, expected two or more"):
         recorder.take()
     for frame, one in itertools.islice(follow(capture_frames(capture), tracker), 2):
         recorder.add(frame, one)

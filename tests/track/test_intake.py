@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from handsim.errors import ShapeError
+from handsim.errors import ArgumentError
 from track.intake import Intake
 
 NOTHING = np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
@@ -98,5 +98,5 @@ def test_stamps_that_lie_together_are_told_apart():
 
 def test_points_and_ids_that_do_not_fit_are_the_callers_mistake():
     for points, ids in [(np.zeros((2, 3)), np.zeros(3)), (np.zeros((2, 2)), np.zeros(2)), (np.zeros(3), [1])]:
-        with pytest.raises(ShapeError, match="wanted"):
+        with pytest.raises(ArgumentError, match="wanted"):
             Intake().take(points, np.asarray(ids, dtype=int), 0.0)

@@ -7,14 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.attach import attach
-from gloves.take import Take
-from handsim.model import HandModel
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from handsim.hand.model import HandModel
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
-from track.user import UserHand
-from train.labeler import load_labeler
-from train.twins import TwinConfig, simulate_twin
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig, simulate_twin
 
 
 @pytest.fixture(scope="module")
@@ -27,11 +26,8 @@ def take() -> Take:
     return simulate_twin(TwinConfig(kind="hand-controller", num_frames=240))
 
 
-def users(take: Take) -> list[UserHand]:
-    models = [HandModel(hand.shape) for hand in take.hands]
-    return [
-        UserHand(model, attach(hand.layout, model)) for model, hand in zip(models, take.hands, strict=True)
-    ]
+def users(take: Take) -> list[GloveFit]:
+    return [hand.fit for hand in take.hands]
 
 
 def seen(take: Take, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,16 +12,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gloves.take import Take
-from handsim.errors import ShapeError
-from handsim.model import HandModel
-from track.evaluation import seen_frame, true_users
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError
+from handsim.hand.model import HandModel
+from track.evaluation.take_evaluation import seen_frame, true_users
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
-from track.user import UserHand
-from train.labeler import load_labeler
-from train.labeling import Labeler
-from train.twins import TwinConfig, simulate_twin
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig, simulate_twin
 
 NUM_MARKERS = 38
 SURE = Status.TRACKED, Status.FOUND
@@ -55,7 +55,7 @@ def take() -> Take:
 
 
 @pytest.fixture(scope="module")
-def users(take) -> list[UserHand]:
+def users(take) -> list[GloveFit]:
     return true_users(take)
 
 
@@ -63,7 +63,7 @@ def users(take) -> list[UserHand]:
 class Bench:
     """What a property is tried on; it has nothing to show when an example fails."""
 
-    users: list[UserHand]
+    users: list[GloveFit]
     labeler: Labeler
     take: Take
 
@@ -390,7 +390,7 @@ def test_a_stream_that_is_silent_for_two_seconds_and_comes_back_elsewhere(tracke
 
 @pytest.mark.parametrize("same", [False, True])
 @pytest.mark.parametrize("jump", [(0.5, 0.0, 0.0), (0.0, 0.0, -0.5)])
-def test_a_hand_that_jumps_half_a_metre_is_right_again_soon(tracker, take, jump, same):
+def test_a_hand_that_jumps_half_a_meter_is_right_again_soon(tracker, take, jump, same):
     def change(number: int, fed: Fed) -> Fed:
         points, mine = fed.points.copy(), (fed.labels >= 0) & (fed.labels < 19)
         points[mine] += jump
@@ -448,7 +448,7 @@ def test_ghosts_of_the_first_ten_frames_are_got_over(tracker, take, seed):
     assert all(all_right(fed[30:], tracked[30:]))
 
 
-def changes_of(users: list[UserHand], labeler: Labeler, take: Take, spoil: bool) -> list[np.ndarray]:
+def changes_of(users: list[GloveFit], labeler: Labeler, take: Take, spoil: bool) -> list[np.ndarray]:
     """Poses of both hands as they were said, of frames some of which are empty."""
     tracker, poses = Tracker(users, labeler), []
     for frame in range(40):
@@ -484,9 +484,9 @@ def test_two_trackers_that_are_given_the_same_say_the_same(users, labeler, take)
 
 
 def test_a_caller_whose_points_and_ids_do_not_fit_is_told(tracker):
-    with pytest.raises(ShapeError, match="wanted"):
+    with pytest.raises(ArgumentError, match="wanted"):
         tracker.step(np.zeros((3, 3)), np.zeros(2, dtype=int), 0.0)
-    with pytest.raises(ShapeError, match="wanted"):
+    with pytest.raises(ArgumentError, match="wanted"):
         tracker.step(np.zeros((3, 2)), np.zeros(3, dtype=int), 0.0)
 
 

@@ -8,12 +8,13 @@ import json
 import numpy as np
 import pytest
 
+from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import HandSimError
-from handsim.model import HandModel
-from handsim.shape import sample_shape
-from handsim.topology import SIDES
-from track.user import UserError, UserHand, load_user, save_user, usual_hand
+from handsim.hand.model import HandModel
+from handsim.hand.shape import sample_shape
+from handsim.hand.topology import SIDES
+from track.user import UserError, load_user, save_user
 
 
 @pytest.fixture
@@ -22,9 +23,9 @@ def hands(rng):
     layout = load_layout("dense19")
     pair = []
     for side in SIDES:
-        worn = usual_hand(layout, "M", side).attachment
+        worn = nominal_fit(layout, "M", side).attachment
         worn = dataclasses.replace(worn, points=worn.points + rng.normal(scale=0.003, size=worn.points.shape))
-        pair.append(UserHand(HandModel(sample_shape(side=side, rng=rng)), worn))
+        pair.append(GloveFit(HandModel(sample_shape(side=side, rng=rng)), worn))
     return tuple(pair)
 
 
@@ -42,12 +43,12 @@ def test_hands_come_back_exactly(hands, tmp_path):
 
 
 def test_what_cannot_be_saved_is_told(hands, tmp_path):
-    with pytest.raises(UserError, match="wanted a left hand, a right hand, or one of each"):
+    with pytest.raises(UserError, match="expected a left hand, a right hand, or one of each"):
         save_user(tmp_path / "user.json", (hands[0], hands[0]))
-    with pytest.raises(UserError, match="wanted a left hand"):
+    with pytest.raises(UserError, match="expected a left hand"):
         save_user(tmp_path / "user.json", ())
     with pytest.raises(UserError, match="different gloves"):
-        save_user(tmp_path / "user.json", (hands[0], usual_hand(load_layout("sparse13"), "M", "right")))
+        save_user(tmp_path / "user.json", (hands[0], nominal_fit(load_layout("sparse13"), "M", "right")))
     with pytest.raises(UserError, match="cannot be written"):
         save_user(tmp_path, hands)
     assert not list(tmp_path.iterdir())
@@ -92,11 +93,11 @@ def spoil_sides(content):
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
-        (spoil_schema, "schema 99, wanted 1"),
+        (spoil_schema, "schema 99, expected 1"),
         (spoil_layout, "unknown bone 'toe'"),
         (spoil_number, "damaged"),
         (spoil_nan, "points holds NaN"),
-        (spoil_count, "wanted \\(19, 3\\)"),
+        (spoil_count, "expected \\(19, 3\\)"),
         (spoil_bones, "whole numbers from 0 to 15"),
         (spoil_weights, "sum to one"),
         (spoil_key, "'hands' is missing"),

@@ -8,20 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from gloves.captures import Capture, read_capture, write_capture
-from gloves.take import save_take
-from gloves.tracked_take import save_tracked_take
-from handsim.cli import main
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.takes.take import save_take
+from gloves.takes.tracked_take import save_tracked_take
+from handsim.app.cli import main
+from render.cameras.viewpoints import ViewConfig
 from render.keypoints import hand_keypoints
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
-from render.viewpoints import ViewConfig
 from track.capture_tracking import track
-from track.evaluation import true_users
+from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
-from train.labeler import load_labeler
-from train.shards import Dataset
-from train.twins import TwinConfig, simulate_twin
+from train.data.shards import Dataset
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig, simulate_twin
 
 SMALL = [
     "--samples",
@@ -88,19 +89,19 @@ def test_labels_do_not_depend_on_the_columns(run, rng):
     assert right.mean() > 0.85
 
 
-def test_empty_frames_are_labelled_as_empty(run):
+def test_empty_frames_are_labeled_as_empty(run):
     capture = read_capture(take(run, "gaps.trc", frames=20))
     positions = capture.positions.copy()
     positions[3:7] = np.nan
     write_capture(run / "gaps.trc", Capture(capture.names, positions, 120.0))
     arguments = ["label", str(run / "gaps.trc"), "--labeler", str(run / "run"), "--out", str(run / "out.trc")]
     assert main(arguments) == 0
-    labelled = read_capture(run / "out.trc")
-    assert np.isnan(labelled.positions[3:7]).all()
-    assert np.isfinite(labelled.positions[:3]).any(axis=(1, 2)).all()
+    labeled = read_capture(run / "out.trc")
+    assert np.isnan(labeled.positions[3:7]).all()
+    assert np.isfinite(labeled.positions[:3]).any(axis=(1, 2)).all()
 
 
-def test_a_small_labeler_tracks_to_a_millimetre_and_pictures_agree(run):
+def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
     truth = simulate_twin(TwinConfig(num_frames=240))
     save_take(run / "one.truth.npz", truth)
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
@@ -152,8 +153,8 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
         (["label", "TAKE", "--labeler", "nowhere", "--out", "OUT"], "unknown labeler 'nowhere'"),
         (["label", "missing.trc", "--labeler", "RUN", "--out", "OUT"], "missing.trc: cannot be read"),
         (["label", "TAKE", "--glove", "sparse13", "--labeler", "RUN", "--out", "OUT"], "the labeler knows"),
-        (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "wanted 0 or more"),
-        (["train", "nowhere", "--out", "OUT"], "wanted a training set with a manifest.json, but nowhere"),
+        (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "expected 0 or more"),
+        (["train", "nowhere", "--out", "OUT"], "expected a training set with a manifest.json, but nowhere"),
         (
             ["train", "SET", "--out", "RUN", "--seed", "5"],
             "holds a training run begun with other settings (train)",

@@ -10,10 +10,10 @@ import pytest
 
 from gloves.captures.collection import read_markers
 from gloves.layout import load_layout
-from handsim.errors import ShapeError, WeightsError
-from train.augmentation import Corruption
-from train.evaluation import evaluate_labeler
-from train.labeler import load_labeler, shipped_labelers
+from handsim.errors import ArgumentError, WeightsError
+from train.data.augmentation import Corruption
+from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.labelers.storage import load_labeler, shipped_labelers
 
 
 def test_cards_say_where_the_weights_come_from():
@@ -27,7 +27,7 @@ def test_cards_say_where_the_weights_come_from():
 
 
 @pytest.mark.parametrize(("corruption", "least"), [(Corruption(0, 0), 0.985), (Corruption(), 0.92)])
-def test_real_people_are_labelled(sig18, corruption, least, rng):
+def test_real_people_are_labeled(sig18, corruption, least, rng):
     labeler = load_labeler("dense19")
     files = sorted(sig18.rglob("*.trc"))
     chosen = rng.choice(len(files), size=40, replace=False)
@@ -36,16 +36,16 @@ def test_real_people_are_labelled(sig18, corruption, least, rng):
     assert evaluate_labeler(labeler, frames, corruption, rng=rng).figures["slot_accuracy"] >= least
 
 
-def test_odd_clouds_are_labelled_or_told(rng):
+def test_odd_clouds_are_labeled_or_told(rng):
     labeler = load_labeler("dense19")
     for count in (0, 1, 2, 60):
-        labelling = labeler.label_frames([rng.normal(scale=0.05, size=(count, 3))])[0]
-        assert len(labelling.labels) == len(labelling.confidence) == count
-        named = labelling.labels[labelling.labels >= 0]
+        labeling = labeler.label_frames([rng.normal(scale=0.05, size=(count, 3))])[0]
+        assert len(labeling.labels) == len(labeling.confidence) == count
+        named = labeling.labels[labeling.labels >= 0]
         assert len(set(named.tolist())) == len(named)
-    with pytest.raises(ShapeError, match="frame 1 holds NaN"):
+    with pytest.raises(ArgumentError, match="frame 1 holds NaN"):
         labeler.label_frames([np.zeros((3, 3)), np.full((3, 3), np.nan)])
-    with pytest.raises(ShapeError, match="frame 0 holds 600 points, wanted at most 512"):
+    with pytest.raises(ArgumentError, match="frame 0 holds 600 points, expected at most 512"):
         labeler.label_frames([np.zeros((600, 3))])
 
 

@@ -8,8 +8,9 @@ import ezc3d
 import numpy as np
 import pytest
 
-from gloves.captures import Capture, read_capture, write_capture
 from gloves.captures.c3d import read_c3d
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
 from handsim.errors import CaptureError
 
 INTEL, DEC, SGI = 84, 85, 86
@@ -110,9 +111,9 @@ def test_every_number_format_reads_as_ezc3d_reads_it(
         np.testing.assert_allclose(capture.positions.transpose(2, 1, 0) * 1e3, other["data"]["points"][:3])
 
 
-@pytest.mark.parametrize(("unit", "metres"), [("mm", 1e-3), ("cm ", 1e-2), ("M", 1.0)])
-def test_units(unit: str, metres: float) -> None:
-    np.testing.assert_allclose(read_c3d(c3d(units=unit)).positions, POINTS * metres)
+@pytest.mark.parametrize(("unit", "meters"), [("mm", 1e-3), ("cm ", 1e-2), ("M", 1.0)])
+def test_units(unit: str, meters: float) -> None:
+    np.testing.assert_allclose(read_c3d(c3d(units=unit)).positions, POINTS * meters)
 
 
 def test_points_without_labels_get_one() -> None:

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.captures import READABLE, WRITABLE, Capture, read_capture, write_capture
+from gloves.captures.capture import Capture
+from gloves.captures.formats import READABLE, WRITABLE, read_capture, write_capture
 from handsim.errors import CaptureError
 
 WORDS = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=12)
@@ -20,7 +21,7 @@ NAMES = st.one_of(WORDS, st.builds("{} {}".format, WORDS, WORDS), st.just("*12")
 
 @st.composite
 def captures(draw: st.DrawFn) -> Capture:
-    """Any pattern of gaps, names as users write them, positions up to ten metres."""
+    """Any pattern of gaps, names as users write them, positions up to ten meters."""
     num_frames, num_markers = draw(st.integers(1, 6)), draw(st.integers(1, 5))
     names = draw(st.lists(NAMES, min_size=num_markers, max_size=num_markers))
     positions = draw(hnp.arrays(np.float64, (num_frames, num_markers, 3), elements=st.floats(-10.0, 10.0)))
@@ -34,7 +35,7 @@ def captures(draw: st.DrawFn) -> Capture:
 def test_round_trip(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, tolerance: float, capture: Capture
 ) -> None:
-    """TRC keeps five decimals of millimetres, C3D float32 millimetres: 6e-7 m at ten metres."""
+    """TRC keeps five decimals of millimeters, C3D float32 millimeters: 6e-7 m at ten meters."""
     path = tmp_path_factory.mktemp("capture") / f"take{suffix}"
     write_capture(path, capture)
     again = read_capture(path)
@@ -79,7 +80,8 @@ def test_a_full_disk_leaves_nothing(tmp_path: Path, suffix: str) -> None:
     script = (
         "import resource, sys\n"
         "import numpy as np\n"
-        "from gloves.captures import Capture, write_capture\n"
+        "from gloves.captures.capture import Capture\n"
+        "from gloves.captures.formats import write_capture\n"
         "from handsim.errors import CaptureError\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))\n"
         "try:\n"

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures import read_capture
+from gloves.captures.formats import read_capture
 from gloves.captures.motive_csv import read_motive_csv
 from handsim.errors import CaptureError
 
 # Type, name, quantities and axes of each asset; a number a column counts up from the left.
 BODY = ("Rigid Body", "Cube", ["Rotation"] * 4 + ["Position"] * 3 + ["Mean Marker Error"], [*"XYZWXYZ", ""])
 BODY_MARKER = ("Rigid Body Marker", "Cube:Marker1", ["Position"] * 3 + ["Marker Quality"], [*"XYZ", ""])
-LABELLED = ("Marker", "Glove:ThumbTip", ["Position"] * 3, [*"XYZ"])
-UNLABELLED = ("Marker", "Unlabeled 2379", ["Position"] * 3, [*"XYZ"])
+LABELED = ("Marker", "Glove:ThumbTip", ["Position"] * 3, [*"XYZ"])
+UNLABELED = ("Marker", "Unlabeled 2379", ["Position"] * 3, [*"XYZ"])
 QUOTED = ("Marker", "Glove, left:1", ["Position"] * 3, [*"XYZ"])
 
 
@@ -51,7 +51,7 @@ def motive(
 @pytest.mark.parametrize("parent", [False, True])
 @pytest.mark.parametrize("timecode", [False, True])
 def test_markers_are_found_by_type_and_label(parent: bool, timecode: bool) -> None:
-    text = motive(BODY, BODY_MARKER, LABELLED, BODY, UNLABELLED, QUOTED, parent=parent, timecode=timecode)
+    text = motive(BODY, BODY_MARKER, LABELED, BODY, UNLABELED, QUOTED, parent=parent, timecode=timecode)
     capture = read_motive_csv(text.encode())
     assert capture.names == ("Glove:ThumbTip", "Unlabeled 2379", "Glove, left:1")
     assert capture.rate == 120.0
@@ -61,16 +61,16 @@ def test_markers_are_found_by_type_and_label(parent: bool, timecode: bool) -> No
 
 
 @pytest.mark.parametrize(
-    ("unit", "metres"),
+    ("unit", "meters"),
     [("Meters", 1.0), ("Centimeters", 1e-2), ("Millimeters", 1e-3), (None, 1.0), ("", 1.0)],
 )
-def test_units(unit: str | None, metres: float) -> None:
-    capture = read_motive_csv(motive(UNLABELLED, unit=unit, rows=1).encode())
-    np.testing.assert_allclose(capture.positions, [[[0.0, 0.01 * metres, 0.02 * metres]]])
+def test_units(unit: str | None, meters: float) -> None:
+    capture = read_motive_csv(motive(UNLABELED, unit=unit, rows=1).encode())
+    np.testing.assert_allclose(capture.positions, [[[0.0, 0.01 * meters, 0.02 * meters]]])
 
 
 def test_blank_cells_are_gaps() -> None:
-    lines = motive(LABELLED, UNLABELLED).splitlines()
+    lines = motive(LABELED, UNLABELED).splitlines()
     lines[-3] = "1,0,0.1,0.2,0.3,,,"
     lines[-2] = "2,0,,,,0.4,0.5,0.6"
     lines[-1] = "3,0,,,,,,"
@@ -79,14 +79,14 @@ def test_blank_cells_are_gaps() -> None:
     np.testing.assert_allclose(positions, [[[0.1, 0.2, 0.3], nan], [nan, [0.4, 0.5, 0.6]], [nan, nan]])
 
 
-GOOD = motive(LABELLED, UNLABELLED)
+GOOD = motive(LABELED, UNLABELED)
 BAD = {
     "not Motive": "a,b,c\n1,2,3\n",
     "only rigid bodies": motive(BODY, BODY_MARKER),
     "no columns": motive(),
-    "unknown unit": motive(LABELLED, unit="Feet"),
-    "no rate": motive(LABELLED, first="Format Version,1.23").replace("Export Frame Rate,120.000000", "x,y"),
-    "no frames": motive(LABELLED, rows=0),
+    "unknown unit": motive(LABELED, unit="Feet"),
+    "no rate": motive(LABELED, first="Format Version,1.23").replace("Export Frame Rate,120.000000", "x,y"),
+    "no frames": motive(LABELED, rows=0),
     "header cut": GOOD[: GOOD.index("Frame,")],
     "header cut in its last row": GOOD[: GOOD.index("Frame,") + 12],
     "no Type row": GOOD.replace(",Type,", ",Kind,"),

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures import Capture, read_capture, write_capture
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
 from gloves.captures.trc import read_trc
 from handsim.errors import CaptureError
 
@@ -33,12 +34,12 @@ POINTS = np.array([[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]])
 
 
 @pytest.mark.parametrize(
-    ("unit", "metres"),
+    ("unit", "meters"),
     [("mm", 1e-3), ("MM", 1e-3), ("cm", 1e-2), ("m", 1.0), ("Meters", 1.0), (" Millimeters ", 1e-3)],
 )
-def test_units(unit: str, metres: float) -> None:
+def test_units(unit: str, meters: float) -> None:
     capture = read_trc(trc(ROW, units=unit))
-    np.testing.assert_allclose(capture.positions, POINTS * metres)
+    np.testing.assert_allclose(capture.positions, POINTS * meters)
     assert (capture.names, capture.rate) == (("a", "b"), 120.0)
 
 
@@ -162,6 +163,6 @@ def test_all_published_captures_read() -> None:
         assert capture.names[-1] == "BackHand3"
         assert capture.rate == 120.0
         assert np.isfinite(capture.positions).all()
-        assert np.abs(capture.positions).max() < 3.0, "metres"
+        assert np.abs(capture.positions).max() < 3.0, "meters"
         num_frames += capture.num_frames
     assert num_frames == 61_941

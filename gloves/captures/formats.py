@@ -1,0 +1,71 @@
+"""Marker files by their suffix: TRC and C3D both ways, Motive CSV in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from gloves.captures.c3d import read_c3d, write_c3d
+from gloves.captures.capture import Capture
+from gloves.captures.motive_csv import read_motive_csv
+from gloves.captures.trc import read_trc, write_trc
+from handsim.errors import CaptureError, choices
+from handsim.files.atomic import atomic_write
+
+READABLE: Final = (".trc", ".c3d", ".csv")
+WRITABLE: Final = (".trc", ".c3d")
+
+
+def read_capture(path: str | Path) -> Capture:
+    """Read a `.trc`, `.c3d` or Motive `.csv` file.
+
+    Raises:
+        CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its units are unknown.
+    """
+    path = Path(path)
+    check_suffix(path, READABLE)
+    readers = dict(zip(READABLE, (read_trc, read_c3d, read_motive_csv), strict=True))
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read: {error.strerror}") from error
+    if not data:
+        raise CaptureError(f"{path}: the file is empty")
+    try:
+        return readers[path.suffix.lower()](data)
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+
+
+def write_capture(path: str | Path, capture: Capture) -> None:
+    """Write a `.trc` or `.c3d` file in millimeters, whole or not at all.
+
+    A TRC keeps positions to 5e-9 m; a C3D keeps single precision (6e-8 of the value).
+
+    Raises:
+        CaptureError: The suffix is unknown, a name cannot stand in the file, or the disk says no.
+    """
+    path = Path(path)
+    check_suffix(path, WRITABLE)
+    for name in capture.names:
+        if not name or name != name.strip() or not name.isprintable():
+            raise CaptureError(
+                f"{path}: marker name {name!r} cannot be written; expected printable characters without "
+                "tabs, line ends or outer blanks"
+            )
+    try:
+        with atomic_write(path) as temporary:
+            if path.suffix.lower() == ".trc":
+                write_trc(temporary, capture, title=path.name)
+            else:
+                write_c3d(temporary, capture)
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be written: {error.strerror or error}") from error
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+
+
+def check_suffix(path: Path, valid: tuple[str, ...]) -> None:
+    """Raise a `CaptureError` with the valid suffixes unless the path has one of them."""
+    if path.suffix.lower() not in valid:
+        raise CaptureError(f"{path}: {choices(path.suffix, valid, noun='file type')}")

@@ -1,0 +1,98 @@
+"""A hand in its glove: the one type for a user's hand, a simulated one, a tracked one and a drawn one."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gloves.attach import Attachment, attach
+from gloves.layout import MarkerLayout
+from handsim.hand.model import HandModel
+from handsim.hand.shape import HandShape
+from handsim.hand.topology import Side
+from handsim.space.transforms import MIRROR
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GloveFit:
+    """One hand and the glove on it."""
+
+    model: HandModel
+    attachment: Attachment
+
+    @property
+    def side(self) -> Side:
+        """Which hand this is."""
+        return self.model.shape.side
+
+    @property
+    def shape(self) -> HandShape:
+        """The hand's measures."""
+        return self.model.shape
+
+    @property
+    def layout(self) -> MarkerLayout:
+        """The glove's markers."""
+        return self.attachment.layout
+
+    def with_side(self, side: Side) -> GloveFit:
+        """The same hand in its glove on the other (or the same) arm."""
+        if side == self.side:
+            return self
+        worn = self.attachment
+        mirrored = dataclasses.replace(worn, points=worn.points @ MIRROR, normals=worn.normals @ MIRROR)
+        return GloveFit(HandModel(self.shape.with_side(side)), mirrored)
+
+    def markers(
+        self, qpos: Float[np.ndarray, "T 27"]
+    ) -> tuple[Float[np.ndarray, "T M 3"], Float[np.ndarray, "T M 3"]]:
+        """Marker centers [m] and outward unit directions in the world, for poses of this hand.
+
+        Raises:
+            ArgumentError: `qpos` is not (T, 27) or not finite.
+        """
+        return self.attachment.markers(self.model, self.model.forward_kinematics(qpos))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GlovedHand:
+    """A hand in its glove, in motion."""
+
+    fit: GloveFit
+    qpos: Float[np.ndarray, "T 27"]
+    """Wrist position [m], wrist orientation (wxyz), hinge angles [rad]; NaN in frames without a pose."""
+
+    @property
+    def side(self) -> Side:
+        """Which hand this is."""
+        return self.fit.side
+
+    @property
+    def shape(self) -> HandShape:
+        """The hand's measures."""
+        return self.fit.shape
+
+    @property
+    def layout(self) -> MarkerLayout:
+        """The glove's markers."""
+        return self.fit.layout
+
+
+def fit_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
+    """Put a glove on a hand as designed.
+
+    Raises:
+        LayoutError: A marker finds no skin; the sentence names the marker.
+    """
+    return GloveFit(model, attach(layout, model))
+
+
+def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
+    """A hand of one of the five sizes (XS to XL), its glove put on as designed."""
+    return fit_glove(layout, HandModel.named(size, side=side))

@@ -1,0 +1,108 @@
+"""Points that are no markers: mirror images in shiny surfaces near the hand, and stray reflections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from gloves.optics.mirrors import cameras_by_mirror, reflect
+from handsim.space.cameras import CameraRig
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+MAX_GHOSTS: Final = 4
+"""Ghosts kept a frame; what is more is dropped at random."""
+GHOST_REACH: Final = 0.1
+"""A ghost farther from every marker of a hand [m] is not in its cloud; the paper clusters at 200 mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class GhostConfig:
+    """How often ghosts appear and where."""
+
+    mirror_rate: float = 0.25
+    """Share of frames with a shiny surface near the hand."""
+    mirror_distance: tuple[float, float] = (0.02, 0.10)
+    """How far the surface lies from the middle of the markers' box, beyond its half side [m]."""
+    mirror_radius: float = 0.06
+    """Size of the shiny patch [m]."""
+    reflectance: float = 0.5
+    """Chance that a marker's mirror image is bright enough at all."""
+    stray_rate: float = 0.8
+    """Mean number of stray reflections a frame, Poisson distributed."""
+    stray_margin: float = 0.3
+    """Strays lie in the markers' box grown by this share."""
+
+
+def sample_ghosts(
+    markers: Float[np.ndarray, "T M 3"],
+    rig: CameraRig,
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+    config: GhostConfig,
+    *,
+    min_cameras: int,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "T 4 3"]:
+    """Ghosts [m] of every frame, NaN where there is none.
+
+    Args:
+        markers: Marker centers in the world [m].
+        rig: The cameras.
+        segments: Capsule axes of everything in the way [m].
+        radii: Their radii [m].
+        config: How often and where.
+        min_cameras: Cameras that must see a mirror image before it is a point.
+        rng: Source of all randomness.
+    """
+    frames = len(markers)
+    low, high = markers.min(axis=1), markers.max(axis=1)
+    count = np.minimum(rng.poisson(config.stray_rate, frames), MAX_GHOSTS)
+    uniform = rng.uniform(-config.stray_margin / 2, 1 + config.stray_margin / 2, size=(frames, MAX_GHOSTS, 3))
+    strays = low[:, None] + uniform * (high - low)[:, None]
+    strays[np.arange(MAX_GHOSTS) >= count[:, None]] = np.nan
+    images = np.full(markers.shape, np.nan)
+    shiny = np.flatnonzero(rng.random(frames) < config.mirror_rate)
+    images[shiny] = _mirror_images(
+        markers[shiny], rig, segments[shiny], radii, config, min_cameras=min_cameras, rng=rng
+    )
+    return keep_some(np.concatenate([strays, images], axis=1), rng=rng)
+
+
+def _mirror_images(
+    markers: NDArray[np.float64],
+    rig: CameraRig,
+    segments: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    config: GhostConfig,
+    *,
+    min_cameras: int,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Mirror images (T, M, 3) that enough cameras see by way of the shiny patch, NaN elsewhere."""
+    frames, count = markers.shape[:2]
+    normal = rng.standard_normal((frames, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    middle = (markers.min(axis=1) + markers.max(axis=1)) / 2
+    half = np.linalg.norm(markers.max(axis=1) - markers.min(axis=1), axis=1) / (2 * np.sqrt(3.0))
+    distance = half + rng.uniform(*config.mirror_distance, size=frames)
+    plane = middle - distance[:, None] * normal
+    images = reflect(markers, plane[:, None], normal[:, None])
+    images[rng.random((frames, count)) >= config.reflectance] = np.nan
+    seen = cameras_by_mirror(images, plane, normal, config.mirror_radius, rig, segments, radii)
+    images[seen.sum(axis=2) < min_cameras] = np.nan
+    return images
+
+
+def keep_some(
+    candidates: Float[np.ndarray, "T N 3"], *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 4 3"]:
+    """At most `MAX_GHOSTS` of each frame's candidates, chosen at random, those that exist first."""
+    order = rng.random(candidates.shape[:2]) + np.isnan(candidates[..., 0])
+    chosen = order.argsort(axis=1)[:, :MAX_GHOSTS]
+    kept: NDArray[np.float64] = np.take_along_axis(candidates, chosen[..., None], axis=1)
+    return kept

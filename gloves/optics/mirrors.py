@@ -1,0 +1,100 @@
+"""Mirror images of markers in shiny patches, and the cameras that see them by way of the patch.
+
+The way marker -> patch -> camera unfolds into the straight line from the mirror image to the camera, so that
+an optical system puts a point where the image is.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+
+from handsim.kernels.segments import segment_distance_squared
+from handsim.space.cameras import CameraRig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy.typing import NDArray
+
+
+def reflect(
+    points: Float[np.ndarray, "*batch 3"],
+    plane_point: Float[np.ndarray, "*batch 3"],
+    plane_normal: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3"]:
+    """Mirror images of points in planes given by a point and a unit normal [m]."""
+    height = np.einsum("...i,...i->...", points - plane_point, plane_normal)
+    mirrored: NDArray[np.float64] = points - 2.0 * height[..., None] * plane_normal
+    return mirrored
+
+
+def cameras_by_mirror(
+    images: Float[np.ndarray, "T P 3"],
+    plane_point: Float[np.ndarray, "T 3"],
+    plane_normal: Float[np.ndarray, "T 3"],
+    radius: float,
+    rig: CameraRig,
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+) -> Bool[np.ndarray, "T P C"]:
+    """Which cameras see which mirror image: over the patch, in view, and with both legs of the way free.
+
+    Args:
+        images: Mirror images of the markers [m]; NaN where there is none.
+        plane_point: Middle of the patch in each frame [m].
+        plane_normal: Unit normal of its shiny side.
+        radius: Radius of the patch [m].
+        rig: The cameras.
+        segments: Capsule axes of what stands in the way [m].
+        radii: Their radii [m].
+    """
+    seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
+    view = np.cos(rig.field_of_view / 2)
+    _over_patch(images, plane_point, plane_normal, radius, rig.T_world_camera, view, segments, radii, seen)
+    return seen
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _over_patch(
+    images: Any, plane_point: Any, plane_normal: Any, radius: float, T_world_camera: Any, view: float,
+    segments: Any, radii: Any, seen: Any,
+) -> None:  # fmt: skip
+    hit, marker, camera = np.empty(3), np.empty(3), np.empty(3)
+    for t in range(len(images)):
+        point, normal = plane_point[t], plane_normal[t]
+        for p in range(images.shape[1]):
+            behind = 0.0  # how deep the image lies behind the plane
+            for i in range(3):
+                behind += (point[i] - images[t, p, i]) * normal[i]
+            if not behind > 0.0:  # also where there is no image: NaN
+                continue
+            for i in range(3):
+                marker[i] = images[t, p, i] + 2.0 * behind * normal[i]
+            for c in range(len(T_world_camera)):
+                ahead, off, deep, far = 0.0, 0.0, 0.0, 0.0
+                for i in range(3):
+                    camera[i] = T_world_camera[c, i, 3]
+                    way = images[t, p, i] - camera[i]
+                    ahead -= way * normal[i]
+                    deep += way * T_world_camera[c, i, 2]
+                    far += way * way
+                if ahead <= behind or deep < view * np.sqrt(far):
+                    continue
+                for i in range(3):
+                    hit[i] = images[t, p, i] + behind / ahead * (camera[i] - images[t, p, i])
+                    off += (hit[i] - point[i]) ** 2
+                seen[t, p, c] = (
+                    off < radius * radius
+                    and _clear(marker, hit, segments[t], radii)
+                    and _clear(hit, camera, segments[t], radii)
+                )
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _clear(start: Any, end: Any, segments: Any, radii: Any) -> bool:
+    for k in range(len(radii)):
+        if segment_distance_squared(start, end, segments[k, 0], segments[k, 1]) < radii[k] * radii[k]:
+            return False
+    return True

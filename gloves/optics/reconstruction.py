@@ -1,0 +1,136 @@
+"""What an optical system makes of what its cameras see: blobs, rays, points, gaps and false points.
+
+One model yields them all. A marker is a noisy blob in every camera that sees it; blobs that touch become one;
+rays through blobs meet in points, if enough of them meet closely enough; rays that found no point may meet by
+chance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from gloves.optics.triangulation import reconstruct_frames
+from handsim.errors import ArgumentError
+from handsim.space.cameras import CameraRig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+MAX_FALSE_POINTS: Final = 6
+"""False intersections kept a frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsConfig:
+    """A camera's and a solver's properties; the defaults are those of a well-kept optical system."""
+
+    noise: float = 0.12
+    """Standard deviation of a blob's center, each axis [px]."""
+    partial: float = 0.5
+    """Each look goes to a random spot of the marker within this share of its radius: what is behind an edge
+    flickers."""
+    marker_radius: float = 0.0032
+    """Radius of the spheres [m]; Han et al. 2018, section 3."""
+    roundness: float = 0.5
+    """Two blobs that touch are one: taken for a marker while their centers lie nearer than this share of the
+    sum of their radii, and thrown away as not round beyond it."""
+    blob_loss: float = 0.002
+    """Chance that a camera misses a blob it should see."""
+    dropout: float = 0.0002
+    """Chance a frame that cameras begin to lose their pictures: a lost packet, a head or an arm in front."""
+    dropout_length: float = 3.0
+    """Mean number of pictures that they then lose."""
+    dropout_cameras: int = 1
+    """Cameras that lose them together, as those on one network switch do."""
+    min_rays: int = 2
+    """Rays that must meet before a point exists or goes on."""
+    min_rays_to_start: int = 3
+    """Rays that must meet before a point that was not there in the frame before exists."""
+    max_residual: float = 0.003
+    """Largest distance of a ray from its point [m]; the worst ray goes first."""
+    min_angle: float = 10.0
+    """Two rays alone must cross at this angle at least [deg]."""
+    min_distance: float = 0.004
+    """Points nearer to each other than this are one: the one with more rays [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "partial", "marker_radius", "max_residual", "min_distance", "roundness"):
+            value = getattr(self, name)
+            if not 0.0 <= value < np.inf:
+                raise ArgumentError(f"{name} is {value:g}, expected a finite number that is not negative")
+        for name in ("blob_loss", "dropout"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ArgumentError(f"{name} is {getattr(self, name):g}, expected a chance from 0 to 1")
+        if not 2 <= self.min_rays <= self.min_rays_to_start:
+            raise ArgumentError(
+                f"min_rays is {self.min_rays} and min_rays_to_start {self.min_rays_to_start}, "
+                "expected 2 <= min_rays <= min_rays_to_start"
+            )
+
+
+class Reconstruction(NamedTuple):
+    """The points of every frame, each under the source it comes from."""
+
+    positions: Float[np.ndarray, "T S 3"]
+    """Where the system puts each source [m], NaN where it puts none."""
+    rays: Int[np.ndarray, "T S"]
+    """Rays that made each point, 0 where there is none."""
+    false_points: Float[np.ndarray, "T F 3"]
+    """Points where rays of different sources met by chance [m], NaN where none; a column holds one such point
+    for as long as it stays."""
+
+
+def reconstruct(
+    sources: Float[np.ndarray, "T S 3"],
+    seen: Bool[np.ndarray, "T S C"],
+    rig: CameraRig,
+    config: OpticsConfig,
+    *,
+    continuous: bool,
+    rng: np.random.Generator,
+) -> Reconstruction:
+    """Simulate detection and triangulation.
+
+    Args:
+        sources: True places of all that shines, markers, mirror images, strays [m]; NaN where there is none.
+        seen: Which cameras have a free view of each.
+        rig: The cameras.
+        config: Noise, gates and losses.
+        continuous: Frames follow each other in time; otherwise each stands alone, and `min_rays` is enough.
+        rng: Source of all randomness.
+    """
+    frames, count = sources.shape[:2]
+    positions = np.full((frames, count, 3), np.nan)
+    rays = np.zeros((frames, count), dtype=np.int64)
+    false_points = np.full((frames, MAX_FALSE_POINTS, 3), np.nan)
+    lost = _dropouts(frames, len(rig.positions), config, rng)
+    reconstruct_frames(
+        np.ascontiguousarray(sources, dtype=np.float64),
+        np.ascontiguousarray(seen & ~lost[:, None]),
+        np.ascontiguousarray(rig.T_world_camera),
+        (rig.focal_length, config.noise, config.blob_loss, config.marker_radius, config.roundness),
+        (config.max_residual, np.sin(np.deg2rad(config.min_angle)), config.min_distance),
+        (config.min_rays, config.min_rays_to_start if continuous else config.min_rays),
+        rng,
+        positions,
+        rays,
+        false_points,
+    )
+    return Reconstruction(positions, rays, false_points)
+
+
+def _dropouts(
+    frames: int, cameras: int, config: OpticsConfig, rng: np.random.Generator
+) -> Bool[np.ndarray, "T C"]:
+    """Pictures that are lost: each dropout takes some cameras for a geometric number of frames."""
+    begins = np.flatnonzero(rng.random(frames) < config.dropout)
+    lasts = rng.geometric(1.0 / config.dropout_length, size=len(begins))
+    lost = np.zeros((frames, cameras), dtype=bool)
+    for begin, last in zip(begins, lasts, strict=True):
+        lost[
+            begin : begin + last, rng.choice(cameras, min(cameras, config.dropout_cameras), replace=False)
+        ] = True
+    return lost

@@ -1,0 +1,275 @@
+"""The compiled kernels of `gloves.optics.reconstruction`: blobs, rays, triangulation, false intersections."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+_FALSE_REACH = 0.25  # [m] a false point farther than this from every source is outside the capture volume
+_FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last frame is the same one
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def reconstruct_frames(
+    sources: Any, seen: Any, T_world_camera: Any, camera: Any, gates: Any, min_rays: Any, rng: Any,
+    positions: Any, rays: Any, false_points: Any,
+) -> None:  # fmt: skip
+    """Fill positions (T, S, 3), rays (T, S) and false_points (T, F, 3); see `reconstruct`."""
+    count, cameras = seen.shape[1:]
+    centers, radii = np.empty((cameras, count, 2)), np.empty((cameras, count))
+    directions = np.empty((count, cameras, 3))
+    usable = np.empty((count, cameras), dtype=np.bool_)
+    for t in range(len(sources)):
+        _draw_blobs(sources[t], seen[t], T_world_camera, camera, rng, centers, radii)
+        _cast_rays(seen[t], T_world_camera, camera, centers, radii, directions, usable)
+        for s in np.argsort(-usable.sum(axis=1), kind="mergesort"):
+            enough = min_rays[0] if t > 0 and rays[t - 1, s] > 0 else min_rays[1]
+            rays[t, s] = _meet(directions[s], usable[s], T_world_camera, gates, enough, positions[t, s])
+            if rays[t, s] > 0:
+                _spend(positions[t, s], s, directions, usable, T_world_camera, gates[0])
+        _join_near(positions[t], rays[t], gates[2])
+        false = false_points[t - 1 if t > 0 else 0], false_points[t]
+        _meet_by_chance(sources[t], directions, usable, T_world_camera, gates, min_rays, positions[t], false)
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _draw_blobs(
+    sources: Any, seen: Any, T_world_camera: Any, camera: Any, rng: Any, centers: Any, radii: Any
+) -> None:
+    """Noisy blob centers [px] and radii; radius 0 where there is no blob."""
+    focal, noise, loss, radius = camera[0], camera[1], camera[2], camera[3]
+    for c in range(len(T_world_camera)):
+        pose = T_world_camera[c]
+        for s in range(len(sources)):
+            radii[c, s] = 0.0
+            if not seen[s, c] or np.isnan(sources[s, 0]) or (loss > 0.0 and rng.random() < loss):
+                continue
+            x, y, z = sources[s, 0] - pose[0, 3], sources[s, 1] - pose[1, 3], sources[s, 2] - pose[2, 3]
+            depth = pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z
+            if depth <= 1e-6:
+                continue
+            right = pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z
+            down = pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z
+            radii[c, s] = focal * radius / depth
+            centers[c, s, 0] = focal * right / depth + noise * rng.standard_normal()
+            centers[c, s, 1] = focal * down / depth + noise * rng.standard_normal()
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _cast_rays(
+    seen: Any, T_world_camera: Any, camera: Any, centers: Any, radii: Any, directions: Any, usable: Any
+) -> None:
+    """Unit rays of every source's blob in every camera, after blobs that touch have become one."""
+    focal, roundness = camera[0], camera[4]
+    count = seen.shape[0]
+    for c in range(len(T_world_camera)):
+        pose = T_world_camera[c]
+        for s in range(count):
+            usable[s, c] = radii[c, s] > 0.0
+            if not usable[s, c]:
+                continue
+            u, v, members = centers[c, s, 0], centers[c, s, 1], 1
+            for o in range(count):
+                if o == s or radii[c, o] == 0.0:
+                    continue
+                du, dv = centers[c, o, 0] - centers[c, s, 0], centers[c, o, 1] - centers[c, s, 1]
+                reach = radii[c, o] + radii[c, s]
+                squared = du * du + dv * dv
+                if squared >= reach * reach:
+                    continue
+                if squared > (roundness * reach) ** 2:
+                    usable[s, c] = False
+                    break
+                u, v, members = u + centers[c, o, 0], v + centers[c, o, 1], members + 1
+            u, v = u / (members * focal), v / (members * focal)
+            length = np.sqrt(u * u + v * v + 1.0)
+            for i in range(3):
+                directions[s, c, i] = (pose[i, 0] * u + pose[i, 1] * v + pose[i, 2]) / length
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _meet(directions: Any, usable: Any, T_world_camera: Any, gates: Any, enough: int, point: Any) -> int:
+    """The point nearest to a source's rays, the worst dropped until all are within the gate; rays used."""
+    used = usable.copy()
+    count = 0
+    for c in range(len(used)):
+        count += used[c]
+    while count >= enough:
+        if not _nearest_point(directions, used, T_world_camera, point):
+            break
+        worst, far = -1, gates[0]
+        for c in range(len(used)):
+            if used[c]:
+                off = _off(point, directions[c], T_world_camera[c])
+                if off > far:
+                    worst, far = c, off
+        if worst < 0:
+            if count == 2 and not _wide(directions, used, gates[1]):
+                break
+            return count
+        used[worst] = False
+        count -= 1
+    point[:] = np.nan
+    return 0
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _nearest_point(directions: Any, used: Any, T_world_camera: Any, point: Any) -> bool:
+    """Least-squares meeting point of rays: sum of (I - d d^T) (x - o) = 0, by Cramer's rule."""
+    a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # the symmetric matrix [[a, b, c], [b, d, e], [c, e, f]]
+    p, q, r = 0.0, 0.0, 0.0
+    for k in range(len(used)):
+        if used[k]:
+            x, y, z = directions[k, 0], directions[k, 1], directions[k, 2]
+            ox, oy, oz = T_world_camera[k, 0, 3], T_world_camera[k, 1, 3], T_world_camera[k, 2, 3]
+            along = x * ox + y * oy + z * oz
+            a, d, f = a + 1.0 - x * x, d + 1.0 - y * y, f + 1.0 - z * z
+            b, c, e = b - x * y, c - x * z, e - y * z
+            p, q, r = p + ox - along * x, q + oy - along * y, r + oz - along * z
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * c00 + b * c01 + c * c02
+    if determinant < 1e-9:
+        return False
+    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
+    point[0] = (c00 * p + c01 * q + c02 * r) / determinant
+    point[1] = (c01 * p + c11 * q + c12 * r) / determinant
+    point[2] = (c02 * p + c12 * q + c22 * r) / determinant
+    return True
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _off(point: Any, direction: Any, pose: Any) -> float:
+    """Distance of a point from a camera's ray; infinite behind the camera."""
+    x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
+    along = x * direction[0] + y * direction[1] + z * direction[2]
+    if along <= 0.0:
+        return np.inf
+    return float(np.sqrt(max(0.0, x * x + y * y + z * z - along * along)))
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _wide(directions: Any, used: Any, min_sine: float) -> bool:
+    """Whether the first two used rays cross at a wide enough angle."""
+    first = -1
+    for c in range(len(used)):
+        if used[c]:
+            if first < 0:
+                first = c
+            else:
+                cosine = np.dot(directions[first], directions[c])
+                return bool(1.0 - cosine * cosine >= min_sine * min_sine)
+    return False
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
+    """Of two points closer than the system can tell apart, the one with fewer rays goes."""
+    for s in range(len(rays)):
+        for o in range(s):
+            if rays[s] > 0 and rays[o] > 0:
+                squared = 0.0
+                for i in range(3):
+                    squared += (positions[s, i] - positions[o, i]) ** 2
+                if squared < min_distance * min_distance:
+                    gone = o if rays[o] < rays[s] else s
+                    rays[gone] = 0
+                    positions[gone] = np.nan
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
+    """Rays that made a point make no other; a camera that does not see its source lends another's ray."""
+    for c in range(len(T_world_camera)):
+        taken, near = -1, gate
+        if usable[source, c]:
+            if _off(point, directions[source, c], T_world_camera[c]) <= gate:
+                usable[source, c] = False
+            continue
+        for s in range(len(usable)):
+            if usable[s, c]:
+                off = _off(point, directions[s, c], T_world_camera[c])
+                if off <= near:
+                    taken, near = s, off
+        if taken >= 0:
+            usable[taken, c] = False
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _meet_by_chance(
+    sources: Any, directions: Any, usable: Any, T_world_camera: Any, gates: Any, min_rays: Any,
+    positions: Any, false: Any,
+) -> None:  # fmt: skip
+    """Points where rays left over from different sources meet; written into `now` (F, 3)."""
+    before, now = false
+    left = np.argwhere(usable)
+    pair, two = np.empty((len(T_world_camera), 3)), np.zeros(len(T_world_camera), dtype=np.bool_)
+    point = np.empty(3)
+    for first in range(len(left)):
+        s, c = left[first]
+        for second in range(first + 1, len(left)):
+            o, k = left[second]
+            if s == o or c == k or not usable[s, c] or not usable[o, k]:
+                continue
+            pair[c], pair[k] = directions[s, c], directions[o, k]
+            two[c], two[k] = True, True
+            found = _wide(pair, two, gates[1]) and _nearest_point(pair, two, T_world_camera, point)
+            two[c], two[k] = False, False
+            if not found or max(
+                _off(point, pair[c], T_world_camera[c]), _off(point, pair[k], T_world_camera[k])
+            ) > gates[0]:  # fmt: skip
+                continue
+            place = _false_place(point, before, now)
+            fewest = min_rays[0] if place >= 0 else min_rays[1]
+            if place < 0:
+                place = _free_place(before, now)
+            if place < 0 or _support(point, left, directions, usable, T_world_camera, gates[0]) < fewest:
+                continue
+            if _new_and_near(point, sources, positions, gates[2]):
+                now[place] = point
+                _spend(point, s, directions, usable, T_world_camera, gates[0])
+                usable[s, c] = usable[o, k] = False
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _support(point: Any, left: Any, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> int:
+    """Cameras with a ray left that passes through the point."""
+    through = np.zeros(len(T_world_camera), dtype=np.bool_)
+    for s, c in left:
+        if usable[s, c] and not through[c]:
+            through[c] = _off(point, directions[s, c], T_world_camera[c]) <= gate
+    return int(through.sum())
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float) -> bool:
+    """Whether a false point lies in the capture volume and not where a point is already."""
+    near = False
+    for s in range(len(sources)):
+        there, true = 0.0, 0.0
+        for i in range(3):
+            there += (positions[s, i] - point[i]) ** 2
+            true += (sources[s, i] - point[i]) ** 2
+        if there < min_distance * min_distance:  # False where there is none: NaN
+            return False
+        near |= true < _FALSE_REACH * _FALSE_REACH
+    return near
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _false_place(point: Any, before: Any, now: Any) -> int:
+    """The column whose false point of the frame before lies near, -1 for none."""
+    for place in range(len(before)):
+        if np.isnan(now[place, 0]) and np.sum((before[place] - point) ** 2) < _FALSE_STEP * _FALSE_STEP:
+            return place
+    return -1
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _free_place(before: Any, now: Any) -> int:
+    """A column that was empty in the frame before and is empty now, -1 for none."""
+    for place in range(len(before)):
+        if np.isnan(now[place, 0]) and np.isnan(before[place, 0]):
+            return place
+    return -1

@@ -1,0 +1,119 @@
+"""Which camera sees which marker: rays against the hand's capsules, facing, and field of view."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numba
+import numpy as np
+
+from handsim.hand.capsules import bounding_spheres
+from handsim.kernels.segments import segment_distance_squared
+from handsim.space.cameras import CameraRig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy.typing import NDArray
+
+MAX_FACING: Final = np.deg2rad(85.0)
+"""Largest angle between a marker's outward direction and the ray to a camera that still sees it [rad]."""
+
+
+def free_rays(
+    markers: Float[np.ndarray, "T M 3"],
+    cameras: Float[np.ndarray, "C 3"],
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+) -> Bool[np.ndarray, "T M C"]:
+    """Which straight lines from marker to camera meet no capsule.
+
+    A ray meets a capsule exactly when the segment marker-camera comes nearer to the capsule's axis than
+    its radius, so one distance between two segments decides it; MuJoCo's `mj_multiRay` is the test's oracle.
+    """
+    free: NDArray[np.bool_] = _free(markers, cameras, segments, radii)
+    return free
+
+
+def visible_cameras(
+    markers: Float[np.ndarray, "T M 3"],
+    normals: Float[np.ndarray, "T M 3"],
+    rig: CameraRig,
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+) -> Bool[np.ndarray, "T M C"]:
+    """Which cameras see each marker: in view, facing, and with nothing of the hand between.
+
+    Args:
+        markers: Marker centers in the world [m].
+        normals: Unit directions in which the markers look away from the skin.
+        rig: The cameras.
+        segments: Both ends of every capsule's axis in the world [m].
+        radii: Capsule radii [m].
+    """
+    clear = free_rays(markers, rig.positions, segments, radii)
+    seen: NDArray[np.bool_] = facing_cameras(markers, normals, rig) & clear
+    return seen
+
+
+def facing_cameras(
+    markers: Float[np.ndarray, "T M 3"], normals: Float[np.ndarray, "T M 3"], rig: CameraRig
+) -> Bool[np.ndarray, "T M C"]:
+    """Which cameras would see each marker if nothing stood in the way: in view, and on its open side.
+
+    Args:
+        markers: Marker centers in the world [m].
+        normals: Unit directions in which the markers look away from what carries them.
+        rig: The cameras.
+    """
+    cameras = rig.positions
+    ahead = normals @ cameras.T - np.einsum("tmi,tmi->tm", normals, markers)[..., None]
+    squared = np.einsum("tmi,tmi->tm", markers, markers)[..., None] - markers @ (2.0 * cameras.T)
+    squared += np.einsum("ci,ci->c", cameras, cameras)
+    facing: NDArray[np.bool_] = ahead > np.cos(MAX_FACING) * np.sqrt(squared)
+    return rig.in_view(markers) & facing
+
+
+def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
+    """One bit a camera: bit c is set where camera c sees."""
+    bits = visible.astype(np.uint32) << np.arange(visible.shape[-1], dtype=np.uint32)
+    packed: NDArray[np.uint32] = bits.sum(axis=-1, dtype=np.uint32)
+    return packed
+
+
+def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndarray, "*batch C"]:
+    """Inverse of `pack_cameras`."""
+    bits: NDArray[np.bool_] = (packed[..., None] >> np.arange(num_cameras, dtype=np.uint32)) & 1 == 1
+    return bits
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
+    frames, count = markers.shape[:2]
+    free = np.ones((frames, count, len(cameras)), dtype=np.bool_)
+    capsules = len(radii)
+    centers, reach = np.empty((capsules, 3)), np.empty(capsules)
+    way, gap, margin = np.empty((3, capsules)), np.empty(capsules), np.empty(capsules)
+    for t in range(frames):
+        bounding_spheres(segments[t], radii, centers, reach)
+        for m in range(count):
+            marker = markers[t, m]
+            for k in range(capsules):
+                for i in range(3):
+                    way[i, k] = centers[k, i] - marker[i]
+                gap[k] = way[0, k] ** 2 + way[1, k] ** 2 + way[2, k] ** 2 - reach[k] ** 2
+            for c in range(len(cameras)):
+                dx, dy, dz = (cameras[c, 0] - marker[0], cameras[c, 1] - marker[1], cameras[c, 2] - marker[2])
+                squared = dx * dx + dy * dy + dz * dz
+                inverse = 1.0 / squared
+                for k in range(capsules):  # a capsule whose bounding sphere the ray misses cannot be met
+                    along = way[0, k] * dx + way[1, k] * dy + way[2, k] * dz
+                    share = min(1.0, max(0.0, along * inverse))
+                    margin[k] = gap[k] - share * (2.0 * along - share * squared)
+                for k in range(capsules):
+                    if margin[k] < 0.0 and (
+                        segment_distance_squared(marker, cameras[c], segments[t, k, 0], segments[t, k, 1])
+                        < radii[k] * radii[k]
+                    ):
+                        free[t, m, c] = False
+                        break
+    return free

@@ -1,0 +1,110 @@
+"""Takes as files: named arrays and a JSON header in one .npz, whole or not at all, and never unpickled."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+
+from handsim.errors import CaptureError, HandSimError
+from handsim.files.atomic import atomic_write
+
+Content = TypeVar("Content")
+
+KINDS: Final = {
+    "take": "the truth of a simulated capture",
+    "tracked take": "a tracked take",
+}
+"""What these files may hold, and what it is called in a sentence."""
+_OLDEST_KIND: Final = "take"  # of headers that name none
+_DAMAGE: Final = (
+    HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, EOFError,
+    RuntimeError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What reading a damaged file may end in."""
+
+
+def write_archive(
+    path: Path, kind: str, schema: int, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> None:
+    """Write arrays and a header.
+
+    Args:
+        path: The file, whose name should end in .npz.
+        kind: One of `KINDS`.
+        schema: The number of its form.
+        header: The rest of the header, as JSON.
+        arrays: By name; `header` is taken.
+    """
+    text = json.dumps({"kind": kind, "schema": schema} | dict(header))
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, header=np.array(text), **arrays)
+
+
+def read_archive(
+    path: Path,
+    kind: str,
+    schema: int,
+    unpack: Callable[[dict[str, Any], dict[str, np.ndarray]], Content],
+) -> Content:
+    """Read what `write_archive` wrote.
+
+    Args:
+        path: The file.
+        kind: What it should hold.
+        schema: The number of its form.
+        unpack: Makes the content of header and arrays; what it raises means that they are damaged.
+
+    Raises:
+        CaptureError: No such file, of another kind or schema, or damaged.
+    """
+    header, arrays = _read(path, kind)
+    found = header.get("kind", _OLDEST_KIND)
+    if found != kind and found in KINDS:
+        raise CaptureError(f"{path}: {KINDS[found]}, expected {KINDS[kind]}")
+    if "schema" not in header:
+        raise CaptureError(f"{path}: not a {kind}, or a damaged one")
+    if header["schema"] != schema:
+        raise CaptureError(f"{path}: a {kind} of schema {header['schema']}, expected {schema}")
+    try:
+        return unpack(header, arrays)
+    except _DAMAGE as error:
+        raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
+
+
+def archive_kind(path: Path) -> str:
+    """Which of `KINDS` a file is.
+
+    Raises:
+        CaptureError: No such file, or none of them.
+    """
+    found = _read(path, "take")[0].get("kind", _OLDEST_KIND)
+    if found not in KINDS:
+        raise CaptureError(f"{path}: a {found}, expected {' or '.join(KINDS.values())}")
+    return str(found)
+
+
+def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays, whatever they hold."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        header = json.loads(str(arrays["header"]))
+        if not isinstance(header, dict):
+            raise ValueError("the header is no table")
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except _DAMAGE as error:
+        raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
+    return header, arrays
+
+
+def check_shapes(wanted: Iterable[tuple[np.ndarray, tuple[int, ...]]]) -> None:
+    """Raise a `ValueError` unless every array has its shape."""
+    if any(array.shape != shape for array, shape in wanted):
+        raise ValueError("the arrays do not fit together")

@@ -1,0 +1,149 @@
+"""A take: what an optical system put out, frame by frame, and the truth beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.fit import GlovedHand, fit_glove
+from gloves.layout import stored_layout
+from gloves.takes.archives import check_shapes, read_archive, write_archive
+from handsim.hand.model import HandModel
+from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
+from handsim.hand.topology import NUM_QPOS
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+KIND: Final = "take"
+SCHEMA: Final = 1
+SUFFIX: Final = ".truth.npz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldBody:
+    """A rigid body of a take."""
+
+    name: str
+    marker_names: tuple[str, ...]
+    T_world_body: Float[np.ndarray, "T 4 4"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Take:
+    """Points of every frame with IDs and truth.
+
+    A label counts through the markers of the hands, in their order, then those of the body; -1 is a ghost or
+    no point at all. An unbroken stretch of a column is one ID.
+    """
+
+    rate: float
+    """Frames a second [Hz]."""
+    points: Float[np.ndarray, "T N 3"]
+    """World frame [m], NaN where a column has no point."""
+    ids: Int[np.ndarray, "T N"]
+    labels: Int[np.ndarray, "T N"]
+    hands: tuple[GlovedHand, ...]
+    """The hands as they moved, their gloves as they were worn: positions after slipping."""
+    body: HeldBody | None
+    settings: dict[str, Any]
+    """What made it, as JSON."""
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.points)
+
+    @property
+    def hand_labels(self) -> tuple[range, ...]:
+        """The labels of each hand's markers."""
+        sizes = np.cumsum([0, *(hand.fit.layout.num_markers for hand in self.hands)])
+        return tuple(range(int(low), int(high)) for low, high in itertools.pairwise(sizes))
+
+    def observed(self, label: range) -> Float[np.ndarray, "T M 3"]:
+        """Where the system put the markers with these labels [m], NaN where it lost them."""
+        observed = np.full((self.num_frames, len(label), 3), np.nan)
+        mine = (self.labels >= label.start) & (self.labels < label.stop)
+        frame, column = np.nonzero(mine)
+        observed[frame, self.labels[frame, column] - label.start] = self.points[frame, column]
+        return observed
+
+    def markers_present(self) -> Bool[np.ndarray, "T M"]:
+        """Which markers of the hands have a point in which frame."""
+        observed = [self.observed(label) for label in self.hand_labels]
+        present: np.ndarray = np.isfinite(np.concatenate(observed, axis=1)[..., 0])
+        return present
+
+
+def save_take(path: Path, take: Take) -> None:
+    """Write a take's `.truth.npz`, whole or not at all."""
+    body = take.body
+    header = {
+        "units": "metres, radians, world frame",
+        "rate": take.rate,
+        "layouts": [dataclasses.asdict(hand.fit.layout) for hand in take.hands],
+        "body": None if body is None else {"name": body.name, "marker_names": body.marker_names},
+        "settings": take.settings,
+    }
+    arrays = {
+        "points": take.points,
+        "ids": take.ids.astype(np.int32),
+        "labels": take.labels.astype(np.int16),
+        "hands": np.array([pack_hand(hand.fit.shape) for hand in take.hands], dtype=HAND_DTYPE),
+        "qpos": np.stack([hand.qpos for hand in take.hands]),
+        "T_world_body": np.zeros((0, 4, 4)) if body is None else body.T_world_body,
+    }
+    write_archive(path, KIND, SCHEMA, header, arrays)
+
+
+def load_take(path: Path) -> Take:
+    """Read a `.truth.npz`.
+
+    Raises:
+        CaptureError: No such file, of another kind or schema, or damaged.
+    """
+    return read_archive(path, KIND, SCHEMA, _unpack)
+
+
+def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
+    stored = zip(header["layouts"], arrays["hands"], arrays["qpos"], strict=True)
+    hands = tuple(
+        GlovedHand(fit_glove(stored_layout(layout), HandModel(unpack_hand(record))), qpos)
+        for layout, record, qpos in stored
+    )
+    body = header["body"] and HeldBody(
+        header["body"]["name"], tuple(header["body"]["marker_names"]), arrays["T_world_body"]
+    )
+    take = Take(
+        rate=float(header["rate"]),
+        points=arrays["points"],
+        ids=arrays["ids"],
+        labels=arrays["labels"],
+        hands=hands,
+        body=body,
+        settings=header["settings"],
+    )
+    _check(take)
+    return take
+
+
+def _check(take: Take) -> None:
+    """Whether the parts of a take fit together."""
+    frames, columns = take.points.shape[:2]
+    shapes = [
+        (take.points, (frames, columns, 3)),
+        (take.ids, (frames, columns)),
+        (take.labels, take.ids.shape),
+    ]
+    shapes += [(hand.qpos, (frames, NUM_QPOS)) for hand in take.hands]
+    shapes += [] if take.body is None else [(take.body.T_world_body, (frames, 4, 4))]
+    check_shapes(shapes)
+    known = sum(hand.fit.layout.num_markers for hand in take.hands)
+    known += 0 if take.body is None else len(take.body.marker_names)
+    if not 0.0 < take.rate < np.inf or (take.labels < -1).any() or (take.labels >= known).any():
+        raise ValueError("the rate is none, or a label names no marker")

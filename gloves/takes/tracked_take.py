@@ -1,0 +1,256 @@
+"""A tracked take: what a tracker made of a capture, for whoever draws it or uses the motion."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.attach import Attachment
+from gloves.fit import GloveFit
+from gloves.layout import stored_layout
+from gloves.takes.archives import check_shapes, read_archive, write_archive
+from handsim.errors import ArgumentError, choices
+from handsim.hand.model import HandModel
+from handsim.hand.motion import HandMotion, bridge_gaps
+from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
+from handsim.hand.topology import NUM_BONES, NUM_QPOS, Side
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+    from numpy.typing import NDArray
+
+KIND: Final = "tracked take"
+SCHEMA: Final = 1
+STATUSES: Final = ("lost", "coasting", "found", "tracked")
+"""What a status number means; only what is lost has no pose."""
+LOST, COASTING, FOUND, TRACKED = range(4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkedBody:
+    """A rigid body with markers of its own."""
+
+    name: str
+    marker_names: tuple[str, ...]
+    places: Float[np.ndarray, "Q 3"]
+    """Its markers in its own frame [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedTake:
+    """Motion, labels and status of every frame; T frames, H hands, M markers, N points, B bodies.
+
+    A label counts through the markers of the hands, in their order, then those of the bodies; -1 is a point
+    that is nobody's, or no point at all.
+
+    Raises:
+        ArgumentError: The arrays do not fit together, or hold what they cannot.
+    """
+
+    rate: float
+    """Frames a second [Hz]; of a stream, the usual one."""
+    times: Float[np.ndarray, "T"]
+    """Time of each frame [s], growing."""
+    hands: tuple[GloveFit, ...]
+    qpos: Float[np.ndarray, "T H 27"]
+    """World frame, NaN where a hand is lost."""
+    status: Int[np.ndarray, "T H"]
+    """Places in `STATUSES`."""
+    rms: Float[np.ndarray, "T H"]
+    """3D RMS distance of the labeled markers from the pose's [m]; NaN without a fit."""
+    markers: Float[np.ndarray, "T H M 3"]
+    """Markers [m] as seen, or from the pose where `filled`; NaN where a hand is lost."""
+    filled: Bool[np.ndarray, "T H M"]
+    points: Float[np.ndarray, "T N 3"]
+    """What there was to see [m], NaN where a column has no point. The columns are the capture's; a stream's
+    points stand in the order in which they came."""
+    ids: Int[np.ndarray, "T N"]
+    """The system's ID of each point, -1 where it has none."""
+    labels: Int[np.ndarray, "T N"]
+    confidence: Float[np.ndarray, "T N"]
+    """How sure each label is, 0 to 1; NaN where there is no point."""
+    bodies: tuple[MarkedBody, ...]
+    body_poses: Float[np.ndarray, "T B 7"]
+    """Place [m] and orientation (wxyz) in the world, NaN where a body is lost."""
+    body_status: Int[np.ndarray, "T B"]
+    body_rms: Float[np.ndarray, "T B"]
+    settings: dict[str, Any]
+    """What made it, as JSON."""
+
+    def __post_init__(self) -> None:
+        try:
+            _check(self)
+        except ValueError as error:
+            raise ArgumentError(f"no tracked take: {error}") from error
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.times)
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Sides of the hands, in their order."""
+        return tuple(hand.side for hand in self.hands)
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """What each label is called: `right:ThumbTip`, `pen:Pen1`."""
+        hands = [f"{hand.side}:{name}" for hand in self.hands for name in hand.layout.names]
+        return (*hands, *(f"{body.name}:{name}" for body in self.bodies for name in body.marker_names))
+
+    def hand(self, side: Side) -> int:
+        """The place of a hand among the hands.
+
+        Raises:
+            ArgumentError: It was not tracked.
+        """
+        if side not in self.sides:
+            raise ArgumentError(choices(side, self.sides, noun="hand"))
+        return self.sides.index(side)
+
+    def observed(self, side: Side) -> Float[np.ndarray, "T M 3"]:
+        """The markers of a hand that were seen [m], NaN for the others."""
+        hand = self.hand(side)
+        return np.where(self.filled[:, hand, :, None], np.nan, self.markers[:, hand])
+
+    def motion(self, side: Side) -> HandMotion:
+        """The motion of a hand, whole: where it is lost, from the pose before straight to the pose after.
+
+        It stands still before its first pose and after its last; `status` says which frames are made up so.
+
+        Raises:
+            ArgumentError: The hand was never tracked.
+        """
+        qpos = self.qpos[:, self.hand(side)]
+        if np.isnan(qpos[:, 0]).all():
+            raise ArgumentError(f"the {side} hand has no pose in any frame")
+        return bridge_gaps(self.times, qpos, self.rate)
+
+
+def save_tracked_take(path: Path, take: TrackedTake) -> None:
+    """Write a tracked take, whole or not at all; `load_tracked_take` gives the same numbers again."""
+    header = {
+        "units": "metres, radians, seconds, wxyz, world frame",
+        "rate": take.rate,
+        "layouts": [dataclasses.asdict(hand.layout) for hand in take.hands],
+        "statuses": STATUSES,
+        "bodies": [{"name": body.name, "marker_names": body.marker_names} for body in take.bodies],
+        "settings": take.settings,
+    }
+    arrays = {name: np.asarray(getattr(take, name), dtype) for name, dtype in _ARRAYS.items()}
+    arrays["hands"] = np.array([pack_hand(hand.shape) for hand in take.hands], dtype=HAND_DTYPE)
+    for name in _WORN:
+        arrays[f"attachment_{name}"] = np.stack([getattr(hand.attachment, name) for hand in take.hands])
+    arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.places for body in take.bodies)])
+    write_archive(path, KIND, SCHEMA, header, arrays)
+
+
+def load_tracked_take(path: Path) -> TrackedTake:
+    """Read what `save_tracked_take` wrote.
+
+    Raises:
+        CaptureError: No such file, of another kind or schema, or damaged.
+    """
+    return read_archive(path, KIND, SCHEMA, _unpack)
+
+
+_ARRAYS: Final = {
+    "times": "f8",
+    "qpos": "f8",
+    "status": "i1",
+    "rms": "f8",
+    "markers": "f8",
+    "filled": "?",
+    "points": "f8",
+    "ids": "i4",
+    "labels": "i2",
+    "confidence": "f8",
+    "body_poses": "f8",
+    "body_status": "i1",
+    "body_rms": "f8",
+}
+"""The fields that lie in a file by their names, and as what."""
+_WORN: Final = ("points", "normals", "bone_indices", "bone_weights")
+
+
+def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTake:
+    if tuple(header["statuses"]) != STATUSES:
+        raise ValueError("the statuses are others")
+    hands = []
+    worn = zip(*(arrays[f"attachment_{name}"] for name in _WORN), strict=True)
+    for record, layout, parts in zip(arrays["hands"], header["layouts"], worn, strict=True):
+        attachment = Attachment(stored_layout(layout), *parts)
+        _check_worn(attachment)
+        hands.append(GloveFit(HandModel(unpack_hand(record)), attachment))
+    names = [(stored["name"], tuple(stored["marker_names"])) for stored in header["bodies"]]
+    places = np.split(arrays["body_places"], np.cumsum([len(markers) for _, markers in names], dtype=int))
+    if len(places.pop()):
+        raise ValueError("places of no body's markers")
+    if any(arrays[name].dtype != dtype for name, dtype in _ARRAYS.items()):
+        raise ValueError("numbers of another kind")
+    return TrackedTake(
+        rate=float(header["rate"]),
+        hands=tuple(hands),
+        bodies=tuple(MarkedBody(*name, place) for name, place in zip(names, places, strict=True)),
+        settings=header["settings"],
+        **{name: arrays[name] for name in _ARRAYS},
+    )
+
+
+def _check_worn(worn: Attachment) -> None:
+    """Whether a stored attachment fits its layout."""
+    count = worn.layout.num_markers
+    check_shapes((getattr(worn, name), (count, 3 if name in _WORN[:2] else 4)) for name in _WORN)
+    if not np.isfinite(worn.points).all() or not np.isfinite(worn.normals).all():
+        raise ValueError("a marker has no place")
+    if worn.bone_indices.dtype.kind != "i" or not _within(worn.bone_indices, 0, NUM_BONES - 1):
+        raise ValueError("a marker is on no bone")
+    if not _within(worn.bone_weights, 0.0, 1.0):
+        raise ValueError("a marker's weights are no shares")
+
+
+def _check(take: TrackedTake) -> None:
+    """Whether the parts of a tracked take fit together; a `ValueError` says what does not."""
+    frames, columns = take.num_frames, take.points.shape[1]
+    hands, bodies = len(take.hands), len(take.bodies)
+    if not frames or not hands or len(set(take.sides)) < hands:
+        raise ValueError(f"{frames} frames of the hands {take.sides}, expected some of one hand of a side")
+    counts = {hand.layout.num_markers for hand in take.hands}
+    if len(counts) > 1:
+        raise ValueError("the hands wear gloves with different numbers of markers")
+    markers = counts.pop()
+    check_shapes(
+        [
+            (take.times, (frames,)),
+            (take.qpos, (frames, hands, NUM_QPOS)),
+            (take.status, (frames, hands)),
+            (take.rms, (frames, hands)),
+            (take.markers, (frames, hands, markers, 3)),
+            (take.filled, (frames, hands, markers)),
+            (take.points, (frames, columns, 3)),
+            *((array, (frames, columns)) for array in (take.ids, take.labels, take.confidence)),
+            (take.body_poses, (frames, bodies, 7)),
+            (take.body_status, (frames, bodies)),
+            (take.body_rms, (frames, bodies)),
+            *((body.places, (len(body.marker_names), 3)) for body in take.bodies),
+        ]
+    )
+    if not 0.0 < take.rate < np.inf or not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():
+        raise ValueError("the rate is none, or times do not grow")
+    for status, poses in ((take.status, take.qpos), (take.body_status, take.body_poses)):
+        if (
+            not _within(status, 0, len(STATUSES) - 1)
+            or (np.isnan(poses) != (status == LOST)[..., None]).any()
+        ):
+            raise ValueError("a status is none, or does not fit its pose")
+    if not _within(take.labels, -1, len(take.label_names) - 1):
+        raise ValueError("a label names no marker")
+
+
+def _within(values: NDArray[Any], low: float, high: float) -> bool:
+    return bool(((values >= low) & (values <= high)).all())

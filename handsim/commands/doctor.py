@@ -1,0 +1,218 @@
+"""`handsim doctor`: what is missing on this machine, and how to get it."""
+
+from __future__ import annotations
+
+import ctypes.util
+import operator
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib import metadata, util
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from handsim._siblings import SIBLINGS, shadowed_siblings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
+_PROBE_SECONDS: Final = 120.0
+# Run in processes of their own: a broken driver takes its process with it, and torch and GL stay out of ours.
+_DRAW: Final = """
+import os
+os.environ["PYOPENGL_PLATFORM"] = "egl"
+import numpy, pyrender
+from OpenGL.GL import GL_RENDERER, glGetString
+scene = pyrender.Scene()
+scene.add(pyrender.PerspectiveCamera(yfov=1.0), pose=numpy.eye(4))
+renderer = pyrender.OffscreenRenderer(16, 16)
+renderer.render(scene, flags=pyrender.RenderFlags.DEPTH_ONLY)
+print(glGetString(GL_RENDERER).decode())
+"""
+_FIND_GPU: Final = """
+import torch
+print(torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none; the CPU does it, slower")
+"""
+_COMPARE: Final = {
+    ">=": operator.ge,
+    "<=": operator.le,
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report."""
+
+    what: str
+    found: str
+    wanted: str = ""
+    """What would do, in words or as limits of a version; empty when anything does."""
+    advice: str = ""
+    """What to do about it; empty when all is well."""
+    needed: bool = True
+    """Whether commands fail until the advice is followed."""
+
+
+def doctor() -> int:
+    """Say what is missing on this machine, and how to get it.
+
+    Returns:
+        0 when everything that the commands need is there, else 1.
+    """
+    from rich.console import Console
+
+    with Console(stderr=True).status("drawing a picture and looking for a GPU"):
+        findings = examine()
+    _print_report(findings)
+    return int(any(finding.needed and finding.advice for finding in findings))
+
+
+def examine() -> list[Finding]:
+    """Every finding about this machine, in the order of the report; takes a few seconds."""
+    drawing, gpu = _start(_DRAW), _start(_FIND_GPU)
+    return [
+        *check_requirements(),
+        *check_names(metadata.packages_distributions(), shadowed_siblings()),
+        check_drawing(*_finish(drawing)),
+        check_gpu(*_finish(gpu)),
+        *check_room(),
+    ]
+
+
+def check_requirements() -> Iterator[Finding]:
+    """Python itself and each dependency, as the installed handsim asks for them."""
+    try:
+        limits = metadata.metadata("handsim")["Requires-Python"]
+    except metadata.PackageNotFoundError:
+        yield Finding("handsim", "not installed", advice="run `pip install -e .` in handsim's folder")
+        return
+    python = ".".join(map(str, sys.version_info[:3]))
+    advice = "" if satisfies(python, limits) else "make a virtual environment with one of these versions"
+    yield Finding("Python", python, limits, advice)
+    for requirement in metadata.requires("handsim") or ():
+        if ";" not in requirement:  # what has a marker belongs to an extra
+            yield check_requirement(requirement)
+
+
+def check_requirement(requirement: str) -> Finding:
+    """One dependency, written as in pyproject.toml: a name, then limits joined by commas."""
+    name, limits = re.fullmatch(r"([\w.-]+)\s*(.*)", requirement).groups()  # type: ignore[union-attr]
+    advice = f"run `pip install '{name}{limits}'`"
+    try:
+        found = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return Finding(name, "missing", limits, advice)
+    return Finding(name, found, limits, "" if satisfies(found, limits) else advice)
+
+
+def satisfies(version: str, limits: str) -> bool:
+    """Whether a version keeps limits such as '>=13,<15'; only the release numbers are compared."""
+    signs_and_bounds = re.findall(r"([<>=!]+)\s*([\d.]+)", limits)
+    return all(_COMPARE[sign](_release(version), _release(bound)) for sign, bound in signs_and_bounds)
+
+
+def _release(version: str) -> tuple[int, ...]:
+    numbers = [int(part) for part in re.findall(r"\d+", re.split(r"[^\d.]", version)[0])]
+    return tuple(numbers + [0] * (4 - len(numbers)))  # 2.8 and 2.8.0 are equal
+
+
+def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]) -> Iterator[Finding]:
+    """Whether the generic import names, and pyrender's, belong to whom they should.
+
+    Args:
+        owners: The distributions that install each import name.
+        shadowed: Where each sibling leads that does not lie beside handsim.
+    """
+    for name in ("handsim", *SIBLINGS):
+        strangers = sorted(set(owners.get(name, ())) - {"handsim"})
+        if strangers:
+            advice = f"run `pip uninstall {' '.join(strangers)}`, then install handsim anew"
+            yield Finding(f"import {name}", f"also owned by {', '.join(strangers)}", "handsim alone", advice)
+        elif name in shadowed:
+            yield Finding(f"import {name}", shadowed[name], "beside handsim", "rename that, or go elsewhere")
+    advice = "run `pip uninstall pyrender pyrender-maintained`, then `pip install pyrender-maintained`"
+    flavors = sorted(set(owners.get("pyrender", ())))
+    broken = _pyrender_version() == "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later
+    if broken or len(flavors) > 1:
+        found = "0.1.45" if broken else " and ".join(flavors)
+        yield Finding("import pyrender", found, "pyrender-maintained alone", advice)
+
+
+def _pyrender_version() -> str:
+    """The version that pyrender's files state, which is not always the one its distribution claims."""
+    spec = util.find_spec("pyrender")
+    if spec is None or spec.origin is None:
+        return ""
+    file = Path(spec.origin).with_name("version.py")
+    stated = re.search(r"__version__ = ['\"](.+)['\"]", file.read_text()) if file.exists() else None
+    return stated.group(1) if stated else ""
+
+
+def check_drawing(code: int, output: str) -> Finding:
+    """Whether pictures can be drawn without a screen, judged by an attempt."""
+    what, wanted = "drawing (EGL)", "an OpenGL driver"
+    if code == 0:
+        return Finding(what, output, wanted)
+    if sys.platform != "linux":
+        return Finding(what, output, wanted, "drawing without a screen needs Linux; all else works here")
+    found = "libEGL is missing" if ctypes.util.find_library("EGL") is None else output
+    return Finding(what, found, wanted, f"run `apt-get install {EGL_PACKAGES}` as root")
+
+
+def check_gpu(code: int, output: str) -> Finding:
+    """What torch can compute on; only a torch that cannot be imported is a fault."""
+    advice = "" if code == 0 else "install torch anew; CONTRIBUTING.md says how to get its CPU build"
+    return Finding("GPU for training", output, advice=advice)
+
+
+def check_room() -> Iterator[Finding]:
+    """Cores for the workers and space on the disk of the current folder."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield Finding("CPU cores", str(cores))
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    advice = "" if free >= 1.0 else "free some space, or give --out on another disk"
+    yield Finding("free disk here", f"{free:.1f} GB", "1 GB", advice, needed=False)
+
+
+def _start(code: str) -> subprocess.Popen[str]:
+    # -P: a stranger's file in the current folder must not answer to numpy's or torch's name
+    command = [sys.executable, "-P", "-c", code]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _finish(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit code and last line of output, or of the errors when it failed."""
+    try:
+        output, errors = process.communicate(timeout=_PROBE_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        return 1, f"no answer in {_PROBE_SECONDS:g} s"
+    lines = (output if process.returncode == 0 else errors).strip().splitlines()
+    return process.returncode, lines[-1] if lines else f"died with code {process.returncode}"
+
+
+def _print_report(findings: Sequence[Finding]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("", "what", "found", "wanted", box=None, pad_edge=False)
+    for finding in findings:
+        mark = "[green]ok" if not finding.advice else "[red]missing" if finding.needed else "[yellow]low"
+        table.add_row(mark, Text(finding.what), Text(finding.found), Text(finding.wanted))
+    console = Console()
+    console.print(table)
+    troubles = [finding for finding in findings if finding.advice]
+    for finding in troubles:
+        console.print(Text(f"{finding.what}: {finding.advice}."), soft_wrap=True)
+    if not troubles:
+        console.print("Nothing is missing.")

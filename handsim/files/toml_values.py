@@ -1,0 +1,85 @@
+"""Values of TOML files: checked for their kind, told of in a sentence, and written so that they read back.
+
+What is wrong is a `HandSimError` that names the key; whoever knows the file makes it one of its own.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim.errors import HandSimError, choices
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
+
+
+def check_keys(
+    table: Mapping[str, object], owner: str, valid: Collection[str], *, optional: Collection[str] = ()
+) -> None:
+    """Whether a table has all the keys that it must have, and no others."""
+    for key in table:
+        if key not in valid:
+            raise HandSimError(f"{owner} has an {choices(key, valid, noun='key')}")
+    for key in valid:
+        if key not in table and key not in optional:
+            raise HandSimError(f"{owner} lacks the key '{key}'")
+
+
+def tables_of(table: Mapping[str, object], key: str) -> list[dict[str, Any]]:
+    """A list of tables, which may be missing."""
+    tables = table.get(key, [])
+    if not isinstance(tables, list) or not all(isinstance(entry, dict) for entry in tables):
+        raise HandSimError(f"{key} is not a list of tables; expected one [[{key}]] table a {key}")
+    return tables
+
+
+def text_of(table: Mapping[str, object], key: str, prefix: str = "", *, default: str | None = None) -> str:
+    """Text, of whatever characters."""
+    value = table.get(key, default)
+    if not isinstance(value, str):
+        raise HandSimError(f"{prefix}{key} is {shown(value)}, expected text in quotes")
+    return value
+
+
+def number_of(
+    table: Mapping[str, object], key: str, prefix: str = "", *, default: float | None = None
+) -> float:
+    """A finite number."""
+    return float(numbers(f"{prefix}{key}", table.get(key, default), (), "a number"))
+
+
+def numbers(owner: str, value: object, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:
+    """Nested lists of finite numbers as an array of exactly this shape; `wanted` says so in words."""
+    try:
+        array = np.array(value, dtype=object)
+    except ValueError:  # rows of different lengths
+        array = np.array(None)
+    flat = array.ravel().tolist()
+    if array.shape != shape or not all(
+        isinstance(entry, int | float) and not isinstance(entry, bool) and abs(entry) < _LARGEST
+        for entry in flat
+    ):
+        raise HandSimError(f"{owner} is {shown(value)}, expected {wanted}")
+    return np.array(flat, dtype=np.float64).reshape(shape)
+
+
+def shown(value: object) -> str:
+    """A value as a sentence shows it, cut where it is long."""
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 40 else text[:40] + "..."
+
+
+def quoted(text: str) -> str:
+    """A TOML basic string, which escapes as JSON does."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def written(value: float) -> str:
+    """A TOML float without the noise of unit conversion; never '-0.0'."""
+    return repr(round(value, 9) + 0.0)

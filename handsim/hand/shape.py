@@ -1,0 +1,188 @@
+"""How a hand is built: lengths, breadths and girths in meters, five named sizes, and a population.
+
+Sources, in docs/anatomy.md with their tables: bone lengths from Buryanov and Kotiuk 2010 (Int. J. Morphol.
+28:755), hand length and breadth from ANSUR II (2012), finger girths from Greiner 1991 (NATICK/TR-92/011).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim._checks import check_array
+from handsim.errors import ArgumentError, choices
+from handsim.hand.topology import DIGITS, SIDES, Side
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+# A man of hand length 193.9 mm (Buryanov's middle ray on a 37 mm carpus) and breadth 88.3 mm (ANSUR II mean).
+REFERENCE_LENGTH: Final = 0.1939
+REFERENCE_BREADTH: Final = 0.0883
+
+# Moving bones [mm]: proximal, middle, distal with its soft tip; for the thumb metacarpal, proximal, distal.
+_BONE_LENGTHS: Final = np.array(
+    [
+        [46.2, 31.6, 27.3],
+        [39.8, 22.4, 19.7],
+        [44.6, 26.3, 21.4],
+        [41.4, 25.7, 21.3],
+        [32.7, 18.1, 19.7],
+    ]
+)
+# Where each digit begins [mm], in the wrist frame: thumb CMC joint, then the four MCP joints. x follows the
+# metacarpal and carpus lengths, y spreads over the breadth, z is the transverse arch.
+_KNUCKLES: Final = np.array(
+    [[26.0, 25.5, -17.5], [97.5, 27.0, -2.0], [98.0, 5.0, 2.0], [90.5, -15.5, 0.0], [80.5, -35.0, -8.0]]
+)
+# How each digit points at zero angles [deg]: turn about z, tip towards the palm, roll about its own length.
+# The rolls make flexed fingers converge on the scaphoid; the thumb's nail faces sideways.
+_BASE_ANGLES: Final = np.array(
+    [[30.0, 32.0, -87.0], [-1.0, -8.0, -10.0], [-5.0, -2.0, -3.0], [-10.0, -2.0, 4.0], [-18.0, -2.0, 12.0]]
+)
+# Skin radius [mm] at a digit's base, second and third joint and behind the tip: Greiner's girths over 2 pi.
+_RADII: Final = np.array(
+    [
+        [14.5, 11.8, 11.5, 8.6],
+        [12.6, 10.9, 9.1, 7.4],
+        [12.8, 11.1, 9.3, 7.6],
+        [12.2, 10.3, 8.7, 7.2],
+        [11.0, 9.2, 7.9, 6.5],
+    ]
+)
+_PALM_THICKNESS: Final = 28.0  # [mm] at the metacarpals, without the thenar
+
+# ANSUR II [mm]: mean and SD of length and breadth, and their correlation, for women and men.
+_LENGTH_BREADTH: Final = {
+    "female": ((181.1, 10.1), (78.2, 3.8), 0.57),
+    "male": ((193.3, 9.9), (88.3, 4.4), 0.58),
+}
+# ANSUR II percentiles: women's p5 and p50, the even mixture's p50, men's p50 and p95 [mm].
+SIZES: Final[dict[str, tuple[float, float]]] = {
+    "XS": (165.0, 72.0),
+    "S": (180.0, 78.0),
+    "M": (187.0, 83.0),
+    "L": (193.0, 88.0),
+    "XL": (210.0, 96.0),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandShape:
+    """One person's hand, always described as a right hand; `side` says which one it is."""
+
+    side: Side
+    length: float
+    """Hand length [m], wrist crease to the tip of the middle finger."""
+    breadth: float
+    """Hand breadth [m] across the metacarpal heads."""
+    bone_lengths: Float[np.ndarray, "5 3"]
+    """Lengths [m] of the three moving bones of each digit, the last one to the soft tip."""
+    knuckles: Float[np.ndarray, "5 3"]
+    """Where each digit's first joint sits [m] in the wrist frame."""
+    base_angles: Float[np.ndarray, "5 3"]
+    """How each digit points at zero angles [rad]: turn, tip, roll."""
+    radii: Float[np.ndarray, "5 4"]
+    """Skin radius [m] at each digit's three joints and behind its tip."""
+    palm_thickness: float
+    """Thickness [m] of the palm at the metacarpals."""
+
+    def __post_init__(self) -> None:
+        if self.side not in SIDES:
+            raise ArgumentError(choices(self.side, SIDES, noun="side"))
+        for name, shape in (
+            ("bone_lengths", (5, 3)),
+            ("knuckles", (5, 3)),
+            ("base_angles", (5, 3)),
+            ("radii", (5, 4)),
+        ):
+            object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
+        smallest = min(
+            self.length, self.breadth, self.palm_thickness, self.bone_lengths.min(), self.radii.min()
+        )
+        if not smallest > 0.0:
+            raise ArgumentError(f"a hand's lengths must be positive, got {smallest:g} m")
+        if not 0.05 <= self.length <= 0.35:
+            raise ArgumentError(
+                f"hand length {self.length:g} m is no human hand's; expected meters, 0.05 to 0.35"
+            )
+
+    def with_side(self, side: Side) -> HandShape:
+        """The same hand on the other (or the same) arm."""
+        return dataclasses.replace(self, side=side)
+
+
+def shape_from_measures(length: float, breadth: float, *, side: Side = "right") -> HandShape:
+    """Hand of mean proportions with this length and breadth [m]; girths follow the breadth."""
+    along, across = length / REFERENCE_LENGTH * 1e-3, breadth / REFERENCE_BREADTH * 1e-3
+    return HandShape(
+        side=side,
+        length=length,
+        breadth=breadth,
+        bone_lengths=_BONE_LENGTHS * along,
+        knuckles=_KNUCKLES * np.array([along, across, across]),
+        base_angles=np.deg2rad(_BASE_ANGLES),
+        radii=_RADII * across,
+        palm_thickness=_PALM_THICKNESS * across,
+    )
+
+
+def named_shape(size: str, *, side: Side = "right") -> HandShape:
+    """One of the five sizes XS, S, M, L, XL."""
+    if size not in SIZES:
+        raise ArgumentError(choices(size, SIZES, noun="size"))
+    length, breadth = SIZES[size]
+    return shape_from_measures(length * 1e-3, breadth * 1e-3, side=side)
+
+
+@dataclass(frozen=True, slots=True)
+class Population:
+    """Whose hands `sample_shape` draws; the spreads are standard deviations around the mean proportions."""
+
+    children: float = 0.0
+    """Share of children: hand lengths from 0.6 of an adult's (about three years old) upwards."""
+    digit_spread: float = 0.035
+    """Log spread of a whole digit's length."""
+    bone_spread: float = 0.045
+    """Log spread of a single bone's length."""
+    knuckle_spread: float = 0.001
+    """Spread of each knuckle's place [m]."""
+    angle_spread: float = 3.0
+    """Spread of each finger's base angles [deg]; three times this for the thumb."""
+    girth_spread: float = 0.06
+    """Log spread of a digit's girth."""
+
+
+ADULTS: Final = Population()
+EVERYBODY: Final = Population(children=0.2)
+
+
+def sample_shape(
+    population: Population = ADULTS, *, side: Side = "right", rng: np.random.Generator
+) -> HandShape:
+    """A random person's hand: length and breadth as ANSUR II correlates them, proportions varied on top."""
+    sex = "female" if rng.random() < 0.5 else "male"
+    (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]
+    first, second = np.clip(rng.standard_normal(2), -2.5, 2.5)
+    length = length_mean + length_sd * first
+    breadth = breadth_mean + breadth_sd * (correlation * first + np.sqrt(1 - correlation**2) * second)
+    youth = rng.uniform(0.6, 1.0) if rng.random() < population.children else 1.0
+    mean = shape_from_measures(youth * length * 1e-3, youth * breadth * 1e-3, side=side)
+
+    def spread(scale: float, shape: tuple[int, ...]) -> np.ndarray:
+        return scale * np.clip(rng.standard_normal(shape), -2.5, 2.5)
+
+    angles = spread(np.deg2rad(population.angle_spread), (len(DIGITS), 3))
+    angles[0] *= 3.0
+    bones = np.exp(spread(population.digit_spread, (5, 1)) + spread(population.bone_spread, (5, 3)))
+    return dataclasses.replace(
+        mean,
+        bone_lengths=mean.bone_lengths * bones,
+        knuckles=mean.knuckles + youth * spread(population.knuckle_spread, (5, 3)),
+        base_angles=mean.base_angles + angles,
+        radii=mean.radii * np.exp(spread(population.girth_spread, (5, 1))),
+        palm_thickness=mean.palm_thickness * float(np.exp(spread(population.girth_spread, ()))),
+    )

@@ -1,0 +1,64 @@
+"""Where a hand's bones and hinges sit at zero angles, for either side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from handsim.hand.shape import HandShape
+from handsim.hand.topology import BONES, JOINTS, NUM_BONES
+from handsim.space.transforms import MIRROR, euler_matrix
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Skeleton:
+    """Rest transforms of the bones relative to their parents, hinge axes, and bone lengths."""
+
+    offsets: Float[np.ndarray, "L 3"]
+    """Origin of each bone in its parent's frame [m]; zero for the palm."""
+    rotations: Float[np.ndarray, "L 3 3"]
+    """Orientation of each bone in its parent's frame at zero angles."""
+    axes: Float[np.ndarray, "J 3"]
+    """Hinge axes in the frames of the bones they move."""
+    ranges: Float[np.ndarray, "J 2"]
+    """Lowest and highest angle of each hinge [rad]."""
+    lengths: Float[np.ndarray, "L"]
+    """Length of each bone along its x axis [m]; for the palm, wrist to the middle knuckle."""
+
+    def rest_transforms(self) -> Float[np.ndarray, "L 4 4"]:
+        """`T_wrist_bone` of every bone at zero angles."""
+        transforms = np.tile(np.eye(4), (NUM_BONES, 1, 1))
+        for number, bone in enumerate(BONES):
+            if bone.parent >= 0:
+                local = np.eye(4)
+                local[:3, :3], local[:3, 3] = self.rotations[number], self.offsets[number]
+                transforms[number] = transforms[bone.parent] @ local
+        return transforms
+
+
+def build_skeleton(shape: HandShape) -> Skeleton:
+    """Skeleton of a hand; a left hand is the mirror image, so equal angles give mirrored poses."""
+    offsets, rotations = np.zeros((NUM_BONES, 3)), np.tile(np.eye(3), (NUM_BONES, 1, 1))
+    lengths = np.zeros(NUM_BONES)
+    lengths[0] = shape.knuckles[2, 0]
+    for number, bone in enumerate(BONES):
+        if bone.digit < 0:
+            continue
+        place = (number - 1) % 3
+        lengths[number] = shape.bone_lengths[bone.digit, place]
+        if place == 0:
+            offsets[number] = shape.knuckles[bone.digit]
+            rotations[number] = euler_matrix(shape.base_angles[bone.digit])
+        else:
+            offsets[number, 0] = shape.bone_lengths[bone.digit, place - 1]
+    axes = np.array([joint.axis for joint in JOINTS])
+    if shape.side == "left":
+        offsets, rotations = offsets @ MIRROR, MIRROR @ rotations @ MIRROR
+        axes = -axes @ MIRROR  # a mirrored turn goes the other way round
+    ranges = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
+    return Skeleton(offsets, rotations, axes, ranges, lengths)

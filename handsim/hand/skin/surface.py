@@ -1,0 +1,183 @@
+"""The hand's skin: a smooth closed mesh that is a function of the shape, and linear blend skinning."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from handsim.hand.skin.cage import (
+    KNUCKLES,
+    METACARPUS,
+    CageScales,
+    CageTopology,
+    cage_topology,
+    cage_vertices,
+    digit_frames,
+    dorsal,
+    first_scales,
+    palmar,
+    ring_girths,
+)
+from handsim.hand.skin.subdivision import catmull_clark, subdivided_loop
+from handsim.hand.skin.weights import cage_weights, strongest_weights
+from handsim.hand.topology import DIGITS
+from handsim.space.transforms import MIRROR
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+    from handsim.hand.shape import HandShape
+
+_LEVELS: Final = 2
+_FIT_STEPS: Final = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandSurface:
+    """Skin of one hand at zero angles, in the wrist frame; faces and weights are the same for every shape."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    """Rest positions [m]."""
+    faces: Int[np.ndarray, "F 3"]
+    """Triangles, counter-clockwise from outside."""
+    bone_indices: Int[np.ndarray, "V 4"]
+    """Places in `topology.BONES` of the bones that move each vertex."""
+    bone_weights: Float[np.ndarray, "V 4"]
+    """Their shares: not negative, in descending order, summing to one."""
+
+
+class _Template(NamedTuple):
+    """What all hands share. The last four are rows of `measured`, the vertices that the fit looks at."""
+
+    topology: CageTopology
+    subdivide: sparse.csr_array
+    faces: np.ndarray
+    bone_indices: np.ndarray
+    bone_weights: np.ndarray
+    measured: sparse.csr_array
+    ring_loops: np.ndarray
+    knuckle_loop: np.ndarray
+    tips: np.ndarray
+    back_and_palm: np.ndarray
+
+
+@functools.cache
+def _template() -> _Template:
+    topology = cage_topology()
+    quads, count = topology.quads, topology.num_vertices
+    loops = [ring for rings in topology.rings for ring in rings] + [topology.palm[KNUCKLES]]
+    subdivide = sparse.eye_array(count, format="csr")
+    for _ in range(_LEVELS):
+        step, next_quads = catmull_clark(quads, count)
+        loops = [subdivided_loop(loop, quads, count) for loop in loops]
+        subdivide = step @ subdivide
+        quads, count = next_quads, step.shape[0]
+    children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # a quad's four follow one another
+    tips = np.array([np.unique(quads[children[pair]]) for pair in topology.tips])
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    indices, weights = strongest_weights(subdivide @ cage_weights(topology))
+    for array in (faces, indices, weights):
+        array.setflags(write=False)
+    back_and_palm = topology.palm[METACARPUS][[dorsal(3), palmar(3)]]
+    looked_at = (np.array(loops[:-1]), loops[-1], tips, back_and_palm)
+    rows = np.unique(np.concatenate([part.ravel() for part in looked_at]))
+    parts = [np.searchsorted(rows, part) for part in looked_at]
+    return _Template(topology, subdivide, faces, indices, weights, subdivide[rows], *parts)
+
+
+def build_surface(shape: HandShape) -> HandSurface:
+    """Skin of a hand at zero angles.
+
+    Subdivision shrinks, so the cage is blown up until the skin has the shape's girths, lengths, breadth and
+    palm thickness. A left hand is the exact mirror image of the right one.
+    """
+    template = _template()
+    vertices, faces = template.subdivide @ _fitted_cage(shape, template), template.faces
+    if shape.side == "left":
+        vertices, faces = vertices @ MIRROR, faces[:, ::-1]
+    return HandSurface(vertices, faces, template.bone_indices, template.bone_weights)
+
+
+def _fitted_cage(shape: HandShape, template: _Template) -> np.ndarray:
+    """Cage vertices after a few corrections of their scales by wanted over measured."""
+    topology, frames, first = template.topology, digit_frames(shape), first_scales()
+    still, wide, deep = _cage_parts(shape, frames, topology)
+    palm, on_ring = topology.palm.size, topology.rings[0].shape[1]
+    sideways = np.concatenate([np.full(palm, first.breadth), np.concatenate(first.rings).repeat(on_ring)])
+    upwards = np.concatenate([np.full(palm, first.thickness), np.zeros(len(still) - palm)])
+    rings = sideways[palm:].reshape(-1, on_ring)  # a view
+    tip_rings = np.cumsum([len(digit) for digit in topology.rings]) - 1
+    outermost = np.array([digit[-1] for digit in topology.rings])
+    girths = np.concatenate([ring_girths(shape, digit) for digit in range(len(DIGITS))])
+    for _ in range(_FIT_STEPS):
+        points = template.measured @ (still + sideways[:, None] * wide + upwards[:, None] * deep)
+        loops = points[template.ring_loops]
+        rings *= (girths / np.linalg.norm(loops - np.roll(loops, 1, axis=1), axis=-1).sum(axis=1))[:, None]
+        rings[tip_rings] = rings[tip_rings - 1]
+        ahead = np.einsum("dni,di->dn", points[template.tips] - frames[:, None, :3, 3], frames[:, :3, 0])
+        upwards[outermost] += (shape.bone_lengths.sum(axis=1) - ahead.max(axis=1))[:, None]
+        sideways[:palm] *= shape.breadth / np.ptp(points[template.knuckle_loop, 1])
+        upwards[:palm] *= -shape.palm_thickness / np.diff(points[template.back_and_palm, 2])
+    cage: np.ndarray = still + sideways[:, None] * wide + upwards[:, None] * deep
+    return cage
+
+
+def _cage_parts(shape: HandShape, frames: np.ndarray, topology: CageTopology) -> np.ndarray:
+    """The cage is affine in its scales: vertices (3, K, 3) at none, what one of width adds, and of depth."""
+
+    def scaled(wide: float, deep: float) -> np.ndarray:
+        rings = [np.full(len(digit), wide) for digit in topology.rings]
+        return cage_vertices(
+            shape, frames, topology, CageScales(rings, np.full(len(DIGITS), deep), wide, deep)
+        )
+
+    still = scaled(0.0, 0.0)
+    return np.stack([still, scaled(1.0, 0.0) - still, scaled(0.0, 1.0) - still])
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """Outward unit normals, each the area-weighted mean of the faces around its vertex."""
+    corners = vertices[faces]
+    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = [np.bincount(faces.ravel(), np.repeat(crosses[:, axis], 3), len(vertices)) for axis in range(3)]
+    normals = np.stack(sums, axis=1)
+    unit: np.ndarray = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    return unit
+
+
+def linear_blend_skinning(
+    points: Float[np.ndarray, "N 3"],
+    bone_indices: Int[np.ndarray, "N 4"],
+    bone_weights: Float[np.ndarray, "N 4"],
+    rest_transforms: Float[np.ndarray, "L 4 4"],
+    transforms: Float[np.ndarray, "*batch L 4 4"],
+) -> Float[np.ndarray, "*batch N 3"]:
+    """Points attached at rest, carried by the bones.
+
+    Args:
+        points: Rest positions, in the frame of `rest_transforms` [m].
+        bone_indices: The bones that move each point.
+        bone_weights: Their shares.
+        rest_transforms: Bones at rest.
+        transforms: Bones in each pose, in any frame.
+
+    Returns:
+        Positions in the frame of `transforms` [m].
+    """
+    motion = (transforms @ np.linalg.inv(rest_transforms))[..., :3, :]
+    weights = np.zeros((len(points), len(rest_transforms)))
+    np.add.at(weights, (np.arange(len(points))[:, None], bone_indices), bone_weights)
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    # Each bone moves only its own points: one small product a bone instead of a blended matrix a point.
+    result = np.zeros((*motion.shape[:-3], len(points), 3))
+    for bone in range(len(rest_transforms)):
+        mine = np.flatnonzero(weights[:, bone])
+        carried = np.einsum("...ij,nj->...ni", motion[..., bone, :, :], homogeneous[mine])
+        result[..., mine, :] += weights[mine, bone, None] * carried
+    return result

@@ -1,0 +1,74 @@
+"""What a camera rig's TOML file says, each value checked for its kind."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from handsim.errors import ArgumentError, HandSimError
+from handsim.files.atomic import read_toml
+from handsim.files.toml_values import check_keys, number_of, numbers, shown, tables_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+_RIG_KEYS: Final = ("name", "description", "field_of_view", "resolution", "camera")
+_CAMERA_KEYS: Final = ("position", "target", "T_world_camera")
+
+
+class RigTable(NamedTuple):
+    """A rig as written; whether cameras can stand like that is `CameraRig`'s to say."""
+
+    name: str
+    field_of_view: float
+    """[deg]"""
+    resolution: int
+    """[px]"""
+    cameras: list[tuple[NDArray[np.float64], NDArray[np.float64]] | NDArray[np.float64]]
+    """Position and target (3,) [m], or a pose (4, 4)."""
+
+
+def read_rig_file(path: Path) -> RigTable:
+    """Read a rig's file.
+
+    Raises:
+        ArgumentError: It cannot be read, is damaged, or a key is missing, unknown or of another kind.
+    """
+    table = read_toml(path, error=ArgumentError)
+    try:
+        return _parse(table)
+    except HandSimError as error:
+        raise ArgumentError(f"{path}: {error}") from error
+
+
+def _parse(table: Mapping[str, object]) -> RigTable:
+    check_keys(table, "the file", _RIG_KEYS, optional=("description", "resolution", "camera"))
+    name, tables = table["name"], tables_of(table, "camera")
+    if not isinstance(name, str) or not name or not name.isprintable():
+        raise ArgumentError(f"name is {shown(name)}, expected printable text in quotes")
+    resolution = table.get("resolution", 1280)
+    if isinstance(resolution, bool) or not isinstance(resolution, int):
+        raise ArgumentError(f"resolution is {shown(resolution)}, expected a whole number of pixels")
+    angle = number_of(table, "field_of_view")
+    cameras = [_parse_camera(entry, f"camera {number}") for number, entry in enumerate(tables, 1)]
+    return RigTable(name, angle, resolution, cameras)
+
+
+def _parse_camera(
+    table: Mapping[str, object], owner: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | NDArray[np.float64]:
+    check_keys(table, owner, _CAMERA_KEYS, optional=_CAMERA_KEYS)
+    if set(table) == {"T_world_camera"}:
+        return numbers(
+            f"{owner}: T_world_camera", table["T_world_camera"], (4, 4), "four rows of four numbers"
+        )
+    if set(table) == {"position", "target"}:
+        wanted = "three numbers [x, y, z] in meters"
+        position, target = (
+            numbers(f"{owner}: {key}", table[key], (3,), wanted) for key in ("position", "target")
+        )
+        return position, target
+    given = " and ".join(table) or "nothing"
+    raise ArgumentError(f"{owner} has {given}, expected position and target, or T_world_camera alone")

@@ -1,0 +1,81 @@
+"""Rotations and rigid transforms on numpy arrays, leading batch dimensions everywhere.
+
+Quaternions are wxyz (MuJoCo's order). A matrix `T_a_b` maps coordinates of frame b into frame a.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+MIRROR = np.diag([1.0, -1.0, 1.0])  # right hand <-> left hand, in the wrist frame
+
+
+def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices (..., 3, 3) about one unit axis by `angle` (...) [rad] (Rodrigues' formula)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine, cosine = np.sin(angle)[..., None, None], np.cos(angle)[..., None, None]
+    rotation: NDArray[np.float64] = np.eye(3) + sine * cross + (1.0 - cosine) * (cross @ cross)
+    return rotation
+
+
+def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.float64]:
+    """Rotation matrices (..., 3, 3) of wxyz quaternions, which are normalized first."""
+    unit = quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(unit, -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    matrix: NDArray[np.float64] = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return matrix
+
+
+def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Unit wxyz quaternions (T, 4) of rotation matrices."""
+    quaternions: NDArray[np.float64] = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
+    return quaternions
+
+
+def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]:
+    """Unit wxyz quaternions (T, 4) of rotation vectors [rad]."""
+    quaternions: NDArray[np.float64] = Rotation.from_rotvec(vectors).as_quat(scalar_first=True)
+    return quaternions
+
+
+def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
+    """Rotation Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: turn, then tip, then roll about the own x axis."""
+    x, y, z = np.eye(3)
+    matrix: NDArray[np.float64] = (
+        axis_angle_matrix(z, angles[0]) @ axis_angle_matrix(y, angles[1]) @ axis_angle_matrix(x, angles[2])
+    )
+    return matrix
+
+
+def random_quaternions(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Uniform random rotations as wxyz quaternions (count, 4)."""
+    raw: NDArray[np.float64] = rng.standard_normal((count, 4))
+    raw /= np.linalg.norm(raw, axis=1, keepdims=True)
+    return raw
+
+
+def rigid_fit(
+    source: Float[np.ndarray, "*batch N 3"], target: Float[np.ndarray, "*batch N 3"]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (..., 3, 3) and translation (..., 3) that best map `source` onto `target` (Kabsch)."""
+    source_center, target_center = source.mean(-2, keepdims=True), target.mean(-2, keepdims=True)
+    covariance = np.swapaxes(source - source_center, -1, -2) @ (target - target_center)
+    u, _, vt = np.linalg.svd(covariance)
+    flip = np.ones(covariance.shape[:-1])
+    flip[..., 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    rotation = np.swapaxes(u * flip[..., None, :] @ vt, -1, -2)
+    translation = target_center[..., 0, :] - np.einsum("...ij,...j->...i", rotation, source_center[..., 0, :])
+    return rotation, translation

@@ -1,0 +1,141 @@
+"""Hands brought together until they touch: one backs off along an axis, fingers close until something is met.
+
+Both searches come from the free side and stop at the first contact, so whatever is less far is free too. That
+is what lets a motion be smoothed afterwards: towards the free side only.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.ndimage import convolve1d, maximum_filter1d
+
+from handsim.hand.model import HandModel
+from handsim.space.transforms import quaternion_matrix
+from poses.contact.contact_search import (
+    NEAREST,
+    Digit,
+    Obstacles,
+    Ways,
+    pose_digit,
+    search_closing,
+    search_contact,
+)
+
+__all__ = ["NEAREST", "close_fingers", "first_contact", "smooth_above", "smooth_below"]
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+# Fingers close in two stages: what stops a knuckle does not stop the joints beyond it. Each has a depth [m]
+# to which a finger presses into the other hand or its own, and the joints of a digit that it moves.
+_STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
+_ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
+
+
+def first_contact(
+    still: HandModel,
+    still_qpos: Float[np.ndarray, "T 27"],
+    moving: HandModel,
+    moving_qpos: Float[np.ndarray, "T 27"],
+    axis: Float[np.ndarray, "T 3"],
+) -> Float[np.ndarray, "T"]:
+    """How far along `axis` [m] the moving hand touches the still one, coming from far outside.
+
+    Everything farther out is free. Frames without a contact give `NEAREST`.
+    """
+    reach: NDArray[np.float64] = search_contact(
+        moving.capsules.posed(moving.forward_kinematics(moving_qpos)),
+        moving.capsules.radii,
+        still.capsules.posed(still.forward_kinematics(still_qpos)),
+        still.capsules.radii,
+        axis,
+    )
+    return reach
+
+
+def close_fingers(
+    model: HandModel,
+    opened: Float[np.ndarray, "T 27"],
+    closed: Float[np.ndarray, "T 20"],
+    strength: Float[np.ndarray, "T 5"],
+    *,
+    other: HandModel,
+    other_qpos: Float[np.ndarray, "T 27"],
+    window: int = 1,
+) -> Float[np.ndarray, "T 20"]:
+    """Hinge angles of fingers that close from one pose towards another until they meet a hand.
+
+    Args:
+        model: The hand whose fingers close.
+        opened: Where it is, with its fingers open.
+        closed: Angles [rad] its fingers would have with nothing in the way.
+        strength: Share of the way that is gone where nothing is in the way, a digit each.
+        other: The hand that is in the way, besides the own one.
+        other_qpos: Where that is.
+        window: Frames over which the ways are smoothed; 1 leaves each frame alone.
+    """
+    busy = np.flatnonzero(strength.max(axis=1) > 0.0)
+    angles = opened[:, 7:].copy()
+    rotations, positions = quaternion_matrix(opened[busy, 3:7]), opened[busy, :3]
+    own = model.capsules.posed(model.forward_kinematics(opened[busy]))
+    others = other.capsules.posed(other.forward_kinematics(other_qpos[busy]))
+    all_of_other = np.ones((3, len(other.capsules.radii)), dtype=bool)
+    for press, joints in _STAGES:
+        for digit in _ORDER:
+            parts = _digit(model, digit)
+            rest = [k for k in range(len(model.capsules.bones)) if k not in parts.capsules]
+            place = slice(4 * digit, 4 * digit + 4)
+            goal = angles[:, place].copy()
+            goal[:, joints] = closed[:, place][:, joints]
+            share = np.ones(len(angles))
+            share[busy] = search_closing(
+                Ways(rotations, positions, angles[busy, place], goal[busy]),
+                parts,
+                Obstacles(
+                    np.concatenate([others, own[:, rest]], axis=1),
+                    np.concatenate([other.capsules.radii, model.capsules.radii[rest]]),
+                    np.concatenate([all_of_other, parts.meets[:, rest]], axis=1),
+                    press,
+                ),
+            )
+            share = smooth_below(share, window) * strength[:, digit]
+            angles[:, place] += share[:, None] * (goal - angles[:, place])
+            own[:, parts.capsules] = pose_digit((rotations, positions), angles[busy, place], parts)
+    return angles
+
+
+def smooth_above(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
+    """A smooth curve that is nowhere below `values`, smoothed over an odd number of frames."""
+    if window < 3:
+        return values
+    kernel = np.hanning(window + 2)[1:-1]
+    highest = maximum_filter1d(values, window, mode="nearest")
+    smooth: NDArray[np.float64] = convolve1d(highest, kernel / kernel.sum(), mode="nearest")
+    return smooth
+
+
+def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarray, "T"]:
+    """A smooth curve that is nowhere above `values`, smoothed over an odd number of frames."""
+    return -smooth_above(-values, window)
+
+
+def _digit(model: HandModel, digit: int) -> Digit:
+    capsules, skeleton = model.capsules, model.skeleton
+    first = 1 + 3 * digit
+    places = np.array([int(np.flatnonzero(capsules.bones == first + number)[0]) for number in range(3)])
+    meets = np.zeros((len(capsules.bones),) * 2, dtype=bool)
+    pairs = capsules.touching_pairs()
+    meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
+    return Digit(
+        capsules=places,
+        offsets=skeleton.offsets[first : first + 3],
+        rotations=skeleton.rotations[first : first + 3],
+        axes=skeleton.axes[4 * digit : 4 * digit + 4],
+        ends=np.stack([capsules.starts[places], capsules.ends[places]], axis=1),
+        radii=capsules.radii[places],
+        meets=meets[places],
+        reach=float(skeleton.lengths[first : first + 3].sum() + capsules.radii[places].max()),
+    )

@@ -1,0 +1,223 @@
+"""The compiled searches behind `touch`: where a hand first meets another, how far a digit can close."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numba
+import numpy as np
+
+from handsim.kernels.segments import segment_distance_squared
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FARTHEST: Final = 0.4
+"""Where the search for the first contact begins [m], measured along the axis."""
+NEAREST: Final = -0.15
+"""Where it ends without one [m]."""
+_PRESS: Final = 0.0005  # depth [m] to which a hand is brought to the other
+_STEP: Final = 0.15  # of all hinges together [rad], from open to closed until the first that is blocked
+_HALVINGS: Final = 6  # of that last step, or fewer where that is exact to
+_PRECISION: Final = 0.003  # of all hinges together [rad]
+
+
+class Digit(NamedTuple):
+    """What the searches need of a digit: three bones, four hinges, three capsules."""
+
+    capsules: NDArray[np.int64]
+    offsets: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    ends: NDArray[np.float64]
+    radii: NDArray[np.float64]
+    meets: NDArray[np.bool_]
+    """Which capsules of the hand each of its own may collide with (3, K)."""
+    reach: float
+    """Farthest that its skin gets from its first joint [m]."""
+
+
+class Ways(NamedTuple):
+    """A digit's way in every frame: the wrist's place, hinges (T, 4) at the start and at the goal [rad]."""
+
+    rotations: NDArray[np.float64]
+    positions: NDArray[np.float64]
+    start: NDArray[np.float64]
+    goal: NDArray[np.float64]
+
+
+class Obstacles(NamedTuple):
+    """What a digit may meet: capsules of the other hand and of its own."""
+
+    segments: NDArray[np.float64]
+    """Axes in the world (T, K, 2, 3) [m]."""
+    radii: NDArray[np.float64]
+    meets: NDArray[np.bool_]
+    """Which of them stop which of the digit's bones (3, K)."""
+    press: float
+    """How deep [m] it may press into them."""
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def search_contact(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
+    """How far along the axis capsules first touch others (conservative advancement), in every frame."""
+    reach = np.empty(len(moving))
+    p, q = np.empty(3), np.empty(3)
+    for frame in range(len(moving)):
+        pairs = _pairs_in_line(moving[frame], moving_radii, still[frame], still_radii, axis[frame])
+        shift = FARTHEST
+        for _ in range(100):
+            gap = 1e9
+            for number in range(len(pairs)):
+                i, j = pairs[number, 0], pairs[number, 1]
+                for k in range(3):
+                    p[k] = moving[frame, i, 0, k] + shift * axis[frame, k]
+                    q[k] = moving[frame, i, 1, k] + shift * axis[frame, k]
+                near = gap + moving_radii[i] + still_radii[j]
+                squared = segment_distance_squared(p, q, still[frame, j, 0], still[frame, j, 1])
+                if near > 0.0 and squared < near * near:
+                    gap = np.sqrt(squared) - moving_radii[i] - still_radii[j]
+            # No point moves faster than the hand: so far it can go without a touch.
+            shift -= gap + _PRESS
+            if gap + _PRESS < 2e-5 or shift <= NEAREST:
+                break
+        reach[frame] = max(shift, NEAREST)
+    return reach
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
+    """Pairs whose bounding balls meet somewhere along the axis; the others never touch."""
+    pairs = np.empty((len(moving_radii) * len(still_radii), 2), dtype=np.int64)
+    count = 0
+    for i in range(len(moving_radii)):
+        for j in range(len(still_radii)):
+            along, apart, lengths = 0.0, 0.0, np.zeros(2)
+            for k in range(3):
+                between = 0.5 * (moving[i, 0, k] + moving[i, 1, k] - still[j, 0, k] - still[j, 1, k])
+                along += between * axis[k]
+                apart += between * between
+                lengths[0] += (moving[i, 1, k] - moving[i, 0, k]) ** 2
+                lengths[1] += (still[j, 1, k] - still[j, 0, k]) ** 2
+            reach = moving_radii[i] + still_radii[j] + 0.5 * (np.sqrt(lengths[0]) + np.sqrt(lengths[1]))
+            if apart - along * along < reach * reach:
+                pairs[count, 0], pairs[count, 1] = i, j
+                count += 1
+    return pairs[:count]
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def search_closing(ways: Any, parts: Any, obstacles: Any) -> Any:
+    """Share of its way that a digit can go before it meets something, in every frame."""
+    share = np.ones(len(ways.start))
+    near = np.empty(len(obstacles.radii), dtype=np.int64)
+    angles, bones, scratch = np.empty(4), np.empty((3, 2, 3)), np.empty((7, 3))
+    for frame in range(len(ways.start)):
+        wrist = ways.rotations[frame], ways.positions[frame]
+        count = _within_reach(wrist, parts, obstacles, frame, near)
+        if count == 0:
+            continue
+        bend = np.abs(ways.goal[frame] - ways.start[frame]).sum()
+        steps = max(1, int(np.ceil(bend / _STEP)))
+        low, high = 0.0, 1.0
+        for step in range(1, steps + _HALVINGS + 1):
+            tried = step / steps if step <= steps and high == 1.0 else (low + high) / 2
+            for hinge in range(4):
+                angles[hinge] = ways.start[frame, hinge] + tried * (
+                    ways.goal[frame, hinge] - ways.start[frame, hinge]
+                )
+            _bend(wrist, angles, parts, bones, scratch)
+            if _blocked(bones, parts, obstacles, frame, near[:count]):
+                high = min(tried, 1.0 - 1e-9)
+            else:
+                low = tried
+            if low >= 1.0 or (high - low) * bend < _PRECISION:
+                break
+        share[frame] = low
+    return share
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> int:
+    """Fill in which obstacles a digit can reach at all, and count them."""
+    knuckle = wrist[1].copy()
+    for row in range(3):
+        for column in range(3):
+            knuckle[row] += wrist[0][row, column] * parts.offsets[0, column]
+    count = 0
+    for j in range(len(obstacles.radii)):
+        reach = parts.reach + obstacles.radii[j]
+        a, b = obstacles.segments[frame, j, 0], obstacles.segments[frame, j, 1]
+        if segment_distance_squared(knuckle, knuckle, a, b) < reach * reach:
+            near[count] = j
+            count += 1
+    return count
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> bool:
+    for i in range(3):
+        for j in near:
+            if obstacles.meets[i, j]:
+                reach = parts.radii[i] + obstacles.radii[j] - obstacles.press
+                a, b = obstacles.segments[frame, j, 0], obstacles.segments[frame, j, 1]
+                if segment_distance_squared(bones[i, 0], bones[i, 1], a, b) < reach * reach:
+                    return True
+    return False
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
+    """Capsule axes (T, 3, 2, 3) of a digit at hinge angles (T, 4); wrists are rotations and positions."""
+    posed, scratch = np.empty((len(angles), 3, 2, 3)), np.empty((7, 3))
+    for frame in range(len(angles)):
+        _bend((wrists[0][frame], wrists[1][frame]), angles[frame], parts, posed[frame], scratch)
+    return posed
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _bend(wrist: Any, angles: Any, parts: Any, posed: Any, scratch: Any) -> None:
+    """Capsule axes `posed` (3, 2, 3) of a digit: the forward kinematics of `HandModel`, for one digit."""
+    frame, turned, origin = scratch[:3], scratch[3:6], scratch[6]
+    frame[:] = wrist[0]
+    origin[:] = wrist[1]
+    hinge = 0
+    for bone in range(3):
+        for row in range(3):
+            for column in range(3):
+                origin[row] += frame[row, column] * parts.offsets[bone, column]
+        _multiply(frame, parts.rotations[bone], turned)
+        for _ in range(2 if bone == 0 else 1):
+            _turn(frame, parts.axes[hinge], angles[hinge], turned)
+            hinge += 1
+        for end in range(2):
+            for row in range(3):
+                posed[bone, end, row] = origin[row]
+                for column in range(3):
+                    posed[bone, end, row] += frame[row, column] * parts.ends[bone, end, column]
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _multiply(frame: Any, rotation: Any, scratch: Any) -> None:
+    scratch[:] = frame
+    for row in range(3):
+        for column in range(3):
+            frame[row, column] = (
+                scratch[row, 0] * rotation[0, column]
+                + scratch[row, 1] * rotation[1, column]
+                + scratch[row, 2] * rotation[2, column]
+            )
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _turn(frame: Any, axis: Any, angle: Any, scratch: Any) -> None:
+    """Turn a frame about an axis of its own (Rodrigues' formula on its rows)."""
+    scratch[:] = frame
+    sine, cosine = np.sin(angle), np.cos(angle)
+    x, y, z = axis[0], axis[1], axis[2]
+    for row in range(3):
+        a, b, c = scratch[row, 0], scratch[row, 1], scratch[row, 2]
+        along = (1.0 - cosine) * (a * x + b * y + c * z)
+        frame[row, 0] = cosine * a + sine * (b * z - c * y) + along * x
+        frame[row, 1] = cosine * b + sine * (c * x - a * z) + along * y
+        frame[row, 2] = cosine * c + sine * (a * y - b * x) + along * z

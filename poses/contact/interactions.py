@@ -1,0 +1,213 @@
+"""How two hands meet: the interactions of `data/interactions.json`, and one course drawn from them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from handsim.errors import ArgumentError, choices
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import DIGITS, bones_of
+from handsim.space.transforms import MIRROR, euler_matrix
+from poses.shapes.couplings import HIGH, LOW
+from poses.shapes.library import gesture, gesture_names
+from poses.shapes.validity import is_valid, make_valid, resting_angles
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_FLEXION_NOISE: Final = np.deg2rad(4.0)
+_ABDUCTION_NOISE: Final = np.deg2rad(1.5)
+_NOISE: Final = np.tile([_ABDUCTION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE, _FLEXION_NOISE], len(DIGITS))
+_SNUG: Final = 0.0007  # self-penetration [m] up to which fingers may wander
+_WANDER: Final = 0.4  # noise from beat to beat, as a share of the noise that a whole interaction keeps
+
+
+@cache
+def library() -> dict[str, Any]:
+    """The data file."""
+    text = resources.files("poses").joinpath("data/interactions.json").read_text(encoding="utf-8")
+    data: dict[str, Any] = json.loads(text)
+    return data
+
+
+INTERACTIONS: Final[tuple[str, ...]] = tuple(library()["interactions"])
+"""Names of all interactions."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fingers:
+    """Hinge angles of one hand, a beat each."""
+
+    opened: Float[np.ndarray, "K 20"]
+    closed: Float[np.ndarray, "K 20"]
+    """Where the fingers would go if nothing were in the way."""
+    strength: Float[np.ndarray, "K 5"]
+    """Share of that way, a digit each."""
+
+    def at(self, beats: Float[np.ndarray, "T"]) -> Fingers:
+        """The same between beats."""
+        return Fingers(*(at_beats(keys, beats) for keys in (self.opened, self.closed, self.strength)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Meeting:
+    """One interaction as it was drawn: poses of the moving hand in the wrist frame of the still one."""
+
+    still: Fingers
+    moving: Fingers
+    rotations: Float[np.ndarray, "K 3"]
+    """Rotation vectors [rad], to be applied after `rotation`."""
+    rotation: Float[np.ndarray, "3 3"]
+    targets: Float[np.ndarray, "K 3"]
+    """Points of the still hand [m]."""
+    anchors: Float[np.ndarray, "K 3"]
+    """Points of the moving hand [m] that are laid on them."""
+    axis: Float[np.ndarray, "3"]
+    """Direction in which the moving hand backs off."""
+
+    def placement(self, beats: Float[np.ndarray, "T"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist before it backs off."""
+        turns = Rotation.from_rotvec(at_beats(self.rotations, beats)).as_matrix()
+        rotations = turns @ self.rotation
+        anchors = np.einsum("tij,tj->ti", rotations, at_beats(self.anchors, beats))
+        return rotations, at_beats(self.targets, beats) - anchors
+
+
+def at_beats(keys: Float[np.ndarray, "K *n"], beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
+    """Values between keys, `beats` counting keys from 0."""
+    low = np.minimum(beats.astype(int), max(len(keys) - 2, 0))
+    share = (beats - low)[:, None]
+    values: NDArray[np.float64] = keys[low] + share * (keys[np.minimum(low + 1, len(keys) - 1)] - keys[low])
+    return values
+
+
+def check_names(names: tuple[str, ...]) -> None:
+    """Raise a `ArgumentError` that lists the valid names when one is unknown, or when there is none."""
+    if not names:
+        raise ArgumentError(f"no interactions were named; valid names: {', '.join(INTERACTIONS)}")
+    for name in names:
+        if name not in INTERACTIONS:
+            raise ArgumentError(choices(name, INTERACTIONS, noun="interaction"))
+
+
+def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
+    """One of the ways in which an interaction is described."""
+    variants = library()["interactions"][name]
+    variant: dict[str, Any] = variants[rng.integers(len(variants))]
+    return variant
+
+
+def draw_meeting(
+    variant: dict[str, Any],
+    still: HandModel,
+    moving: HandModel,
+    count: int,
+    *,
+    together: bool,
+    rng: np.random.Generator,
+) -> Meeting:
+    """Random places, orientations and fingers for `count` beats.
+
+    Args:
+        variant: Its description, of `draw_variant`.
+        still: The hand that holds still.
+        moving: The other hand, of the other side.
+        count: Beats.
+        together: Whether beats belong to one meeting, and so resemble each other, or are apart.
+        rng: Source of all randomness.
+    """
+    noise = _Noise(count, together, rng)
+    mirror = np.eye(3) if still.shape.side == "right" else MIRROR
+    fingers = [
+        _draw_fingers(model, variant[role], variant["relaxing"], noise, rng)
+        for model, role in ((still, "still"), (moving, "moving"))
+    ]
+    targets = np.tile(variant["target"], (count, 1))
+    targets[:, :2] += noise.around(np.array(variant["jitter"]), 0.0) + _places(variant, count, rng)
+    tilts = noise.around(np.deg2rad(variant["tilt"]), 0.3)
+    axis = np.array(variant["axis"], dtype=np.float64) @ mirror
+    return Meeting(
+        still=fingers[0],
+        moving=fingers[1],
+        rotations=-tilts[:, ::-1] @ mirror if still.shape.side == "left" else tilts[:, ::-1],
+        rotation=mirror @ euler_matrix(np.deg2rad(variant["rotation"])) @ mirror,
+        targets=still.shape.length * targets @ mirror,
+        anchors=_anchors(variant["anchor"], moving, fingers[1].opened),
+        axis=axis / np.linalg.norm(axis),
+    )
+
+
+class _Noise:
+    """Gaussian noise with a part that all beats share, clipped at two standard deviations."""
+
+    def __init__(self, count: int, together: bool, rng: np.random.Generator) -> None:
+        self.count, self.together, self.rng = count, together, rng
+
+    def around(
+        self, scale: NDArray[np.float64], wander: float, *, common: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Noise (K, n): `common` standard deviations `scale` (n,) that last, `wander` new at each beat."""
+        size = (self.count, len(scale))
+        lasting = np.clip(self.rng.standard_normal((1, size[1]) if self.together else size), -2.0, 2.0)
+        new = np.clip(self.rng.standard_normal(size), -2.0, 2.0)
+        noise: NDArray[np.float64] = scale * (common * lasting + wander * new)
+        return noise
+
+
+def _places(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Places (K, 2) of the beats around the middle one."""
+    reach = np.array(variant["place"])
+    if variant["pattern"] == "random":
+        return reach * rng.uniform(-1.0, 1.0, size=(count, 2))
+    side = (-1.0) ** np.arange(count)[:, None]
+    direction = reach * np.array([1.0, rng.uniform(-1.0, 1.0)])
+    places: NDArray[np.float64] = side * direction * rng.uniform(0.6, 1.0, size=(count, 1))
+    return places
+
+
+def _draw_fingers(
+    model: HandModel, role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
+) -> Fingers:
+    weaker = rng.random((noise.count, len(DIGITS))) < relaxing
+    strength = np.where(weaker, rng.uniform(0.4, 1.0, size=weaker.shape), 1.0)
+    opened = _angles(role["open"]) + noise.around(_NOISE, 0.0)
+    closed = _angles(role["closed"]) + noise.around(_NOISE, 0.0)
+    lasting = _loosened(model, make_valid(model, np.clip(opened, LOW, HIGH)))
+    wandering = np.clip(lasting + _WANDER * noise.around(_NOISE, 1.0, common=0.0), LOW, HIGH)
+    valid = is_valid(model, wandering, max_penetration=_SNUG)
+    return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
+
+
+def _loosened(model: HandModel, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Valid poses, those that press hard into themselves a little nearer to rest: fingers need room."""
+    hard = ~is_valid(model, angles, max_penetration=_SNUG)
+    angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
+    return angles
+
+
+def _angles(name: str) -> NDArray[np.float64]:
+    """Hinge angles [rad] of a gesture, or of a hand that only this data file knows."""
+    if name in gesture_names():
+        return gesture(name)
+    return np.deg2rad(np.array(library()["hands"][name], dtype=np.float64).ravel())
+
+
+def _anchors(
+    anchor: str | list[float], moving: HandModel, opened: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Points (K, 3) of the moving hand in its wrist frame [m]."""
+    if isinstance(anchor, str):
+        bone = bones_of(anchor)[-1]
+        frames = moving.forward_kinematics(join_qpos(opened))[:, bone]
+        tips: NDArray[np.float64] = frames[:, :3, 3] + moving.skeleton.lengths[bone] * frames[:, :3, 0]
+        return tips
+    mirror = MIRROR if moving.shape.side == "left" else np.eye(3)
+    return np.tile(moving.shape.length * np.array(anchor) @ mirror, (len(opened), 1))

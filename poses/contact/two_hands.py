@@ -1,0 +1,209 @@
+"""Two hands that meet, clasp, clap, rub, point and part: smooth motions, and single poses drawn from them.
+
+The contact is solved, not played back: for each frame the moving hand backs off until it just touches, and
+fingers close until they meet something. Both are smoothed towards the free side, every frame is checked, and
+what fails is drawn again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from handsim.errors import ArgumentError
+from handsim.hand.contact import overlap_between
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.motion import HandMotion
+from handsim.space.cameras import ROOM_CENTER
+from handsim.space.transforms import random_quaternions, rotation_quaternions
+from poses.contact.interactions import INTERACTIONS, check_names
+from poses.contact.meetings import (
+    Passage,
+    TwoHandConfig,
+    draw_poses,
+    join_passages,
+    play_meeting,
+    way_between,
+)
+from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
+from poses.motion.wrist_paths import along
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+__all__ = [
+    "INTERACTIONS",
+    "TwoHandConfig",
+    "sample_two_hand_motion",
+    "sample_two_hand_poses",
+    "two_hands_penetration",
+]
+
+_TRAVEL_TIME: Final = (0.8, 2.5)  # between two places of the pair [s]
+_TURN: Final = 0.5  # spread of the turn between two places [rad]
+_MOST_DRAWS: Final = 60
+_MOST_WAYS: Final = 10
+
+
+def two_hands_penetration(
+    right: HandModel,
+    left: HandModel,
+    right_qpos: Float[np.ndarray, "T 27"],
+    left_qpos: Float[np.ndarray, "T 27"],
+) -> Float[np.ndarray, "T"]:
+    """Deepest overlap of any capsule of one hand with any of the other [m]; 0 where they do not touch."""
+    overlap = overlap_between(
+        right.capsules,
+        right.forward_kinematics(right_qpos),
+        left.capsules,
+        left.forward_kinematics(left_qpos),
+    )
+    depth: NDArray[np.float64] = np.maximum(overlap, 0.0)
+    return depth
+
+
+def sample_two_hand_motion(
+    right: HandModel,
+    left: HandModel,
+    duration: float,
+    config: TwoHandConfig | None = None,
+    *,
+    interactions: Sequence[str] | None = None,
+    rng: np.random.Generator,
+) -> tuple[HandMotion, HandMotion]:
+    """Random smooth motion of two hands through a series of interactions, valid at every frame.
+
+    Args:
+        right: A right hand.
+        left: A left hand; it may be another person's.
+        duration: How long [s]; each motion has `round(duration * rate) + 1` frames.
+        config: Speeds and places; human ones when not given.
+        interactions: Names out of `INTERACTIONS`; all of them when not given.
+        rng: Source of all randomness.
+
+    Raises:
+        ArgumentError: The duration is not positive, an interaction is unknown, the hands are not a right and
+            a
+            left one, or no valid way to bring them together was found.
+    """
+    config = config or TwoHandConfig()
+    names = INTERACTIONS if interactions is None else tuple(interactions)
+    check_names(names)
+    _check_sides(right, left)
+    if not 0.0 < duration < np.inf:
+        raise ArgumentError(f"the duration is {duration:g} s, expected a positive number")
+    frames = round(duration * config.rate) + 1
+    passages = _next_passages(right, left, None, names, config, rng=rng)
+    while sum(map(len, passages)) < frames:
+        passages += _next_passages(right, left, passages[-1].at([-1]), names, config, rng=rng)
+    whole = join_passages(passages).at(slice(frames))
+    right_qpos, left_qpos = _in_world(whole, *_travel(frames, config, rng))
+    return HandMotion(right_qpos, config.rate), HandMotion(left_qpos, config.rate)
+
+
+def sample_two_hand_poses(
+    right: HandModel, left: HandModel, count: int, *, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "T 27"], Float[np.ndarray, "T 27"]]:
+    """Single poses of two hands that touch or nearly do, each drawn on its own, all valid.
+
+    Args:
+        right: A right hand.
+        left: A left hand; it may be another person's.
+        count: How many.
+        rng: Source of all randomness.
+
+    Returns:
+        qpos of the right hand and of the left one.
+
+    Raises:
+        ArgumentError: The count is not positive, the hands are not a right and a left one, or no valid poses
+            were found.
+    """
+    _check_sides(right, left)
+    if count < 1:
+        raise ArgumentError(f"the count of poses is {count}, expected a positive number")
+    passages: list[Passage] = []
+    missing = count
+    for _ in range(_MOST_DRAWS):
+        # Each name twice, since roles are drawn once a batch; more than wanted, since some will fail.
+        batches = rng.multinomial(
+            missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
+        )
+        for name, size in zip(2 * INTERACTIONS, batches, strict=True):
+            if size:
+                passages.append(draw_poses(right, left, name, int(size), rng=rng))
+        missing = count - sum(map(len, passages))
+        if missing <= 0:
+            whole = join_passages(passages)
+            whole = whole.at(rng.permutation(len(whole))[:count])
+            volume = TwoHandConfig().volume
+            places = ROOM_CENTER + rng.uniform(-volume, volume, size=(count, 3))
+            return _in_world(whole, places, Rotation.from_quat(random_quaternions(count, rng=rng)))
+    raise ArgumentError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
+
+
+def _next_passages(
+    right: HandModel,
+    left: HandModel,
+    last: Passage | None,
+    names: tuple[str, ...],
+    config: TwoHandConfig,
+    *,
+    rng: np.random.Generator,
+) -> list[Passage]:
+    """The way from the last frame to a meeting, and the meeting."""
+    name = names[rng.integers(len(names))]
+    for _ in range(_MOST_DRAWS):
+        meeting = play_meeting(right, left, name, config, rng=rng)
+        if meeting is None:
+            continue
+        if last is None:
+            return [meeting]
+        for _ in range(_MOST_WAYS):
+            way = way_between(right, left, last, meeting.at([0]), config, rng=rng)
+            if way is not None:
+                return [way, meeting]
+    raise ArgumentError(f"no valid way was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
+
+
+def _travel(
+    frames: int, config: TwoHandConfig, rng: np.random.Generator
+) -> tuple[NDArray[np.float64], Rotation]:
+    """Positions (T, 3) and orientations of a pair of hands that goes from place to place."""
+    places = [ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)]
+    turns, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
+    while sum(map(len, shares)) < frames:
+        places.append(ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3))
+        turns.append(turns[-1] * Rotation.from_rotvec(rng.normal(scale=_TURN, size=3)))
+        distance = float(np.linalg.norm(places[-1] - places[-2]))
+        seconds = max(rng.uniform(*_TRAVEL_TIME), PEAK_SPEED * distance / config.wrist_speed)
+        shares.append(len(places) - 2 + minimum_jerk(int(np.ceil(seconds * config.rate))))
+    return along(np.array(places), Rotation.concatenate(turns), np.concatenate(shares)[:frames])
+
+
+def _in_world(
+    whole: Passage, middle: NDArray[np.float64], turns: Rotation
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Both hands' qpos from the middle of their wrists and the right one's orientation."""
+    across = turns.apply(whole.position) / 2
+    rotations = turns.as_matrix()
+    return (
+        join_qpos(whole.right, position=middle - across, quaternion=rotation_quaternions(rotations)),
+        join_qpos(
+            whole.left,
+            position=middle + across,
+            quaternion=rotation_quaternions(rotations @ whole.rotation),
+        ),
+    )
+
+
+def _check_sides(right: HandModel, left: HandModel) -> None:
+    sides = right.shape.side, left.shape.side
+    if sides != ("right", "left"):
+        raise ArgumentError(
+            f"the hands are a {sides[0]} and a {sides[1]} one, expected a right and a left one"
+        )

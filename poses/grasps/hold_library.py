@@ -1,0 +1,192 @@
+"""Named ways to hold things, in `data/holds.json`, and where they put a thing in a certain hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim.errors import ArgumentError, choices
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import BONE_NAMES, DIGITS
+from handsim.space.objects import RigidObject
+from handsim.space.transforms import MIRROR, quaternion_matrix, vector_quaternions
+from poses.grasps.grasp_scene import GraspScene
+from poses.grasps.retargeting import retarget_angles
+from poses.shapes.library import gesture
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_GAP: Final = 0.0005  # [m] between palm and object before the fingers close
+_SLIDE: Final = 0.15  # [m] from where an object comes up to the palm
+_HALVINGS: Final = 12
+_ANY: Final = "any"  # the entry for things that have none of their own
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HoldStyle:
+    """One way to hold one thing."""
+
+    name: str
+    open: Float[np.ndarray, "20"]
+    """Angles [rad] before the fingers close."""
+    closed: Float[np.ndarray, "20"]
+    """Where the motors pull [rad]."""
+    strength: Float[np.ndarray, "20"]
+    """Share of the motors' torques."""
+    palm_up: float
+    """Share of its weight with which the thing lies in the palm while the fingers close."""
+    needs: tuple[str, ...]
+    """Bones or digits that must touch."""
+    fingers: int
+    """How many fingers must touch."""
+    free: tuple[str, ...]
+    """Digits that may leave the thing."""
+    press: tuple[str, ...]
+    """Digits that may tap on it."""
+    scribble: float
+    """How far a writing wrist goes [m]; 0 for what does not write."""
+    entry: dict[str, Any]
+    """The rest of its entry: place, axes and what varies."""
+
+
+def hold_names(obj: RigidObject) -> tuple[str, ...]:
+    """Names of the ways to hold a thing; one loaded from a file knows one way, `"grasp"`."""
+    return tuple(_holds(obj))
+
+
+@lru_cache(maxsize=64)
+def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
+    """A way to hold a thing, with the angles that bring this hand's tips where the mean hand has them.
+
+    Raises:
+        ArgumentError: It is not held so.
+    """
+    holds = _holds(obj)
+    if name not in holds:
+        raise ArgumentError(choices(name, holds, noun=f"hold of the {obj.name}"))
+    entry = holds[name]
+    opened = _angles(gesture(entry["open"]["gesture"]), entry["open"])
+    closed = _angles(opened, entry["closed"])
+    return HoldStyle(
+        name=name,
+        open=retarget_angles(model, opened),
+        closed=retarget_angles(model, closed),
+        strength=np.repeat(entry["strength"], 4),
+        palm_up=entry["palm_up"],
+        needs=tuple(entry["needs"]),
+        fingers=entry["fingers"],
+        free=tuple(entry["free"]),
+        press=tuple(entry["press"]),
+        scribble=1e-3 * entry.get("scribble", 0.0),
+        entry=entry,
+    )
+
+
+@cache
+def _library() -> dict[str, Any]:
+    text = resources.files("poses").joinpath("data/holds.json").read_text(encoding="utf-8")
+    library: dict[str, Any] = json.loads(text)["objects"]
+    return library
+
+
+def _holds(obj: RigidObject) -> dict[str, Any]:
+    library = _library()
+    holds: dict[str, Any] = library.get(obj.name, library[_ANY])
+    return holds
+
+
+def _angles(start: NDArray[np.float64], digits: dict[str, Any]) -> NDArray[np.float64]:
+    angles = start.copy()
+    for place, digit in enumerate(DIGITS):
+        if digit in digits:
+            angles[4 * place : 4 * place + 4] = np.deg2rad(digits[digit])
+    return angles
+
+
+def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> NDArray[np.float64]:
+    """`T_wrist_object` (4, 4) before the fingers close, varied as the style says."""
+    model, obj, entry = scene.hand, scene.obj, style.entry
+    mirror = MIRROR if model.shape.side == "left" else np.eye(3)
+    place, vary = entry["place"], entry["vary"]
+    frame = np.eye(4) if obj.name in _library() else _box_frame(obj)
+    point = 1e-3 * np.array(place["point"], dtype=np.float64)
+    point[2] += 1e-3 * rng.uniform(*vary["along"])
+    bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
+    pose = np.eye(4)
+    # All is placed for a right hand, then mirrored.
+    if "between" in place:
+        at = np.mean([_landmark(model, bones, mark) for mark in place["between"]], axis=0) @ mirror
+        back = _landmark(model, bones, place["through"]) @ mirror
+        z = back - at
+        x = _turned_about(z, rng.uniform(0.0, 2 * np.pi))
+    else:
+        length, breadth = model.shape.length, model.shape.breadth
+        at = np.array([place["under"][0] * length, place["under"][1] * breadth, 0.0])
+        x, z = (np.array(entry["axes"][name], dtype=np.float64) for name in "xz")
+    z /= np.linalg.norm(z)
+    y = np.cross(z, x)
+    y /= np.linalg.norm(y)
+    rotation = np.stack([np.cross(y, z), y, z], axis=1)
+    jitter = vector_quaternions(np.deg2rad(vary["angle"]) * np.clip(rng.standard_normal((1, 3)), -1.5, 1.5))
+    rotation = quaternion_matrix(jitter)[0] @ rotation
+    at = at + 1e-3 * vary["place"] * np.clip(rng.standard_normal(3), -1.5, 1.5)
+    pose[:3, :3] = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
+    pose[:3, 3] = mirror @ (at - rotation @ point)
+    pose = pose @ np.linalg.inv(frame)
+    return pose if "between" in place else _slid_to_palm(scene, style, pose)
+
+
+def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
+    """Middle of a thing's bounding box, x along its shortest side and z along its longest."""
+    low, high = obj.vertices.min(axis=0), obj.vertices.max(axis=0)
+    shortest, _, longest = np.argsort(high - low, kind="stable")
+    x, z = np.eye(3)[shortest], np.eye(3)[longest]
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), (low + high) / 2
+    return frame
+
+
+def _turned_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    axis = axis / np.linalg.norm(axis)
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    turned: NDArray[np.float64] = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
+    return turned
+
+
+def _landmark(
+    model: HandModel, bones: NDArray[np.float64], mark: tuple[str, float, float, float]
+) -> NDArray[np.float64]:
+    """Place on a bone in the wrist's frame, for either side."""
+    name, along, sideways, back = mark
+    number = BONE_NAMES.index(name)
+    radius = model.capsules.radii[model.capsules.bones == number][0]
+    sideways = -sideways if model.shape.side == "left" else sideways
+    local = np.array([along * model.skeleton.lengths[number], sideways * radius, back * radius])
+    world: NDArray[np.float64] = bones[number, :3, :3] @ local + bones[number, :3, 3]
+    return world
+
+
+def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The object brought up from below until it almost touches the palm."""
+    palm = [scene.mj_model.geom(geom).name.startswith("palm") for geom in scene.hand_geoms]
+
+    def gap(height: float) -> float:
+        raised = pose.copy()
+        raised[2, 3] += height
+        data = scene.new_data(style.open, raised)
+        return float(scene.distances(data)[palm].min())
+
+    low, high = -_SLIDE, 0.0  # free, too high
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if gap(middle) > _GAP else (low, middle)
+    pose[2, 3] += low
+    return pose

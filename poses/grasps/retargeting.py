@@ -1,0 +1,57 @@
+"""The same pose on another hand: its finger tips go where those of a hand of mean proportions are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.hand.jacobian import skinned_jacobian
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import shape_from_measures
+from handsim.hand.topology import DIGITS, bones_of
+from poses.shapes.couplings import HIGH, LOW
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_ROUNDS: Final = 12
+_STIFFNESS: Final = 0.006  # [m/rad]: by how much a tip may miss so that a joint need not turn
+_LONGEST_STEP: Final = 0.2  # [rad]
+
+
+def retarget_angles(model: HandModel, angles: Float[np.ndarray, "20"]) -> Float[np.ndarray, "20"]:
+    """Hinge angles [rad] that bring the last joints and the tips of a hand where the mean hand has them.
+
+    The mean hand has the same length and breadth. What is given is what the mean hand does; it changes as
+    little as the other proportions ask for.
+    """
+    shape = model.shape
+    mean = HandModel(shape_from_measures(shape.length, shape.breadth, side=shape.side))
+    wanted = _marks(mean, angles)[0]
+    found = angles.copy()
+    for _ in range(_ROUNDS):
+        placed, jacobian = _marks(model, found)
+        misses = np.concatenate([(wanted - placed).ravel(), _STIFFNESS * (angles - found)])
+        slopes = np.concatenate([jacobian.reshape(-1, len(angles)), _STIFFNESS * np.eye(len(angles))])
+        step = np.linalg.lstsq(slopes, misses, rcond=None)[0]
+        found = np.clip(found + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP), LOW, HIGH)
+    return found
+
+
+def _marks(model: HandModel, angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Last joints and tips (10, 3) in the wrist's frame [m], and their derivative (10, 3, 20)."""
+    last = np.array([bones_of(digit)[2] for digit in DIGITS])
+    rest = model.rest_transforms[last]
+    tips = rest[:, :3, 3] + model.skeleton.lengths[last, None] * rest[:, :3, 0]
+    points = np.concatenate([rest[:, :3, 3], tips])
+    indices = np.zeros((len(points), 4), dtype=np.int64)
+    indices[:, 0] = np.tile(last, 2)
+    weights = np.zeros((len(points), 4))
+    weights[:, 0] = 1.0
+    bones = model.forward_kinematics(join_qpos(angles[None]))
+    carried = bones[0, indices[:, 0]] @ np.linalg.inv(model.rest_transforms[indices[:, 0]])
+    placed = np.einsum("mij,mj->mi", carried[:, :3, :3], points) + carried[:, :3, 3]
+    jacobian = skinned_jacobian(model, bones, points, indices, weights)[0, ..., 6:]
+    return placed, jacobian

@@ -1,0 +1,149 @@
+"""Smooth motion through valid poses, at speeds a human hand reaches, valid at every frame.
+
+Between two poses every joint follows the minimum-jerk profile of human reaching (Flash and Hogan 1985). A way
+that digs into the hand is taken over rest instead, some digits ahead of the others where need be.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim._checks import check_array
+from handsim.errors import ArgumentError
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.motion import HandMotion
+from handsim.hand.topology import NUM_JOINTS
+from poses.motion.minimum_jerk import MotionConfig, held, minimum_jerk, straight_way
+from poses.motion.rest_paths import way_to_rest
+from poses.motion.wrist_paths import free_wrist_path
+from poses.shapes.validity import MAX_PENETRATION, is_valid, resting_angles, sample_valid_angles
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+__all__ = ["MotionConfig", "minimum_jerk", "motion_through", "sample_motion"]
+
+_MOST_DRAWS: Final = 25
+_POSES_A_DRAW: Final = 8
+
+
+def sample_motion(
+    model: HandModel, duration: float, config: MotionConfig | None = None, *, rng: np.random.Generator
+) -> HandMotion:
+    """Random smooth motion of one hand through valid poses, valid at every frame.
+
+    Args:
+        model: The hand.
+        duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
+        config: Speeds and places; human ones when not given.
+        rng: Source of all randomness.
+
+    Raises:
+        ArgumentError: The duration is not positive or less than a step, this hand has no room for its
+            fingers,
+            or no way leads out of a pose.
+    """
+    config = config or MotionConfig()
+    frames = count_frames(duration, config)
+    angles = sample_valid_angles(model, 1, rng=rng)
+    parts, count = [angles], 1
+    while count < frames:
+        part = _next_way(model, parts[-1][-1], config, rng)
+        parts.append(part)
+        count += len(part)
+    return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
+
+
+def motion_through(
+    model: HandModel,
+    poses: Float[np.ndarray, "K 20"],
+    config: MotionConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> HandMotion:
+    """Smooth motion of one hand from each of the given poses to the next, valid at every frame.
+
+    It begins in the first pose and rests for a moment at each later one; how long a way takes and where the
+    wrist goes is drawn.
+
+    Args:
+        model: The hand.
+        poses: Hinge angles [rad], at least two poses.
+        config: Speeds and places; human ones when not given.
+        rng: Source of all randomness.
+
+    Raises:
+        ArgumentError: There are less than two poses, one is not valid on this hand, or no way leads out of
+            one.
+    """
+    config = config or MotionConfig()
+    poses = check_array("poses", poses, (None, NUM_JOINTS))
+    if poses.ndim != 2 or len(poses) < 2:
+        raise ArgumentError(f"poses has shape {poses.shape}, expected at least two poses, (K, {NUM_JOINTS})")
+    valid = is_valid(model, poses)
+    if not valid.all():
+        raise ArgumentError(
+            f"pose {valid.argmin()} of {len(poses)} is not valid on this hand: out of range or deeper than "
+            f"{1e3 * MAX_PENETRATION:g} mm in itself, expected what poses.shapes.validity.make_valid returns"
+        )
+    angles = np.concatenate([poses[:1], angles_through(model, poses, config, rng=rng)])
+    return with_wrist(angles, config, rng=rng)
+
+
+def count_frames(duration: float, config: MotionConfig) -> int:
+    """Frames of a motion of this duration [s], the first one included.
+
+    Raises:
+        ArgumentError: The duration is not positive, or less than half a step.
+    """
+    steps = duration * config.rate
+    if not np.isfinite(steps) or round(steps) < 1:
+        raise ArgumentError(
+            f"the motion is {duration:g} s long, expected a number of at least one step at {config.rate:g} Hz"
+        )
+    return round(steps) + 1
+
+
+def angles_through(
+    model: HandModel, poses: Float[np.ndarray, "K 20"], config: MotionConfig, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 20"]:
+    """Valid frames from the first of these valid poses (left out) to the last, a hold at each."""
+    ways = [straight_way(start, target, config, rng) for start, target in pairwise(poses)]
+    ends = np.cumsum([len(way) for way in ways])
+    valid = np.split(is_valid(model, np.concatenate(ways)), ends[:-1])
+    for number, direct in enumerate(valid):
+        if not direct.all():
+            out = way_to_rest(model, poses[number], config, rng)
+            back = way_to_rest(model, poses[number + 1], config, rng)[-2::-1]
+            ways[number] = np.concatenate([out, back, poses[number + 1 : number + 2]])
+    return np.concatenate([held(way, config, rng) for way in ways])
+
+
+def _next_way(
+    model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Frames from one pose to another and a hold there, all valid."""
+    resting = resting_angles(model)
+    for _ in range(_MOST_DRAWS):
+        for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
+            direct = straight_way(start, target, config, rng)
+            if is_valid(model, direct).all():
+                return held(direct, config, rng)
+            around = np.concatenate(
+                [straight_way(start, resting, config, rng), straight_way(resting, target, config, rng)]
+            )
+            if is_valid(model, around).all():
+                return held(around, config, rng)
+    return held(way_to_rest(model, start, config, rng), config, rng)
+
+
+def with_wrist(
+    angles: Float[np.ndarray, "T 20"], config: MotionConfig, *, rng: np.random.Generator
+) -> HandMotion:
+    """The motion of these hinge angles [rad] by a hand whose wrist goes from place to place."""
+    position, quaternion = free_wrist_path(len(angles), config, rng=rng)
+    return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)

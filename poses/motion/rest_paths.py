@@ -1,0 +1,72 @@
+"""Ways to rest that do not dig into the hand: straight where possible, else with stops."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.errors import ArgumentError
+from handsim.hand.model import HandModel
+from handsim.hand.topology import DIGITS, NUM_JOINTS
+from poses.motion.minimum_jerk import MotionConfig, straight_way
+from poses.shapes.couplings import HIGH, LOW
+from poses.shapes.library import gesture
+from poses.shapes.validity import is_valid, resting_angles
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy.typing import NDArray
+
+# Which digits go ahead of the others on a way to rest: all at once, one before the others, one after them.
+_AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [
+    np.repeat((np.arange(len(DIGITS)) == digit) == first, 4)
+    for first in (True, False)
+    for digit in range(len(DIGITS))
+]
+_ROUNDS: Final = 2
+_FANS: Final = (0.0, 0.3, 0.6, 1.0, 1.6)  # how far the fingers part before, in shares of the gesture "spread"
+
+
+def way_to_rest(
+    model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Valid frames from a pose to rest, the straight way or the first detour that does not dig in."""
+    # Each round draws other paces, and so other frames: what grazes the limit may pass.
+    for stops in chain(*(_detours(start, resting_angles(model)) for _ in range(_ROUNDS))):
+        way = np.concatenate([straight_way(*pair, config, rng) for pair in pairwise([start, *stops])])
+        if is_valid(model, way).all():
+            return way
+    raise ArgumentError("no valid way leads from one of the poses to this hand's rest")
+
+
+def _detours(start: NDArray[np.float64], resting: NDArray[np.float64]) -> Iterator[list[NDArray[np.float64]]]:
+    """Stops on ways to rest: fingers part first or not, the thumb swings out or not, a digit goes ahead."""
+    spread = gesture("spread")
+    fan = np.where(np.arange(NUM_JOINTS) % 4 == 0, spread - gesture("flat"), 0.0)
+    fan[:4] = 0.0
+    hubs = [np.concatenate([thumb[:4], resting[4:]]) for thumb in (resting, spread, gesture("claw"))]
+    for hub in hubs:
+        for share in _FANS:
+            parted, opened = (np.clip(pose + share * fan, LOW, HIGH) for pose in (start, hub))
+            for ahead in _AHEAD:
+                stops = [parted, np.where(ahead, opened, parted), opened, resting]
+                legs = pairwise([start, *stops])
+                yield [stop for before, stop in legs if not np.array_equal(before, stop)] or [resting]
+
+
+def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.ndarray, "K"]:
+    """Which of these valid poses a hand finds a valid way out of, and so into."""
+    shares = np.linspace(0.0, 1.0, 32)[:, None]
+    ways = poses[:, None] + shares * (resting_angles(model) - poses[:, None])
+    valid: NDArray[np.bool_] = is_valid(model, ways.reshape(-1, NUM_JOINTS))
+    free: NDArray[np.bool_] = np.all(valid.reshape(-1, len(shares)), axis=1)
+    one_pace, unused = MotionConfig(durations=(0.4, 0.4)), np.random.default_rng(0)
+    for number in np.flatnonzero(~free):
+        with contextlib.suppress(ArgumentError):
+            way_to_rest(model, poses[number], one_pace, unused)
+            free[number] = True
+    return free

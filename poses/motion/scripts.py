@@ -1,0 +1,127 @@
+"""Motions with a purpose: spelling, counting, touching, typing, as written in `data/scripts.json`."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim.errors import ArgumentError, choices
+from handsim.hand.model import HandModel
+from handsim.hand.motion import HandMotion
+from handsim.hand.topology import NUM_JOINTS
+from poses.motion.minimum_jerk import MotionConfig
+from poses.motion.motions import angles_through, count_frames, sample_motion, with_wrist
+from poses.motion.rest_paths import can_be_left
+from poses.shapes.library import gesture, gestures_of
+from poses.shapes.touch import touching_angles
+from poses.shapes.validity import make_valid
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+FREE: Final = "free"
+"""The script of no script: what `sample_motion` makes."""
+_POSES_AT_ONCE: Final = 16
+
+
+@cache
+def _scripts() -> dict[str, dict[str, Any]]:
+    text = resources.files("poses").joinpath("data/scripts.json").read_text(encoding="utf-8")
+    scripts: dict[str, dict[str, Any]] = json.loads(text)["scripts"]
+    return scripts
+
+
+def script_names() -> tuple[str, ...]:
+    """Names of all scripts."""
+    return tuple(_scripts())
+
+
+def scripted_motion(
+    model: HandModel,
+    script: str,
+    duration: float,
+    config: MotionConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> HandMotion:
+    """Smooth motion of one hand that follows a named script, valid at every frame.
+
+    Args:
+        model: The hand.
+        script: One of `script_names`.
+        duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
+        config: Speeds and places; human ones when not given. A script keeps its own pace: but for "free",
+            `durations` and `hold` are the script's.
+        rng: Source of all randomness.
+
+    Raises:
+        ArgumentError: There is no such script, the duration is not positive or less than a step, or this hand
+            cannot do what the script asks for.
+    """
+    if script not in _scripts():
+        raise ArgumentError(choices(script, _scripts(), noun="script"))
+    if script == FREE:
+        return sample_motion(model, duration, config, rng=rng)
+    entry = _scripts()[script]
+    config = dataclasses.replace(
+        config or MotionConfig(), durations=tuple(entry["durations"]), hold=entry["hold"]
+    )
+    frames = count_frames(duration, config)
+    poses = script_poses(model, script)
+    at = int(rng.integers(len(poses)))
+    parts, count = [poses[at : at + 1]], 1
+    while count < frames:
+        turns = _turns(at, len(poses), entry["order"], rng)
+        parts.append(angles_through(model, poses[turns], config, rng=rng))
+        count, at = count + len(parts[-1]), int(turns[-1])
+    return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
+
+
+def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
+    """The poses [rad] a script goes through, as this hand can strike them.
+
+    Touches that this hand's thumb cannot reach and poses that it finds no valid way out of are left out.
+
+    Raises:
+        ArgumentError: There is no such script, it has no poses of its own, or this hand can strike none of
+            them.
+    """
+    if script not in _scripts() or script == FREE:
+        raise ArgumentError(choices(script, [name for name in _scripts() if name != FREE], noun="script"))
+    entry = _scripts()[script]
+    if "touches" in entry:
+        poses = _touches(model, entry["touches"])
+    elif "library" in entry:
+        poses = make_valid(model, gestures_of(entry["library"]))
+    else:
+        poses = make_valid(model, np.stack([gesture(name) for name in entry["gestures"]]))
+    poses = poses[np.flatnonzero(can_be_left(model, poses))]
+    if len(poses) < 2:
+        raise ArgumentError(f"this hand can strike {len(poses)} poses of '{script}', expected at least 2")
+    return poses
+
+
+def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
+    found: list[NDArray[np.float64]] = []
+    for finger in fingers:
+        with contextlib.suppress(ArgumentError):  # another finger will do
+            found.append(touching_angles(model, finger))
+    touches: NDArray[np.float64] = np.array(found).reshape(-1, NUM_JOINTS)
+    return touches
+
+
+def _turns(at: int, count: int, order: str, rng: np.random.Generator) -> Int[np.ndarray, "N"]:
+    """Which poses come next, the present one first."""
+    if order == "in turn":
+        steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
+    else:
+        steps = rng.integers(1, count, size=_POSES_AT_ONCE)
+    turns: NDArray[np.int64] = (at + np.concatenate([[0], np.cumsum(steps)])) % count
+    return turns

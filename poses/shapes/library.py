@@ -1,0 +1,85 @@
+"""Named hand shapes: joint angles written by us, one file a library in `data`."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim.errors import ArgumentError, choices
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+LIBRARIES: Final = ("gestures", "fingerspelling", "numbers", "counting", "grasps", "pinches", "keys")
+"""Names of all libraries; no two hold the same name."""
+_SPREAD: Final = np.array([12.0, 2.0, -8.0, -18.0])  # [deg] index to little, positive towards the thumb
+
+
+@cache
+def _data(library: str) -> dict[str, Any]:
+    text = resources.files("poses").joinpath(f"data/{library}.json").read_text(encoding="utf-8")
+    data: dict[str, Any] = json.loads(text)
+    return data
+
+
+@cache
+def _library(library: str) -> dict[str, NDArray[np.float64]]:
+    if library not in LIBRARIES:
+        raise ArgumentError(choices(library, LIBRARIES, noun="library"))
+    shapes, data = _data("gestures"), _data(library)  # the shapes of single digits serve all libraries
+    gestures: dict[str, NDArray[np.float64]] = {}
+    for name, entry in data["gestures"].items():
+        fingers = np.array([_numbers(finger, shapes["fingers"]) for finger in entry["fingers"]])
+        fingers[:, 0] += entry.get("spread", 0.0) * _SPREAD
+        thumb = _numbers(entry["thumb"], shapes["thumbs"])
+        gestures[name] = np.deg2rad(np.concatenate([thumb, fingers.ravel()]))
+    return gestures
+
+
+def _numbers(digit: str | list[float], shapes: dict[str, list[float]]) -> NDArray[np.float64]:
+    """Four angles [deg] of a digit that is named or written out."""
+    return np.array(shapes[digit] if isinstance(digit, str) else digit, dtype=np.float64)
+
+
+def gesture_names(library: str = "gestures") -> tuple[str, ...]:
+    """Names of all gestures of one library.
+
+    Raises:
+        ArgumentError: There is no such library.
+    """
+    return tuple(_library(library))
+
+
+def gesture(name: str) -> Float[np.ndarray, "20"]:
+    """Hinge angles [rad] of a named gesture of any library, in the order of `topology.JOINTS`.
+
+    Raises:
+        ArgumentError: No library holds this name.
+    """
+    for library in LIBRARIES:
+        if name in _library(library):
+            return _library(library)[name].copy()
+    names = [known for library in LIBRARIES for known in _library(library)]
+    raise ArgumentError(choices(name, names, noun="gesture"))
+
+
+def gestures_of(library: str) -> Float[np.ndarray, "G 20"]:
+    """Hinge angles [rad] of every gesture of one library, in the order of `gesture_names(library)`.
+
+    Raises:
+        ArgumentError: There is no such library.
+    """
+    return np.stack(list(_library(library).values()))
+
+
+def all_gestures() -> Float[np.ndarray, "G 20"]:
+    """Hinge angles [rad] of the gestures that random poses are blended from: the library "gestures".
+
+    The other libraries stay out of it, so that the same seed gives the same training set as ever.
+    """
+    return gestures_of("gestures")

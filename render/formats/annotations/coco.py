@@ -1,0 +1,89 @@
+"""COCO keypoints: `annotations.json` for pycocotools, mmpose, detectron2 and whoever else reads COCO.
+
+Keypoints count pixels from the first one's center, boxes from the picture's corner: this is how COCO's own
+files and their readers have it. Beyond COCO's fields an image has its camera (`K` for such pixels, the lens,
+the pose) and an annotation its side and its keypoints in the camera's axes [m].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, Final
+
+import numpy as np
+
+from render.cameras.camera import Camera
+from render.formats.annotations.common import CENTER, hand_mask, is_seen, rounded, run_lengths
+from render.frames import HandTruth, RenderedFrame
+from render.keypoints import KEYPOINT_NAMES, SKELETON
+
+CATEGORY: Final[dict[str, Any]] = {
+    "id": 1,
+    "name": "hand",
+    "supercategory": "hand",
+    "keypoints": list(KEYPOINT_NAMES),
+    "skeleton": [[start + 1, end + 1] for start, end in SKELETON],  # COCO counts keypoints from one
+}
+
+
+def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
+    """The picture and its hands, still without COCO's numbers."""
+    camera = frame.camera
+    image = {
+        "file_name": file_name,
+        "width": camera.size[0],
+        "height": camera.size[1],
+        "frame": frame.number,
+        "time": frame.time,
+        "camera": camera.name,
+        "K": _centered(camera),
+        "lens": {"kind": camera.lens.kind, "coefficients": list(camera.lens.coefficients)},
+        "T_world_camera": camera.T_world_camera.tolist(),
+    }
+    hands = [_hand_record(frame, number, hand) for number, hand in enumerate(frame.hands) if is_seen(hand)]
+    return {"image": image, "annotations": hands}
+
+
+def numbered(records: Iterable[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]:
+    """Images and their annotations with COCO's numbers, in the order of the records."""
+    annotation_id = 0
+    for image_id, record in enumerate(records, start=1):
+        hands = []
+        for hand in record["annotations"]:
+            annotation_id += 1
+            hands.append({"id": annotation_id, "image_id": image_id, **hand})
+        yield {"id": image_id, **record["image"]}, hands
+
+
+def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str, Any]:
+    keypoints, known = _keypoints(frame.camera, hand)
+    mask = hand_mask(frame, number)
+    record = {
+        "category_id": CATEGORY["id"],
+        "keypoints": keypoints,
+        "num_keypoints": known,
+        "bbox": rounded(hand.box, 3),
+        "area": float(hand.box[2] * hand.box[3]) if mask is None else int(mask.sum()),
+        "iscrowd": 0,
+        "side": hand.shape.side,
+        "xyz": rounded(frame.camera.local(hand.keypoints), 9),
+    }
+    if mask is not None:
+        record["segmentation"] = {"size": list(mask.shape), "counts": run_lengths(mask)}
+    return record
+
+
+def _keypoints(camera: Camera, hand: HandTruth) -> tuple[list[float], int]:
+    """COCO's 21 x (u, v, flag): 0 outside the picture, 1 hidden, 2 seen; and how many are not 0."""
+    inside = np.all((hand.pixels >= 0.0) & (hand.pixels < camera.size), axis=1)  # never so for NaN
+    flags = np.where(inside, np.where(hand.visible, 2, 1), 0)
+    pixels = np.where(inside[:, None], hand.pixels - CENTER, 0.0)
+    rows = zip(rounded(pixels, 5), flags.tolist(), strict=True)
+    return [value for (u, v), flag in rows for value in (u, v, flag)], int(inside.sum())
+
+
+def _centered(camera: Camera) -> list[list[float]]:
+    K = camera.K.copy()
+    K[:2, 2] -= CENTER
+    rows: list[list[float]] = K.tolist()
+    return rows

@@ -1,0 +1,147 @@
+"""What the annotation formats share: masks, run lengths, JSON, and where pixels are counted from.
+
+We count pixels from the picture's corner, so that the first center is at 0.5. OpenCV, and with it FreiHAND,
+InterHand2.6M, UmeTrack and COCO's keypoints, count from the first center: `CENTER` is what goes off for them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim.errors import HandSimError
+from handsim.hand.shape import HandShape
+from handsim.hand.topology import Side
+from handsim.space.transforms import rotation_quaternions
+from render.cameras.camera import Camera
+from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy.typing import NDArray
+
+CENTER: Final = 0.5
+"""Where our count of pixels has the first one's center [px]."""
+
+
+def centered_K(camera: Camera) -> NDArray[np.float64]:
+    """Camera matrix for pixels that are counted from the first one's center.
+
+    Raises:
+        HandSimError: The camera's lens is no pinhole, so that no matrix says where points come to lie.
+    """
+    if camera.lens.kind != "pinhole":
+        raise HandSimError(
+            f"camera '{camera.name}' has a lens '{camera.lens.kind}', which this format cannot hold; "
+            "expected a pinhole camera, or the format webdataset, coco, exr or png"
+        )
+    K = camera.K.copy()
+    K[:2, 2] -= CENTER
+    return K
+
+
+def as_sensed(frame: RenderedFrame) -> Pictures:
+    """The frame's pictures as its camera has them: the noisy ones where there are any."""
+    ideal, noisy = frame.ideal, frame.noisy
+    return Pictures(
+        rgb=ideal.rgb if noisy.rgb is None else noisy.rgb,
+        depth=ideal.depth if noisy.depth is None else noisy.depth,
+        normals=ideal.normals,
+        parts=ideal.parts,
+        instances=ideal.instances,
+        markers=ideal.markers,
+    )
+
+
+def is_seen(hand: HandTruth) -> bool:
+    """Whether any of the hand is in the picture."""
+    return bool(np.isfinite(hand.box).all())
+
+
+def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None:
+    """Where one hand of a frame is seen, its markers too but not its forearm; None without an id picture."""
+    parts, instances = frame.ideal.parts, frame.ideal.instances
+    first = 1 + PARTS_A_HAND * hand
+    if instances is not None:
+        mask: NDArray[np.bool_] = instances == hand + 1
+        return mask if parts is None else mask & (parts != first + FOREARM)
+    if parts is not None:
+        return (parts >= first) & (parts < first + FOREARM)
+    return None
+
+
+def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
+    """COCO's uncompressed run lengths: of zeros and ones in turn, zeros first, column by column."""
+    flat = mask.ravel(order="F")
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    ends = np.concatenate([[0], changes, [flat.size]])
+    counts: list[int] = np.diff(ends).tolist()
+    return [0, *counts] if flat[0] else counts
+
+
+def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:
+    """The frame's hands by their sides.
+
+    Raises:
+        HandSimError: Two are of the same side.
+    """
+    hands = {hand.shape.side: hand for hand in frame.hands}
+    if len(hands) < len(frame.hands):
+        sides = " and ".join(hand.shape.side for hand in frame.hands)
+        raise HandSimError(
+            f"frame {frame.number} has hands {sides}; this format holds at most one of each side"
+        )
+    return hands
+
+
+def without_colors(name: str) -> HandSimError:
+    """What to say where a format is asked for that is nothing without color pictures."""
+    return HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
+
+
+def rigid_record(transform: Float[np.ndarray, "4 4"]) -> dict[str, list[float]]:
+    """A rigid transform as quaternion (wxyz) and translation [m]."""
+    return {
+        "quaternion_wxyz": rotation_quaternions(transform[None, :3, :3])[0].tolist(),
+        "translation_xyz": transform[:3, 3].tolist(),
+    }
+
+
+def shape_record(shape: HandShape) -> dict[str, Any]:
+    """A person's hand as JSON; the fields of `HandShape`."""
+    return {name: _plain(getattr(shape, name)) for name in HandShape.__dataclass_fields__}
+
+
+def rounded(values: NDArray[np.floating], decimals: int) -> Any:
+    """Numbers as nested lists, short enough to be read."""
+    return np.round(np.asarray(values, dtype=np.float64), decimals).tolist()
+
+
+def to_json(content: Any) -> str:
+    """JSON of plain values and arrays; null for NaN, which strict readers refuse."""
+    try:
+        return json.dumps(content, default=_listed, allow_nan=False, separators=(",", ":"))
+    except (TypeError, ValueError):  # something the quick way has no word for
+        return json.dumps(_plain(content), allow_nan=False, separators=(",", ":"))
+
+
+def _listed(content: Any) -> Any:
+    if isinstance(content, np.ndarray | np.generic):
+        return content.tolist()
+    raise TypeError
+
+
+def _plain(content: Any) -> Any:
+    if isinstance(content, Mapping):
+        return {str(key): _plain(value) for key, value in content.items()}
+    if isinstance(content, (list, tuple)):
+        return [_plain(value) for value in content]
+    if isinstance(content, np.ndarray | np.generic):
+        return _plain(content.tolist())
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content

@@ -1,0 +1,115 @@
+"""How others order a hand's joints, as places in our 21 (`render.keypoints`), and the way there and back.
+
+One table, because a wrong permutation looks almost right. A place of `ABSENT` is a joint that we do not have.
+
+- FreiHAND, MediaPipe and COCO-WholeBody: wrist, then thumb to little, base to tip. This is ours.
+- MANO with its tips appended, as in HO-3D and H2O-3D: wrist, three joints each of index, middle, little, ring
+  and thumb, then the tips from thumb to little.
+- InterHand2.6M: thumb to little, tip to base, then the wrist; its files have 42, a right hand and a left one.
+- HANDS17 and BigHand2.2M: wrist, five first joints, then the other three a digit.
+- OpenXR: palm, wrist, four of the thumb, five a finger from its metacarpal on; WebXR has no palm.
+- UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints a finger; with 21 landmarks the
+  palm's center comes last.
+"""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.errors import ArgumentError, choices
+from render.keypoints import NUM_KEYPOINTS
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+ABSENT: Final = -1
+_WRIST: Final = 0
+_THUMB, _INDEX, _MIDDLE, _RING, _LITTLE = _DIGITS = tuple(
+    tuple(range(4 * digit + 1, 4 * digit + 5)) for digit in range(5)
+)
+
+
+def _flat(*parts: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(chain.from_iterable(parts))
+
+
+_OURS: Final = tuple(range(NUM_KEYPOINTS))
+_TIPS: Final = tuple(digit[3] for digit in _DIGITS)
+_MANO: Final = _flat((_WRIST,), *(digit[:3] for digit in (_INDEX, _MIDDLE, _LITTLE, _RING, _THUMB)), _TIPS)
+_INTERHAND: Final = _flat(*(digit[::-1] for digit in _DIGITS), (_WRIST,))
+_HANDS17: Final = _flat((_WRIST,), tuple(digit[0] for digit in _DIGITS), *(digit[1:] for digit in _DIGITS))
+_WEBXR: Final = _flat((_WRIST,), _THUMB, *((ABSENT, *digit) for digit in _DIGITS[1:]))
+_UMETRACK: Final = _flat(_TIPS, (_WRIST,), _THUMB[1:3], *(digit[:3] for digit in _DIGITS[1:]))
+
+JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
+    "handsim": _OURS,
+    "freihand": _OURS,
+    "mediapipe": _OURS,
+    "coco_wholebody_hand": _OURS,
+    "mano": _MANO,
+    "ho3d": _MANO,
+    "interhand": _INTERHAND,
+    "hands17": _HANDS17,
+    "bighand": _HANDS17,
+    "openxr": (ABSENT, *_WEBXR),
+    "webxr": _WEBXR,
+    "umetrack": _UMETRACK,
+    "hot3d": _UMETRACK,
+    "umetrack21": (*_UMETRACK, ABSENT),
+}
+"""Place in `KEYPOINT_NAMES` of every joint of an order."""
+
+
+def joint_order(name: str) -> tuple[int, ...]:
+    """One of `JOINT_ORDERS`.
+
+    Raises:
+        ArgumentError: There is no order of that name.
+    """
+    if name not in JOINT_ORDERS:
+        raise ArgumentError(choices(name, JOINT_ORDERS, noun="joint order"))
+    return JOINT_ORDERS[name]
+
+
+def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
+    """Our keypoints, or anything that there is one of a keypoint, in another order.
+
+    Args:
+        points: In the order of `KEYPOINT_NAMES`.
+        name: One of `JOINT_ORDERS`.
+
+    Returns:
+        As many as that order has; NaN for those that we do not have.
+
+    Raises:
+        ArgumentError: There is no order of that name, or there are not 21 points.
+    """
+    order, points = list(joint_order(name)), _rows(points, NUM_KEYPOINTS, "our keypoints")
+    nowhere = np.full_like(points[..., :1, :], np.nan)
+    ordered: NDArray[np.floating] = np.concatenate([points, nowhere], axis=-2)[..., order, :]
+    return ordered
+
+
+def from_order(points: Float[np.ndarray, "*batch n k"], name: str) -> Float[np.ndarray, "*batch 21 k"]:
+    """The inverse of `to_order`: NaN for those of ours that the other order has not.
+
+    Raises:
+        ArgumentError: There is no order of that name, or it has another number of points.
+    """
+    order = np.array(joint_order(name))
+    points = _rows(points, len(order), f"joints in the order '{name}'")
+    known = np.flatnonzero(order != ABSENT)
+    ours = np.full((*points.shape[:-2], NUM_KEYPOINTS, points.shape[-1]), np.nan, dtype=points.dtype)
+    ours[..., order[known], :] = points[..., known, :]
+    return ours
+
+
+def _rows(points: NDArray[np.floating], count: int, noun: str) -> NDArray[np.floating]:
+    points = np.asarray(points)
+    if points.ndim < 2 or points.shape[-2] != count:
+        raise ArgumentError(f"{noun} have shape {points.shape}, expected (..., {count}, k)")
+    return points if np.issubdtype(points.dtype, np.floating) else points.astype(np.float64)

@@ -1,0 +1,171 @@
+"""Pictures as bytes of PNG and JPEG files; depth as 16-bit PNG that says its own unit.
+
+Depth counts tenths of a millimeter up to 6.5535 m, and 0 is nothing, as sensors have it. What is farther
+becomes 0 too: a hole says "unknown", which is true, where 65535 would be a wall that is not there.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import cv2
+import numpy as np
+
+from handsim.errors import DatasetError, HandSimError
+from render.formats.annotations.common import as_sensed
+from render.frames import Pictures, RenderedFrame
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32, UInt8
+    from numpy.typing import NDArray
+
+METERS_PER_UNIT: Final = 1e-4
+"""What a step of a depth picture is worth, unless its file says otherwise [m]."""
+_KEYWORD: Final = b"metres_per_unit"
+_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+_FIRST_CHUNK: Final = slice(8, 33)  # IHDR: length, name, 13 bytes, checksum
+_MOST: Final = 65535
+_NORMAL_ZERO, _NORMAL_SCALE = 128, 127
+_JPEG_QUALITY: Final = 95
+
+
+def encode_png(picture: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """An sRGB picture as PNG."""
+    return _encode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+
+
+def encode_jpeg(picture: UInt8[np.ndarray, "H W *C"], *, quality: int = _JPEG_QUALITY) -> bytes:
+    """An sRGB or gray picture as JPEG."""
+    ordered = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR) if picture.ndim == 3 else picture
+    return _encode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def encode_depth(depth: Float32[np.ndarray, "H W"], *, meters_per_unit: float = METERS_PER_UNIT) -> bytes:
+    """Depth [m] as 16-bit gray PNG, with its unit in a text chunk `metres_per_unit`.
+
+    Args:
+        depth: Meters; 0, NaN and what does not fit into 65535 units become 0.
+        meters_per_unit: What a step is worth [m].
+
+    Raises:
+        HandSimError: The unit is no positive number.
+    """
+    if not 0.0 < meters_per_unit < np.inf:
+        raise HandSimError(f"meters_per_unit is {meters_per_unit:g}, expected a positive number of meters")
+    steps = np.rint(np.asarray(depth, dtype=np.float64) / meters_per_unit)
+    fits = (steps > 0) & (steps <= _MOST)  # false for NaN
+    data = _encode(".png", np.where(fits, steps, 0).astype(np.uint16))
+    text = _KEYWORD + b"\0" + repr(float(meters_per_unit)).encode("ascii")
+    end = _FIRST_CHUNK.stop
+    return data[:end] + _chunk(b"tEXt", text) + data[end:]
+
+
+def decode_depth(data: bytes, *, name: str = "depth picture") -> Float32[np.ndarray, "H W"]:
+    """Depth [m] of a 16-bit gray PNG, 0 where there is nothing.
+
+    Args:
+        data: The file; without a chunk `metres_per_unit`, steps are taken for tenths of a millimeter.
+        name: What to call it in messages.
+
+    Raises:
+        DatasetError: It is no such picture.
+    """
+    unit = _unit(data, name)
+    steps = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    if steps is None:
+        raise DatasetError(f"{name}: damaged: it is no whole PNG picture")
+    if steps.dtype != np.uint16 or steps.ndim != 2:
+        raise DatasetError(
+            f"{name}: {steps.dtype} of shape {steps.shape}, expected a 16-bit gray picture of depth"
+        )
+    depth: NDArray[np.float32] = (steps * unit).astype(np.float32)
+    return depth
+
+
+def read_depth(path: str | Path) -> Float32[np.ndarray, "H W"]:
+    """Depth [m] of a file that `encode_depth` made.
+
+    Raises:
+        DatasetError: The file cannot be read, or is no such picture.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}") from error
+    return decode_depth(data, name=str(path))
+
+
+def encode_ids(pictures: Pictures) -> bytes | None:
+    """Parts, instances and markers as red, green and blue of one PNG; None when there are none of them."""
+    layers = (pictures.parts, pictures.instances, pictures.markers)
+    known = [layer for layer in layers if layer is not None]
+    if not known:
+        return None
+    return encode_png(np.stack([np.zeros_like(known[0]) if x is None else x for x in layers], axis=-1))
+
+
+def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
+    """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black is nothing."""
+    levels = np.rint(normals * _NORMAL_SCALE) + _NORMAL_ZERO
+    something = (normals != 0.0).any(axis=-1, keepdims=True)
+    return encode_png(np.where(something, levels, 0).astype(np.uint8))
+
+
+def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]:
+    """Files of a frame's pictures as its camera has them, and of ideal depth beside noisy, by suffix.
+
+    Args:
+        frame: Its colors have the suffix `.png` or `.jpg`; then come `.depth.png`, `.depth_ideal.png`,
+            `.normals.png` and `.ids.png`, as far as there are such pictures.
+        lossless: Whether colors are PNG instead of JPEG.
+    """
+    pictures = as_sensed(frame)
+    files: dict[str, bytes] = {}
+    if pictures.rgb is not None:
+        files[".png" if lossless else ".jpg"] = (encode_png if lossless else encode_jpeg)(pictures.rgb)
+    if pictures.depth is not None:
+        files[".depth.png"] = encode_depth(pictures.depth)
+    if frame.noisy.depth is not None and frame.ideal.depth is not None:
+        files[".depth_ideal.png"] = encode_depth(frame.ideal.depth)
+    if pictures.normals is not None:
+        files[".normals.png"] = encode_normals(pictures.normals)
+    ids = encode_ids(pictures)
+    if ids is not None:
+        files[".ids.png"] = ids
+    return files
+
+
+def _encode(suffix: str, picture: NDArray[Any], options: list[int] | None = None) -> bytes:
+    done, data = cv2.imencode(suffix, np.ascontiguousarray(picture), options or [])
+    assert done, "these formats take any picture"
+    encoded: bytes = data.tobytes()
+    return encoded
+
+
+def _chunk(name: bytes, content: bytes) -> bytes:
+    checksum = zlib.crc32(name + content)
+    return struct.pack(">I", len(content)) + name + content + struct.pack(">I", checksum)
+
+
+def _unit(data: bytes, name: str) -> float:
+    """Unit that a PNG states, ours when it states none."""
+    if not data.startswith(_SIGNATURE):
+        raise DatasetError(f"{name}: not a PNG file")
+    place = len(_SIGNATURE)
+    while place + 8 <= len(data):
+        length, kind = struct.unpack(">I4s", data[place : place + 8])
+        content = data[place + 8 : place + 8 + length]
+        keyword, _, text = content.partition(b"\0")
+        if kind == b"tEXt" and keyword == _KEYWORD:
+            try:
+                unit = float(text)
+            except ValueError:
+                unit = np.nan
+            if not 0.0 < unit < np.inf:
+                raise DatasetError(f"{name}: damaged: its unit '{text!r}' is no number of meters")
+            return unit
+        place += 12 + length
+    return METERS_PER_UNIT

@@ -1,0 +1,71 @@
+"""Writers of rendered frames, chosen by the name of a format.
+
+Frames go out in shards, so that rendering can be killed and go on: a shard is written under a temporary name
+and renamed when it is complete. Several processes may write different shards into one folder; when all are
+done, one of them calls `finish`, which merges what the format wants in one file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Final, Protocol
+
+from handsim.errors import HandSimError, choices
+from render.formats.clip_writer import WebdatasetWriter
+from render.formats.folder_writers import CocoWriter, ExrWriter, InterhandWriter, PngWriter
+from render.formats.freihand_writer import FreihandWriter
+from render.frames import RenderedFrame
+
+
+class FrameWriter(Protocol):
+    """What `open_writer` returns."""
+
+    def done(self) -> frozenset[int]:
+        """Numbers of the shards that are complete."""
+
+    def write(self, shard: int, frames: Iterable[RenderedFrame]) -> None:
+        """Write a shard, or write it anew.
+
+        Args:
+            shard: Its number, from 0.
+            frames: What it shall hold; taken one at a time.
+
+        Raises:
+            HandSimError: The format cannot hold these frames, or the disk takes no more.
+        """
+
+    def finish(self) -> None:
+        """Merge what all complete shards say into the files that the format wants; may be called again.
+
+        Raises:
+            HandSimError: A shard is damaged, or the disk takes no more.
+        """
+
+
+WRITERS: Final[dict[str, Callable[[Path], FrameWriter]]] = {
+    "webdataset": WebdatasetWriter,
+    "coco": CocoWriter,
+    "freihand": FreihandWriter,
+    "interhand": InterhandWriter,
+    "exr": ExrWriter,
+    "png": PngWriter,
+}
+FORMATS: Final = tuple(WRITERS)
+NEED_COLORS: Final = ("coco", "freihand", "interhand")
+"""Formats of color pictures."""
+
+
+def open_writer(name: str, folder: str | Path) -> FrameWriter:
+    """The writer of a format.
+
+    Args:
+        name: One of `FORMATS`.
+        folder: Where its files shall be; made when it is not there.
+
+    Raises:
+        HandSimError: There is no such format.
+    """
+    if name not in WRITERS:
+        raise HandSimError(choices(name, WRITERS, noun="format"))
+    return WRITERS[name](Path(folder))

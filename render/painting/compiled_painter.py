@@ -1,0 +1,200 @@
+"""Colors by the z-buffer and the shading of our own: quick on any processor, and without OpenGL.
+
+A software OpenGL shades triangles in blocks of pixels, most of which a fine mesh throws away; here each pixel
+is shaded once, after its nearest face is known, and four times only where one surface ends before another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numba
+import numpy as np
+
+from render.cameras.camera import Camera
+from render.painting.figures import Drawn
+from render.painting.lights import Lighting
+from render.painting.rasterizer import nearest_faces, project
+from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, light_up, read_texels
+from render.painting.shadow_map import shadow_map
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, UInt8
+    from numpy.typing import NDArray
+
+_SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
+
+_NO_TEXELS: Final = np.empty((0, 0, 8), dtype=np.uint8)
+
+
+class _Mesh(NamedTuple):
+    """One surface in the camera's axes, with its material."""
+
+    begin: int
+    """Number of its first face among those of all surfaces."""
+    faces: NDArray[np.int64]
+    vertices: NDArray[np.float64]
+    """Rows (14) as in `shading.Spot`, the first three of `rasterizer.project` at twice the picture's size."""
+    texels: NDArray[np.uint8]
+    """Empty where there is no texture."""
+    finish: NDArray[np.float64]
+    """Color, roughness and glow."""
+
+
+def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
+    """See `render.painting.painter.paint`; the same bytes on every machine but for rounding."""
+    width, height = camera.size
+    meshes = _meshes(camera, drawn)
+    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, counts, strict=False)])
+    vertices = np.concatenate([mesh.vertices[:, :6] for mesh in meshes])
+    nearness, first = nearest_faces(vertices[:, :3], faces, (2 * width, 2 * height), farthest=0.0)
+    lamps, around = _lamp_table(lighting), np.zeros((9, 3))
+    around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
+    shadows = shadow_map(vertices[:, 3:], faces, lamps[0, :3])
+    sums = np.zeros((height, width, 4), dtype=np.float32)
+    for mesh in meshes:
+        _shade(nearness, first, *mesh, lamps, around, *shadows, TO_LINEAR, TO_DISPLAY, sums)
+    painted: NDArray[np.uint8] = np.rint(63.75 * sums).astype(np.uint8)
+    return painted
+
+
+def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
+    rotation = camera.T_world_camera[:3, :3]
+    doubled = np.diag([2.0, 2.0, 1.0]) @ camera.K
+    meshes, begin = [], 0
+    for one in drawn:
+        triangles, material = one.triangles, one.material()
+        vertices = np.zeros((len(triangles.vertices), 14))
+        vertices[:, 3:6] = camera.local(triangles.vertices)
+        vertices[:, :3] = project(vertices[:, 3:6], doubled)
+        vertices[:, 6:9] = triangles.normals @ rotation
+        vertices[:, 9:12] = one.colors[:, :3]
+        if one.uv is not None:
+            vertices[:, 12:] = one.uv
+        texels = _NO_TEXELS if material.texels is None else material.texels
+        faces = np.ascontiguousarray(triangles.faces, dtype=np.int64)
+        finish = np.array([*material.color, material.roughness, material.glow])
+        meshes.append(_Mesh(begin, faces, vertices, texels, finish))
+        begin += len(faces)
+    return meshes
+
+
+def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
+    """See `shading.light_up`; lamps in one direction share a row."""
+    rows: dict[tuple[float, float, float], NDArray[np.float64]] = {}
+    for number, lamp in enumerate(lighting.lamps):
+        towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
+        row = rows.setdefault(lamp.direction, np.concatenate([towards, np.zeros(6)]))
+        row[3 if number == 0 else 6 :][:3] += np.pi * lamp.strength * np.array(lamp.color)
+    if not rows:
+        return np.array([[0.0, 0.0, -1.0, *[0.0] * 6]])
+    return np.stack(list(rows.values()))
+
+
+# Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _shade(
+    nearness: Any,
+    first: Any,
+    begin: int,
+    faces: Any,
+    vertices: Any,
+    texels: Any,
+    finish: Any,
+    lamps: Any,
+    ambient: Any,
+    to_map: Any,
+    nearest: Any,
+    bias: float,
+    to_linear: Any,
+    to_display: Any,
+    sums: Any,
+) -> None:
+    """Add one surface's colors, and how many of four samples a pixel it fills."""
+    spot, light = np.empty(SPOT), np.empty(3)
+    for row in range(len(sums)):
+        for column in range(sums.shape[1]):
+            count, smooth = _samples(nearness, first, begin, begin + len(faces), row, column)
+            if count == 0:
+                continue
+            for i in range(1 if smooth else 2):
+                for j in range(1 if smooth else 2):
+                    face = first[2 * row + i, 2 * column + j] - begin
+                    if not 0 <= face < len(faces):
+                        continue
+                    x, y = (1.0, 1.0) if smooth else (j + 0.5, i + 0.5)
+                    _look(vertices, faces, face, 2 * column + x, 2 * row + y, spot)
+                    spot[14:18] = finish[:4]
+                    if len(texels):
+                        read_texels(texels, to_linear, spot)
+                        _bend(vertices, faces, face, spot)
+                    light_up(spot, finish[4], lamps, ambient, to_map, nearest, bias, light)
+                    share = 4.0 if smooth else 1.0
+                    for k in range(3):
+                        sums[row, column, k] += share * display(spot[9 + k] * light[k], to_display)
+                    sums[row, column, 3] += share
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _samples(nearness: Any, first: Any, begin: int, end: int, row: int, column: int) -> Any:
+    """How many of a pixel's samples a surface fills, and whether they are all and close together."""
+    count, most, least = 0, 0.0, np.inf
+    for i in range(2):
+        for j in range(2):
+            if begin <= first[2 * row + i, 2 * column + j] < end:
+                count += 1
+                most = max(most, nearness[2 * row + i, 2 * column + j])
+                least = min(least, nearness[2 * row + i, 2 * column + j])
+    return count, count == 4 and most - least < _SMOOTH * most
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _look(vertices: Any, faces: Any, face: int, x: float, y: float, spot: Any) -> None:
+    """Write what a face shows at a place of the doubled picture: the means of its corners' rows."""
+    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+    ax, ay = vertices[a, 0], vertices[a, 1]
+    bx, by = vertices[b, 0] - ax, vertices[b, 1] - ay
+    cx, cy = vertices[c, 0] - ax, vertices[c, 1] - ay
+    scale = 1.0 / (bx * cy - by * cx)
+    second = max(((x - ax) * cy - (y - ay) * cx) * scale, 0.0)
+    third = max(((y - ay) * bx - (x - ax) * by) * scale, 0.0)
+    first = max(1.0 - second - third, 0.0) * vertices[a, 2]
+    second, third = second * vertices[b, 2], third * vertices[c, 2]
+    scale = 1.0 / (first + second + third)
+    first, second, third = first * scale, second * scale, third * scale
+    for i in range(3, 14):
+        spot[i] = first * vertices[a, i] + second * vertices[b, i] + third * vertices[c, i]
+    _shorten_normal(spot)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _bend(vertices: Any, faces: Any, face: int, spot: Any) -> None:
+    """Turn a normal by the texture's, whose first axis is where u grows."""
+    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+    bu, bv = vertices[b, 12] - vertices[a, 12], vertices[b, 13] - vertices[a, 13]
+    cu, cv = vertices[c, 12] - vertices[a, 12], vertices[c, 13] - vertices[a, 13]
+    sign = 1.0 if bu * cv - cu * bv >= 0.0 else -1.0
+    bv, cv = sign * bv, sign * cv
+    tx = cv * (vertices[b, 3] - vertices[a, 3]) - bv * (vertices[c, 3] - vertices[a, 3])
+    ty = cv * (vertices[b, 4] - vertices[a, 4]) - bv * (vertices[c, 4] - vertices[a, 4])
+    tz = cv * (vertices[b, 5] - vertices[a, 5]) - bv * (vertices[c, 5] - vertices[a, 5])
+    nx, ny, nz = spot[6], spot[7], spot[8]
+    along = nx * tx + ny * ty + nz * tz
+    tx, ty, tz = tx - along * nx, ty - along * ny, tz - along * nz
+    square = tx * tx + ty * ty + tz * tz
+    if square == 0.0:
+        return
+    across, up, out = spot[18] / np.sqrt(square), spot[19] / np.sqrt(square), spot[20]
+    spot[6] = across * tx + up * (ny * tz - nz * ty) + out * nx
+    spot[7] = across * ty + up * (nz * tx - nx * tz) + out * ny
+    spot[8] = across * tz + up * (nx * ty - ny * tx) + out * nz
+    _shorten_normal(spot)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _shorten_normal(spot: Any) -> None:
+    scale = 1.0 / np.sqrt(spot[6] * spot[6] + spot[7] * spot[7] + spot[8] * spot[8])
+    for i in range(6, 9):
+        spot[i] *= scale

@@ -1,0 +1,189 @@
+"""What is drawn of a hand or a thing: its surface for depth and ids, and what colors it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from gloves.fit import GloveFit
+from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.topology import BONES, NUM_BONES
+from render.frames import PARTS_A_HAND
+from render.painting.materials import (
+    MARKER_COLOR,
+    Material,
+    ball_material,
+    linear,
+    plain_material,
+    shade_colors,
+    skin_material,
+)
+from render.painting.rasterizer import Triangles
+from render.painting.spheres import SphereSurface, sphere_surface
+from render.shown_take import ShownBody
+from render.skin.forearm import Forearm, sample_forearm
+from render.skin.glove_look import GloveLook, glove_texture, sample_glove_look
+from render.skin.look import SkinLook, sample_skin_look
+from render.skin.mesh import SkinMesh
+from render.skin.texture import skin_texture
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32, UInt8
+    from numpy.typing import NDArray
+
+_BALL_LEVEL: Final = 2
+_BODY_BALLS: Final = 0.0032  # [m] radius of the markers of things, the paper's 6.4 mm across
+
+
+@dataclass(frozen=True, slots=True)
+class Appearance:
+    """How one hand looks."""
+
+    skin: SkinLook
+    forearm: Forearm
+    glove: GloveLook | None
+    """The marker glove that it wears, with its markers; None for the bare hand."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """A surface that is ready to be drawn."""
+
+    triangles: Triangles
+    colors: Float32[np.ndarray, "V 4"]
+    """Factors on the material's color, linear."""
+    uv: Float32[np.ndarray, "V 2"] | None
+    material: Callable[[], Material]
+    """The same every time; whoever wants no colors needs none."""
+
+
+def sample_people(
+    count: int, glove: bool, *, tones: tuple[float, float], rng: np.random.Generator
+) -> tuple[Appearance, ...]:
+    """Hands of one person: both have the same skin and the same sleeves.
+
+    Args:
+        count: How many hands.
+        glove: Whether they wear the marker glove.
+        tones: Between which typology angles the skin is drawn, see `render.skin.look`.
+        rng: Where the choices come from.
+    """
+    skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
+    cloth = sample_glove_look(rng=rng) if glove else None
+    return (Appearance(skin, forearm, cloth),) * count
+
+
+class HandFigure:
+    """One hand as it is drawn; its texture is painted once.
+
+    Args:
+        fit: The hand in its glove.
+        look: How it looks.
+        first_marker: Markers of the hands before it.
+    """
+
+    def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
+        self.fit, self.look = fit, look
+        self._skin = SkinMesh(fit.model, look.forearm)
+        self._painted: Material | None = None
+        self._marker_bones = bones = fit.attachment.main_bones
+        self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
+
+    def drawn(self, qpos: Float[np.ndarray, "27"], number: int) -> list[Drawn]:
+        """Skin, and markers where a glove is worn.
+
+        Args:
+            qpos: The pose.
+            number: The hand's place among those in the picture.
+        """
+        skin, first_part = self._skin.posed(qpos), 1 + PARTS_A_HAND * number
+        count = len(skin.faces)
+        triangles = Triangles(
+            skin.vertices,
+            skin.faces,
+            skin.normals,
+            (first_part + skin.parts).astype(np.uint8),
+            np.full(count, 1 + number, dtype=np.uint8),
+            np.zeros(count, dtype=np.uint8),
+        )
+        drawn = [Drawn(triangles, shade_colors(skin.shade), skin.uv, self._material)]
+        if self.look.glove is not None:
+            drawn.append(self._drawn_markers(qpos, number))
+        return drawn
+
+    def markers(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
+        """Centers of the glove's markers in the world [m]."""
+        markers: NDArray[np.float64] = self.fit.markers(qpos[None])[0][0]
+        return markers
+
+    def _material(self) -> Material:
+        if self._painted is None:
+            look, side = self.look, self.fit.side
+            texture = skin_texture(look.skin, look.forearm, side=side)
+            if look.glove is not None:
+                texture = glove_texture(look.glove, texture, look.forearm, side=side)
+            self._painted = skin_material(texture)
+        return self._painted
+
+    def _drawn_markers(self, qpos: NDArray[np.float64], number: int) -> Drawn:
+        balls = sphere_surface(self.markers(qpos), self.fit.layout.radius, level=_BALL_LEVEL)
+        each = len(balls.faces) // len(self._marker_bones)
+        parts = (1 + PARTS_A_HAND * number + self._marker_bones).astype(np.uint8)
+        instances = np.full(len(balls.faces), 1 + number, dtype=np.uint8)
+        numbers = np.repeat(self._marker_numbers, each)
+        return _drawn_balls(balls, np.repeat(parts, each), instances, numbers)
+
+
+class BodyFigure:
+    """One rigid thing as it is drawn.
+
+    Args:
+        body: Which.
+        color: Of its surface, sRGB in [0, 1].
+    """
+
+    def __init__(self, body: ShownBody, color: tuple[float, float, float]) -> None:
+        self.body = body
+        self._material = functools.cache(functools.partial(plain_material, color))
+        if body.thing is not None:
+            self._normals = vertex_normals(body.thing.vertices, body.thing.faces)
+
+    def drawn(self, T_world_body: Float[np.ndarray, "4 4"], instance: int) -> list[Drawn]:
+        """Its surface, where that is known, and its markers."""
+        rotation, place, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
+        thing = self.body.thing
+        if thing is not None:
+            ids = [np.full(len(thing.faces), number, dtype=np.uint8) for number in (0, instance, 0)]
+            vertices = thing.vertices @ rotation.T + place
+            triangles = Triangles(vertices, thing.faces, self._normals @ rotation.T, *ids)
+            white = np.ones((len(vertices), 4), dtype=np.float32)
+            drawn.append(Drawn(triangles, white, None, self._material))
+        if len(self.body.markers):
+            balls = sphere_surface(self.body.markers @ rotation.T + place, _BODY_BALLS, level=_BALL_LEVEL)
+            zeros = np.zeros(len(balls.faces), dtype=np.uint8)
+            drawn.append(_drawn_balls(balls, zeros, zeros + np.uint8(instance), zeros))
+        return drawn
+
+
+def _drawn_balls(
+    balls: SphereSurface,
+    parts: UInt8[np.ndarray, "F"],
+    instances: UInt8[np.ndarray, "F"],
+    markers: UInt8[np.ndarray, "F"],
+) -> Drawn:
+    triangles = Triangles(balls.vertices, balls.faces, balls.normals, parts, instances, markers)
+    colors = np.ones((len(balls.vertices), 4), dtype=np.float32)
+    colors[:, :3] = linear(MARKER_COLOR)
+    return Drawn(triangles, colors, None, ball_material)
+
+
+def digit_of_part(parts: UInt8[np.ndarray, "*shape"], number: int) -> NDArray[np.int64]:
+    """Digit of each pixel that is hand `number`'s; -1 for its palm and forearm, -2 for all else."""
+    digits = np.array([bone.digit for bone in BONES] + [-1] * (PARTS_A_HAND - NUM_BONES))
+    place = parts.astype(np.int64) - 1 - PARTS_A_HAND * number
+    mine = (place >= 0) & (place < PARTS_A_HAND)
+    return np.where(mine, digits[np.clip(place, 0, PARTS_A_HAND - 1)], -2)

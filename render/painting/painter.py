@@ -1,0 +1,91 @@
+"""Colors of what is in a picture, with how much of each pixel it covers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numba
+import numpy as np
+
+from render.cameras.camera import Camera
+from render.painting.compiled_painter import paint_compiled
+from render.painting.figures import Drawn
+from render.painting.lights import Lighting
+from render.painting.opengl_painter import paint_opengl
+from render.painting.rasterizer import NEAR
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32, UInt8
+
+Painter = Literal["compiled", "opengl"]
+_WHITE: Final = 255.0
+_STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL begin anew
+
+
+def paint(
+    camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
+) -> UInt8[np.ndarray, "H W 4"]:
+    """Colors before black, sRGB, and in the fourth channel how much of each pixel is covered.
+
+    Args:
+        camera: A pinhole camera.
+        drawn: What there is to see.
+        lighting: In the camera's axes.
+        painter: Who paints; both give nearly the same picture.
+
+    Raises:
+        HandSimError: OpenGL is wanted and missing on this machine; the sentence says what to install.
+    """
+    every = {"compiled": paint_compiled, "opengl": paint_opengl}[painter]
+    width, height = camera.size
+    picture = np.zeros((height, width, 4), dtype=np.uint8)
+    left, top, right, bottom = _window(camera, drawn)
+    if left < right and top < bottom:
+        inner = dataclasses.replace(
+            camera, size=(right - left, bottom - top), K=camera.K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
+        )
+        picture[top:bottom, left:right] = every(inner, drawn, lighting)
+    return picture
+
+
+def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of where there is anything to see: what is empty costs time too."""
+    width, height = camera.size
+    if not drawn:
+        return 0, 0, 0, 0
+    local = camera.local(np.concatenate([one.triangles.vertices for one in drawn]))
+    if local[:, 2].min() < NEAR:
+        return 0, 0, width, height
+    pixels = local[:, :2] / local[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+    low, high = np.floor(pixels.min(axis=0) - 1.0), np.ceil(pixels.max(axis=0) + 1.0)
+    left, top = (np.clip(low, 0, camera.size) // _STEP * _STEP).astype(int)
+    right, bottom = np.minimum(np.ceil(np.clip(high, 0, camera.size) / _STEP) * _STEP, camera.size).astype(
+        int
+    )
+    return int(left), int(top), int(right), int(bottom)
+
+
+def put_before(
+    painted: UInt8[np.ndarray, "H W 4"], background: Float32[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """What was painted before black, put before something else.
+
+    Args:
+        painted: See `paint`.
+        background: sRGB from 0 to 255.
+    """
+    mixed = np.empty_like(background, dtype=np.uint8)
+    _mix(painted.reshape(-1, 4), background.reshape(-1, 3), mixed.reshape(-1, 3))
+    return mixed
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _mix(painted: Any, background: Any, mixed: Any) -> None:
+    for pixel in range(len(mixed)):
+        clear = 1.0 - painted[pixel, 3] / _WHITE
+        for channel in range(3):
+            mixed[pixel, channel] = int(
+                min(painted[pixel, channel] + clear * background[pixel, channel], _WHITE)
+            )

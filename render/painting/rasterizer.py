@@ -1,0 +1,190 @@
+"""Depth, normals and ids of triangles, drawn by a z-buffer of our own, compiled.
+
+Every pixel takes what lies behind its center, so that depth, normals and ids belong together and are the same
+bytes on every machine; OpenGL draws the colors only (docs/decisions.md says why).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numba
+import numpy as np
+
+from handsim.errors import ArgumentError
+from render.cameras.camera import Camera
+from render.frames import Pictures
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32, Int, Int32, UInt8
+
+NEAR: Final = 0.01
+"""Triangles that come nearer to the camera's plane are not drawn [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangles:
+    """A surface to draw."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    """In the world [m]."""
+    faces: Int[np.ndarray, "F 3"]
+    """Counter-clockwise from outside."""
+    normals: Float[np.ndarray, "V 3"]
+    """Unit normals in the world."""
+    parts: UInt8[np.ndarray, "F"]
+    """See `render.frames.Pictures`, as the next two."""
+    instances: UInt8[np.ndarray, "F"]
+    markers: UInt8[np.ndarray, "F"]
+
+
+def join(surfaces: Sequence[Triangles]) -> Triangles:
+    """Several surfaces as one."""
+    counts = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
+    faces = [surface.faces + first for surface, first in zip(surfaces, counts[:-1], strict=True)]
+    names = ("vertices", "normals", "parts", "instances", "markers")
+    vertices, normals, parts, instances, markers = (
+        np.concatenate([getattr(surface, name) for surface in surfaces]) for name in names
+    )
+    return Triangles(vertices, np.concatenate(faces), normals, parts, instances, markers)
+
+
+def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) -> Pictures:
+    """Depth, normals, parts, instances and markers as a pinhole camera sees them.
+
+    Args:
+        camera: The camera; whoever wants another lens draws pinhole pictures first (`render.cameras.warp`).
+        surface: What there is to see, closed; the backs of its faces are not drawn.
+        with_normals: Whether they are wanted.
+
+    Raises:
+        ArgumentError: The camera's lens is no pinhole.
+    """
+    if camera.lens.kind != "pinhole":
+        raise ArgumentError(f"camera '{camera.name}' has a lens '{camera.lens.kind}', expected a pinhole")
+    width, height = camera.size
+    local = camera.local(surface.vertices)
+    faces = np.ascontiguousarray(surface.faces, dtype=np.int64)
+    corners = project(local, camera.K)
+    inverse, first = nearest_faces(corners, faces, camera.size, farthest=0.0)
+    depth = np.zeros((height, width), dtype=np.float32)
+    normals = np.zeros((height, width, 3), dtype=np.float32) if with_normals else None
+    parts, instances, markers = (np.zeros((height, width), dtype=np.uint8) for _ in range(3))
+    labels = np.stack([surface.parts, surface.instances, surface.markers], axis=1)
+    _write(inverse, first, labels, depth, parts, instances, markers)
+    if normals is not None:
+        turned = surface.normals @ camera.T_world_camera[:3, :3]
+        _interpolate(faces, turned, corners, first, normals)
+    return Pictures(depth=depth, normals=normals, parts=parts, instances=instances, markers=markers)
+
+
+def nearest_faces(
+    corners: Float[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    size: tuple[int, int],
+    *,
+    farthest: float,
+) -> tuple[Float32[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
+    """Nearness behind the center of every pixel, and the number of the face there, -1 for none.
+
+    Args:
+        corners: Pixels and nearness of the vertices; the nearness must be linear over a triangle's picture,
+            as is one over the depth, or the depth itself where rays are parallel. NaN hides a vertex's faces.
+        faces: Triangles that run counter-clockwise in the picture, where y is down, are drawn.
+        size: Width and height of the picture [px].
+        farthest: Nearness of nothing.
+    """
+    nearness = np.full(size[::-1], farthest, dtype=np.float32)
+    first = np.full(size[::-1], -1, dtype=np.int32)
+    _draw(corners, faces, nearness, first)
+    return nearness, first
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def project(local: Any, K: Any) -> Any:
+    """Pixels and one over the depth (V, 3) of points (V, 3) in a pinhole camera's axes; NaN before `NEAR`."""
+    corners = np.full_like(local, np.nan)
+    for vertex in range(len(local)):
+        depth = local[vertex, 2]
+        if depth >= NEAR:
+            corners[vertex, 0] = K[0, 0] * local[vertex, 0] / depth + K[0, 2]
+            corners[vertex, 1] = K[1, 1] * local[vertex, 1] / depth + K[1, 2]
+            corners[vertex, 2] = 1.0 / depth
+    return corners
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
+    height, width = nearness.shape
+    for face in range(len(faces)):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        ax, ay, az = corners[a, 0], corners[a, 1], corners[a, 2]
+        bx, by, bz = corners[b, 0] - ax, corners[b, 1] - ay, corners[b, 2] - az
+        cx, cy, cz = corners[c, 0] - ax, corners[c, 1] - ay, corners[c, 2] - az
+        area = bx * cy - by * cx
+        if not area < 0.0:
+            continue  # the back of a face, or none
+        low_x, high_x = min(0.0, bx, cx) + ax, max(0.0, bx, cx) + ax
+        low_y, high_y = min(0.0, by, cy) + ay, max(0.0, by, cy) + ay
+        if high_x < 0.0 or high_y < 0.0 or low_x > width or low_y > height:
+            continue
+        left, right = max(0, int(np.ceil(low_x - 0.5))), min(width - 1, int(np.floor(high_x - 0.5)))
+        top, bottom = max(0, int(np.ceil(low_y - 0.5))), min(height - 1, int(np.floor(high_y - 0.5)))
+        scale = 1.0 / area
+        step_v, step_w = cy * scale, -by * scale
+        for row in range(top, bottom + 1):
+            y = row + 0.5 - ay
+            x = left + 0.5 - ax
+            v, w = (x * cy - y * cx) * scale, (y * bx - x * by) * scale
+            for column in range(left, right + 1):
+                if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
+                    near = az + v * bz + w * cz
+                    if near > nearness[row, column]:
+                        nearness[row, column] = near
+                        first[row, column] = face
+                v += step_v
+                w += step_w
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _write(
+    inverse: Any, first: Any, labels: Any, depth: Any, parts: Any, instances: Any, markers: Any
+) -> None:
+    """What the nearest faces have to say."""
+    height, width = first.shape
+    for row in range(height):
+        for column in range(width):
+            face = first[row, column]
+            if face >= 0:
+                depth[row, column] = 1.0 / inverse[row, column]
+                parts[row, column] = labels[face, 0]
+                instances[row, column] = labels[face, 1]
+                markers[row, column] = labels[face, 2]
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _interpolate(faces: Any, normals: Any, corners: Any, first: Any, picture: Any) -> None:
+    """Unit normals behind the centers of all pixels that show something."""
+    height, width = first.shape
+    for row in range(height):
+        for column in range(width):
+            face = first[row, column]
+            if face < 0:
+                continue
+            a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+            ax, ay = corners[a, 0], corners[a, 1]
+            bx, by = corners[b, 0] - ax, corners[b, 1] - ay
+            cx, cy = corners[c, 0] - ax, corners[c, 1] - ay
+            x, y, scale = column + 0.5 - ax, row + 0.5 - ay, 1.0 / (bx * cy - by * cx)
+            v, w = (x * cy - y * cx) * scale, (y * bx - x * by) * scale
+            p, q, r = (1.0 - v - w) * corners[a, 2], v * corners[b, 2], w * corners[c, 2]
+            total = 0.0
+            for i in range(3):
+                value = p * normals[a, i] + q * normals[b, i] + r * normals[c, i]
+                picture[row, column, i] = value
+                total += value * value
+            scale = 1.0 / np.sqrt(total)
+            for i in range(3):
+                picture[row, column, i] *= scale

@@ -1,0 +1,222 @@
+"""What is in a picture: posed hands, markers, free points, and the camera that looks at them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.fit import GloveFit
+from handsim._checks import check_array
+from handsim.errors import HandSimError
+from handsim.hand.model import HandModel
+from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.topology import NUM_QPOS
+from render.painting.gl import load_pyrender
+from render.painting.lights import STUDIO, add_lights
+from render.painting.materials import (
+    BACKGROUND,
+    MARKER_COLOR,
+    Covering,
+    Material,
+    ball_material,
+    covering_material,
+    linear,
+    skin_tint,
+)
+from render.painting.spheres import sphere_surface
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
+_NEAR, _FAR = 0.01, 20.0  # [m]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A camera: its pose and how wide it sees.
+
+    Raises:
+        HandSimError: The pose is not (4, 4), or the angle is no camera's.
+    """
+
+    T_world_camera: Float[np.ndarray, "4 4"]
+    """Pose in the world [m], OpenCV axes: x right, y down, z into the picture."""
+    field_of_view: float
+    """Full vertical opening angle [rad]."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
+        if not 0.0 < self.field_of_view < np.pi:
+            raise HandSimError(f"field_of_view is {self.field_of_view:g}, expected radians between 0 and pi")
+
+    def project(
+        self, points: Float[np.ndarray, "*batch 3"], size: tuple[int, int]
+    ) -> Float[np.ndarray, "*batch 2"]:
+        """Pixels of world points in a picture (width, height): x right, y down, first center at 0.5."""
+        rotation, center = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        local = (points - center) @ rotation
+        focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
+        pixels: NDArray[np.float64] = focal * local[..., :2] / local[..., 2:] + np.array(size) / 2
+        return pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Balls:
+    """Spheres of one radius, such as markers or the points that an optical system sees."""
+
+    centers: Float[np.ndarray, "N 3"]
+    """Centers in the world [m]; NaN rows are not drawn."""
+    radius: float
+    """Radius [m]."""
+    colors: Float[np.ndarray, "N 3"] | tuple[float, float, float] = MARKER_COLOR
+    """sRGB in [0, 1], one for all or one each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedHand:
+    """A hand in a pose, with or without a glove's markers."""
+
+    hand: GloveFit | HandModel
+    """In a glove whose markers are drawn, or without one."""
+    qpos: Float[np.ndarray, "27"]
+    """Wrist position [m], wrist orientation (wxyz), hinge angles [rad]."""
+    covering: Covering = "skin"
+    """Bare skin or a dark glove."""
+    marker_colors: Float[np.ndarray, "M 3"] | tuple[float, float, float] = MARKER_COLOR
+    """sRGB in [0, 1], one for all markers or one each."""
+
+    def __post_init__(self) -> None:
+        qpos = check_array("qpos", self.qpos, (NUM_QPOS,))
+        if qpos.ndim != 1:
+            raise HandSimError(f"qpos has shape {qpos.shape}, expected ({NUM_QPOS},): one pose a hand")
+        object.__setattr__(self, "qpos", qpos)
+
+    @property
+    def model(self) -> HandModel:
+        """The hand without its glove."""
+        return self.hand.model if isinstance(self.hand, GloveFit) else self.hand
+
+    def vertices(self) -> Float[np.ndarray, "V 3"]:
+        """Skin in the world [m]."""
+        vertices: NDArray[np.float64] = self.model.skin(self.qpos[None])[0]
+        return vertices
+
+    def markers(self) -> Float[np.ndarray, "M 3"]:
+        """Marker centers in the world [m]; none without a glove."""
+        if not isinstance(self.hand, GloveFit):
+            return np.empty((0, 3))
+        markers: NDArray[np.float64] = self.hand.markers(self.qpos[None])[0][0]
+        return markers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandScene:
+    """All that one picture shows."""
+
+    view: View
+    hands: tuple[PosedHand, ...] = ()
+    balls: tuple[Balls, ...] = ()
+    background: tuple[float, float, float] = BACKGROUND
+    """sRGB in [0, 1]."""
+
+
+def view_along(
+    direction: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, "3"],
+    points: Float[np.ndarray, "N 3"],
+    size: tuple[int, int],
+    *,
+    field_of_view: float = np.deg2rad(24.0),
+    margin: float = 0.06,
+) -> View:
+    """The nearest view in a given direction that has all points in the picture.
+
+    Args:
+        direction: Where the camera looks, in the world.
+        up: What shall point up in the picture.
+        points: What must be seen [m].
+        size: Width and height of the picture [pixels].
+        field_of_view: Full vertical opening angle [rad].
+        margin: Room left free on each side [share of the picture].
+    """
+    ahead = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    local = points @ rotation
+    slope = np.tan(field_of_view / 2) * (1 - 2 * margin) * np.array([size[0] / size[1], 1.0])
+    # A point is inside when |x - x0| <= slope (z + distance), two linear limits; so is y.
+    above = (local[:, :2] - slope * local[:, 2:]).max(axis=0)
+    below = (-local[:, :2] - slope * local[:, 2:]).max(axis=0)
+    distance = max(*((above + below) / (2 * slope)), 2 * _NEAR - local[:, 2].min())
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
+    return View(pose, field_of_view)
+
+
+def build_scene(scene: HandScene) -> Any:
+    """The pyrender scene: meshes with smooth normals, three lights that go with the camera, the camera.
+
+    Raises:
+        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+    """
+    pyrender = load_pyrender()
+    built = pyrender.Scene(bg_color=[*scene.background, 1.0])
+    for hand in scene.hands:
+        built.add(_hand_mesh(pyrender, hand))
+        if isinstance(hand.hand, GloveFit):
+            radius = hand.hand.layout.radius
+            _add_balls(pyrender, built, Balls(hand.markers(), radius, hand.marker_colors))
+    for balls in scene.balls:
+        _add_balls(pyrender, built, balls)
+    camera = pyrender.PerspectiveCamera(yfov=scene.view.field_of_view, znear=_NEAR, zfar=_FAR)
+    built.add(camera, pose=scene.view.T_world_camera @ OPENGL_FROM_OPENCV)
+    add_lights(pyrender, built, STUDIO, scene.view.T_world_camera)
+    return built
+
+
+def _hand_mesh(pyrender: Any, hand: PosedHand) -> Any:
+    vertices, faces = hand.vertices(), hand.model.surface.faces
+    colors = np.ones((len(vertices), 4))
+    if hand.covering == "skin":
+        colors[:, :3] = skin_tint(hand.model)
+    normals = vertex_normals(vertices, faces)
+    return _mesh(pyrender, vertices, normals, faces, colors, covering_material(hand.covering))
+
+
+def _add_balls(pyrender: Any, built: Any, balls: Balls) -> None:
+    """One mesh for all balls, told apart by vertex colors."""
+    known = np.isfinite(balls.centers).all(axis=-1)
+    centers = balls.centers[known]
+    if not len(centers):
+        return
+    vertices, normals, faces = sphere_surface(centers, balls.radius, level=3)
+    each = len(vertices) // len(centers)
+    colors = np.ones((len(vertices), 4))
+    tint = linear(np.broadcast_to(np.asarray(balls.colors, dtype=np.float64), balls.centers.shape)[known])
+    colors[:, :3] = np.repeat(tint, each, axis=0)
+    built.add(_mesh(pyrender, vertices, normals, faces, colors, ball_material()))
+
+
+def _mesh(
+    pyrender: Any,
+    vertices: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    colors: NDArray[np.float64],
+    material: Material,
+) -> Any:
+    primitive = pyrender.Primitive(
+        positions=vertices,
+        normals=normals,
+        indices=faces,
+        color_0=colors,
+        material=material.for_pyrender(),
+    )
+    return pyrender.Mesh(primitives=[primitive])

@@ -1,0 +1,122 @@
+"""The light that a place on a surface sends to the eye, by its texture and glTF 2.0's microfacet model.
+
+Lambert's diffuse light under Schlick's Fresnel term, GGX with Smith's occlusion in Schlick's form (Khronos
+glTF 2.0 specification, appendix B), as pyrender's shader has them, so that both painters agree.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numba
+import numpy as np
+
+from render.painting.shadow_map import lit_share
+
+GAMMA: Final = 2.2
+_FACING: Final = 0.04  # what a surface that is no metal mirrors when one looks straight at it
+_LIFT: Final = 1.7  # slanting surfaces are read this much above themselves, lest they shade themselves [bias]
+_LEVELS: Final = 2048
+_BYTES = np.arange(256) / 255.0
+TO_LINEAR: Final = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
+"""Linear light of sRGB bytes."""
+TO_DISPLAY: Final = np.linspace(0.0, 1.0, _LEVELS) ** (2.0 / GAMMA)
+"""Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
+
+SPOT: Final = 21
+"""How many numbers a spot of a surface takes on its way to the eye.
+
+Pixel and nearness (3), place (3) and unit normal (3) in the camera's axes, tint (3), place in the texture
+(2), linear color (3), roughness, the texture's normal (3)."""
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def display(light: float, table: Any) -> float:
+    """The display value of linear light, cut to [0, 1]; `table` is `TO_DISPLAY`."""
+    root = np.sqrt(min(max(light, 0.0), 1.0)) * (_LEVELS - 1)
+    low = min(int(root), _LEVELS - 2)
+    value: float = table[low] + (root - low) * (table[low + 1] - table[low])
+    return value
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def read_texels(texels: Any, table: Any, spot: Any) -> None:
+    """Multiply a spot's color and roughness by the texture's, and write its normal; straight between texels.
+
+    Args:
+        texels: See `Material.texels`.
+        table: `TO_LINEAR`.
+        spot: See `SPOT`.
+    """
+    rows, columns = texels.shape[:2]
+    across = min(max(spot[12] * columns - 0.5, 0.0), columns - 1.001)
+    down = min(max((1.0 - spot[13]) * rows - 0.5, 0.0), rows - 1.001)
+    column, row = int(across), int(down)
+    right, below = across - column, down - row
+    red = green = blue = rough = x = y = z = 0.0
+    for i in range(2):
+        for j in range(2):
+            share = (below if i else 1.0 - below) * (right if j else 1.0 - right)
+            red += share * table[texels[row + i, column + j, 0]]
+            green += share * table[texels[row + i, column + j, 1]]
+            blue += share * table[texels[row + i, column + j, 2]]
+            rough += share * texels[row + i, column + j, 3]
+            x += share * texels[row + i, column + j, 4]
+            y += share * texels[row + i, column + j, 5]
+            z += share * texels[row + i, column + j, 6]
+    spot[14] *= red
+    spot[15] *= green
+    spot[16] *= blue
+    spot[17] *= rough / 255.0
+    spot[18], spot[19], spot[20] = x / 127.5 - 1.0, y / 127.5 - 1.0, z / 127.5 - 1.0
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def light_up(
+    spot: Any, glow: float, lamps: Any, ambient: Any, to_map: Any, nearest: Any, bias: float, light: Any
+) -> None:
+    """Write the linear light (red, green, blue) that goes from a spot to the eye in the frame's origin.
+
+    Args:
+        spot: See `SPOT`.
+        glow: See `Material.glow`.
+        lamps: Rows (9): unit vector to the lamp, and its light with and without shadows.
+        ambient: Light from everywhere by the normal (9, 3), see `surroundings.irradiance`.
+        to_map: The first lamp's `ShadowMap`, as the next two.
+        nearest: The same.
+        bias: The same.
+        light: Three numbers, written.
+    """
+    px, py, pz, nx, ny, nz = spot[3], spot[4], spot[5], spot[6], spot[7], spot[8]
+    away = -1.0 / np.sqrt(px * px + py * py + pz * pz)
+    vx, vy, vz = px * away, py * away, pz * away
+    facing = min(max(abs(nx * vx + ny * vy + nz * vz), 0.001), 1.0)
+    rough = max(spot[17], 0.04)
+    square, k = rough**4, (rough + 1.0) ** 2 / 8.0
+    red, green, blue = spot[14], spot[15], spot[16]
+    for i in range(3):
+        around = ambient[0, i] + nx * ambient[1, i] + ny * ambient[2, i] + nz * ambient[3, i]
+        around += nx * ny * ambient[4, i] + ny * nz * ambient[5, i] + nx * nz * ambient[6, i]
+        around += (nx * nx - ny * ny) * ambient[7, i] + (3.0 * nz * nz - 1.0) * ambient[8, i]
+        light[i] = spot[14 + i] * (max(around, 0.0) + glow)
+    for lamp in range(len(lamps)):
+        lx, ly, lz = lamps[lamp, 0], lamps[lamp, 1], lamps[lamp, 2]
+        slope = nx * lx + ny * ly + nz * lz
+        if slope <= 0.0:
+            continue
+        hx, hy, hz = lx + vx, ly + vy, lz + vz
+        length = np.sqrt(max(hx * hx + hy * hy + hz * hz, 1e-12))
+        half = max((nx * hx + ny * hy + nz * hz) / length, 0.0)
+        grazing = 1.0 - 0.5 * length  # the half vector's length is twice its cosine with either
+        fresnel = _FACING + (1.0 - _FACING) * grazing**5
+        peak = half * half * (square - 1.0) + 1.0
+        occlusion = 4.0 * (facing * (1.0 - k) + k) * (slope * (1.0 - k) + k)
+        mirrored = slope * fresnel * square / (np.pi * peak * peak * occlusion)
+        scattered = slope * (1.0 - fresnel) * (1.0 - _FACING) / np.pi
+        lit = 1.0
+        if lamp == 0:
+            lift = _LIFT * bias * np.sqrt(1.0 - min(slope, 1.0) ** 2)
+            lit = lit_share(to_map, nearest, bias, px + lift * nx, py + lift * ny, pz + lift * nz)
+        light[0] += (scattered * red + mirrored) * (lit * lamps[lamp, 3] + lamps[lamp, 6])
+        light[1] += (scattered * green + mirrored) * (lit * lamps[lamp, 4] + lamps[lamp, 7])
+        light[2] += (scattered * blue + mirrored) * (lit * lamps[lamp, 5] + lamps[lamp, 8])

@@ -1,0 +1,73 @@
+"""Which places a far lamp does not reach: the lamp's own z-buffer of what stands in its light."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numba
+import numpy as np
+
+from render.painting.rasterizer import nearest_faces
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32, Int
+
+_TEXELS: Final = (
+    640  # along a side; hands and forearms are half a meter across, a finger's edge a millimeter soft
+)
+_MARGIN: Final = 3.0  # [texels] that reads of neighbors may go beyond what is drawn
+
+
+class ShadowMap(NamedTuple):
+    """How near the nearest surface is to a far lamp."""
+
+    to_map: Float[np.ndarray, "3 4"]
+    """Takes places to columns and rows [texels] and nearness to the lamp [m]."""
+    nearest: Float32[np.ndarray, "N N"]
+    """Nearness [m], minus infinity where nothing is."""
+    bias: float
+    """How much nearer something must be to cast a shadow [m]: about a texel."""
+
+
+def shadow_map(
+    points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], towards: Float[np.ndarray, "3"]
+) -> ShadowMap:
+    """The shadows of a surface.
+
+    Args:
+        points: Vertices [m], in any frame.
+        faces: Triangles.
+        towards: Unit vector to the lamp, in the same frame.
+    """
+    aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
+    aside /= np.linalg.norm(aside)
+    rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
+    turned = points @ rotation.T
+    low, high = turned[:, :2].min(axis=0), turned[:, :2].max(axis=0)
+    scale = (_TEXELS - 2.0 * _MARGIN) / max(float((high - low).max()), 1e-6)
+    to_map = np.column_stack([rotation, np.zeros(3)])
+    to_map[:2] *= scale
+    to_map[:2, 3] = _MARGIN - scale * low
+    corners = turned * [scale, scale, 1.0] + to_map[:, 3]
+    nearest, _ = nearest_faces(corners, faces, (_TEXELS, _TEXELS), farthest=-np.inf)
+    return ShadowMap(to_map, nearest, 1.5 / scale)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def lit_share(to_map: Any, nearest: Any, bias: float, x: float, y: float, z: float) -> float:
+    """Share of the lamp that is seen from a place: the mean over a square of three texels around it."""
+    across = to_map[0, 0] * x + to_map[0, 1] * y + to_map[0, 2] * z + to_map[0, 3] - 0.5
+    down = to_map[1, 0] * x + to_map[1, 1] * y + to_map[1, 2] * z + to_map[1, 3] - 0.5
+    near = to_map[2, 0] * x + to_map[2, 1] * y + to_map[2, 2] * z + to_map[2, 3] + bias
+    column, row = int(np.floor(across)) - 1, int(np.floor(down)) - 1
+    size = len(nearest)
+    if column < 0 or row < 0 or column + 4 > size or row + 4 > size:
+        return 1.0
+    right, below = across - np.floor(across), down - np.floor(down)
+    lit = 0.0
+    for i in range(4):
+        high = 1.0 - below if i == 0 else below if i == 3 else 1.0
+        for j in range(4):
+            if nearest[row + i, column + j] <= near:
+                lit += high * (1.0 - right if j == 0 else right if j == 3 else 1.0)
+    return lit / 9.0

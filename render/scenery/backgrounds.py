@@ -1,0 +1,262 @@
+"""What stands behind the hands: plain walls, gradients, noise, clutter, rooms, or a user's own photographs.
+
+Nothing here looks like a hand. A background is a few plain values and a seed; drawing it again gives the same
+picture.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+import cv2
+import numpy as np
+
+from handsim.errors import HandSimError, choices
+from render.scenery.rooms import draw_room, paint_tint
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32
+    from numpy.typing import NDArray
+
+BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
+KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
+PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+_TRIES: Final = 50  # a folder in which so many files in turn cannot be read is no folder of photographs
+_GAMMA: Final = 2.2
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundConfig:
+    """Which backgrounds to draw, and how often each: shares, of any sum.
+
+    Raises:
+        HandSimError: A share is negative, none is positive, or photographs are wanted without a folder.
+    """
+
+    plain: float = 0.1
+    gradient: float = 0.1
+    noise: float = 0.15
+    clutter: float = 0.15
+    room: float = 0.5
+    photo: float = 0.0
+    photos: str | None = None
+    """Folder of photographs, its subfolders included."""
+
+    def __post_init__(self) -> None:
+        shares = self.shares()
+        if min(shares) < 0.0 or not sum(shares) > 0.0:
+            raise HandSimError(f"shares of backgrounds are {shares}, expected none negative and one positive")
+        if self.photo > 0.0 and self.photos is None:
+            raise HandSimError("backgrounds of photographs need `photos`, the folder they lie in")
+
+    def shares(self) -> tuple[float, ...]:
+        """The shares in the order of `KINDS`."""
+        return self.plain, self.gradient, self.noise, self.clutter, self.room, self.photo
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """One background in plain values."""
+
+    kind: BackgroundKind
+    colors: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """Linear light; rooms and photographs take none of it."""
+    seed: int
+    blur: float = 0.0
+    """How far out of focus it is: spread of its blur, in picture heights."""
+    photo: str | None = None
+    """The photograph's file."""
+
+
+def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> Background:
+    """A random background.
+
+    Raises:
+        HandSimError: Photographs are wanted, and the folder holds none that can be read.
+    """
+    shares = np.array(config.shares())
+    kind = KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
+    first, second = _color(rng), _color(rng)
+    blur = float(rng.uniform(0.0, 0.008)) if kind in ("room", "clutter", "photo") else 0.0
+    photo = str(_pick_photo(Path(str(config.photos)), rng)) if kind == "photo" else None
+    return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo)
+
+
+def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
+    """The picture in linear light, 1 for full white.
+
+    Args:
+        background: What to draw.
+        size: Width and height [pixels].
+
+    Raises:
+        HandSimError: The kind is unknown, or the photograph cannot be read.
+    """
+    rng = np.random.default_rng(background.seed)
+    first, second = (np.array(color, dtype=np.float32) for color in background.colors)
+    width, height = size
+    if background.kind == "plain":
+        picture = np.broadcast_to(first, (height, width, 3)).copy()
+    elif background.kind == "gradient":
+        picture = _gradient(first, second, size, rng)
+    elif background.kind == "noise":
+        picture = _noise(first, second, size, rng)
+    elif background.kind == "clutter":
+        picture = _clutter(first, second, size, rng)
+    elif background.kind == "room":
+        picture = draw_room(size, rng=rng)
+    elif background.kind == "photo":
+        picture = _photo(Path(str(background.photo)), size, rng)
+    else:
+        raise HandSimError(choices(background.kind, KINDS, noun="background"))
+    if background.blur * height > 0.3:
+        picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
+    drawn: NDArray[np.float32] = np.clip(picture, 0.0, 1.0).astype(np.float32)
+    return drawn
+
+
+def _color(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Linear light of a wall or a cloth: grays more often than strong colors."""
+    gray = rng.uniform(0.12, 0.95) ** _GAMMA
+    red, green, blue = np.clip(gray * np.exp(paint_tint(rng)), 0.003, 0.95)
+    return float(red), float(green), float(blue)
+
+
+def _gradient(
+    first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    x = np.linspace(-1.0, 1.0, size[0], dtype=np.float32) * np.float32(np.cos(turn))
+    y = np.linspace(-1.0, 1.0, size[1], dtype=np.float32) * np.float32(np.sin(turn))
+    share = (x[None, :] + y[:, None])[..., None]
+    share = 0.5 + 0.5 * share / np.abs(share).max()
+    blend: NDArray[np.float32] = first + share * (second - first)
+    return blend
+
+
+def _octaves(
+    size: tuple[int, int], channels: int, fall: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Noise of all scales, each half as large as the one before and `fall` times as strong; spread 1."""
+    width, height = size
+    cells, strength, squares = 3, 1.0, 0.0
+    total = np.zeros((cells, max(2, cells * width // height), channels), dtype=np.float32)
+    while cells < height:
+        shape = (max(2, cells * width // height), cells)
+        total = cv2.resize(total, shape, interpolation=cv2.INTER_CUBIC).reshape(cells, shape[0], channels)
+        total += np.float32(strength) * rng.standard_normal(total.shape, dtype=np.float32)
+        squares += strength**2
+        cells, strength = 2 * cells, fall * strength
+    total *= np.float32(1.0 / np.sqrt(squares))
+    whole: NDArray[np.float32] = cv2.resize(total, size, interpolation=cv2.INTER_CUBIC)
+    return whole.reshape(height, width, channels)
+
+
+def _noise(
+    first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    share = 0.5 + 0.35 * _octaves(size, 1, float(rng.uniform(0.5, 0.85)), rng)
+    color = 1.0 + 0.12 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
+    mixed: NDArray[np.float32] = (first + np.clip(share, 0.0, 1.0) * (second - first)) * color
+    return mixed
+
+
+def _clutter(
+    first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Things on a table: boxes, discs and cloths of all colors in a heap, each with its own light."""
+    picture = _noise(first, 0.6 * first + 0.4 * second, size, rng)
+    height = size[1]
+    for _ in range(int(rng.integers(8, 30))):
+        color = np.array(_color(rng), dtype=np.float32)
+        center = rng.uniform(0.0, 1.0, 2) * size
+        reach = height * rng.uniform(0.05, 0.28)
+        corners = 24 if rng.random() < 0.25 else 4
+        stretch = rng.uniform(0.45, 1.0) if corners == 4 else rng.uniform(0.8, 1.0)
+        turn = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(corners) / corners
+        outline = np.stack([np.cos(turn), stretch * np.sin(turn)], axis=1) * reach
+        lean = rng.uniform(0.0, 2.0 * np.pi)
+        axes = np.array([[np.cos(lean), np.sin(lean)], [-np.sin(lean), np.cos(lean)]])
+        light = np.float32(rng.uniform(0.8, 1.15))
+        _lay_down(picture, outline @ axes + center, light * color)
+    return picture * (1.0 + 0.06 * _octaves(size, 1, 0.8, rng))
+
+
+def _lay_down(picture: NDArray[np.float32], outline: NDArray[np.float64], color: NDArray[np.float32]) -> None:
+    """Paint a thing over a picture, with its shadow to the right and below."""
+    height, width = picture.shape[:2]
+    offset = 0.02 * height
+    low = np.clip(np.floor(outline.min(axis=0)).astype(int) - 8, 0, (width, height))
+    high = np.clip(np.ceil(outline.max(axis=0) + offset).astype(int) + 8, 0, (width, height))
+    if (low >= high).any():
+        return
+    part = picture[low[1] : high[1], low[0] : high[0]]
+    mask = np.zeros(part.shape[:2], dtype=np.float32)
+    cv2.fillPoly(mask, [np.rint(16.0 * (outline + offset - low)).astype(np.int32)], 0.5, cv2.LINE_AA, 4)
+    part *= 1.0 - cv2.blur(mask, (9, 9))[..., None]
+    mask[:] = 0.0
+    cv2.fillPoly(mask, [np.rint(16.0 * (outline - low)).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
+    part += mask[..., None] * (color - part)
+
+
+@functools.lru_cache(maxsize=2)
+def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Photographs in a folder and its subfolders: those that are some by their first bytes, and the others.
+
+    Raises:
+        HandSimError: There is no such folder, or none in it is readable.
+    """
+    if not folder.is_dir():
+        raise HandSimError(f"{folder}: no such folder of photographs")
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
+    good = tuple(file for file in files if cv2.haveImageReader(str(file)))
+    if not good:
+        raise _no_photo(folder)
+    return good, tuple(file for file in files if file not in set(good))
+
+
+def _pick_photo(folder: Path, rng: np.random.Generator) -> Path:
+    """A random photograph that can be read whole."""
+    files, _ = photo_files(folder)
+    for place in rng.permutation(len(files))[:_TRIES]:
+        if _read(files[place]) is not None:
+            readable: Path = files[place]
+            return readable
+    raise _no_photo(folder)
+
+
+def _no_photo(folder: Path) -> HandSimError:
+    endings = ", ".join(PHOTO_SUFFIXES)
+    return HandSimError(f"{folder}: no photograph that can be read; expected files that end in {endings}")
+
+
+def _read(file: Path) -> NDArray[np.uint8] | None:
+    try:
+        data = np.fromfile(file, dtype=np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except (OSError, cv2.error):
+        return None
+    return None if picture is None else np.asarray(picture)
+
+
+def _photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
+    """A random part of a photograph in the picture's proportions, as large as fits at up to half the zoom."""
+    photo = _read(file)
+    if photo is None:
+        raise HandSimError(f"{file}: not a readable photograph")
+    height, width = photo.shape[:2]
+    scale = min(width / size[0], height / size[1]) * rng.uniform(0.5, 1.0)
+    part = np.maximum(np.array(size) * scale, 1.0).astype(int)
+    left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
+    cut = photo[top : top + part[1], left : left + part[0], ::-1]
+    if rng.random() < 0.5:
+        cut = cut[:, ::-1]
+    shrinks = part[0] > size[0]
+    scaled = cv2.resize(
+        np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
+    light: NDArray[np.float32] = (scaled.astype(np.float32) / 255.0) ** _GAMMA
+    return light

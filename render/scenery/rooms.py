@@ -1,0 +1,231 @@
+"""Pictures of made-up rooms: walls, floor and ceiling with patterns, and boxes for furniture, ray by ray.
+
+Half of the picture's resolution is enough: a background is out of focus.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import cv2
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32
+    from numpy.typing import NDArray
+
+_REDUCED: Final = 2
+_FURNITURE: Final = (4, 14)
+_PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls
+_FRAME: Final = 0.06  # of a picture or window, as a share of its sides
+
+
+class _Walls(NamedTuple):
+    """What is painted on the six sides: from the room's origin and from its far corner, for x, y and z."""
+
+    patterns: NDArray[np.int64]
+    pitches: NDArray[np.float64]
+    """Of stripes, tiles and boards (6,) [m]."""
+    colors: NDArray[np.float64]
+    """Two of each (6, 2, 3), linear."""
+    boards: NDArray[np.float64]
+    """Tones of boards (512,)."""
+    frames: NDArray[np.float64]
+    """Pictures and windows (6, 3, 11): left, low, width, height, colors of frame and glass, slope; width 0:
+    none."""
+
+
+class _Boxes(NamedTuple):
+    """Furniture: B boxes."""
+
+    corners: NDArray[np.float64]
+    """Low and high (B, 2, 3) [m]."""
+    colors: NDArray[np.float64]
+    """Linear (B, 2, 3)."""
+    bands: NDArray[np.float64]
+    """How many drawers or shelves, and what share of each has the second color (B, 2)."""
+    shades: NDArray[np.float64]
+    """Of the faces along x, y and z (B, 3)."""
+
+
+def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.ndarray, "H W 3"]:
+    """A random room from a random place, linear light.
+
+    Args:
+        size: Width and height [pixels].
+        rng: Where the choices come from.
+    """
+    width, height = (max(1, length // _REDUCED) for length in size)
+    room = rng.uniform((2.5, 2.5, 2.3), (7.0, 7.0, 3.2))  # [m], corner at the origin, z up
+    eye = room * rng.uniform((0.25, 0.05, 0.35), (0.75, 0.3, 0.75))
+    rays = _rays(width, height, rng)
+    # Lamps and windows leave some places darker than others.
+    lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
+    light = np.empty((height * width, 3), dtype=np.float32)
+    _cast(rays, eye, room, *_paint_walls(room, rng), *_place_boxes(room, eye, rng), lamp, strength, light)
+    small = light.reshape(height, width, 3)
+    small *= 1.0 + np.float32(0.05) * rng.standard_normal((height, width, 1), dtype=np.float32)
+    small = cv2.GaussianBlur(small, (0, 0), 0.7)  # or edges would show the coarse pixels
+    drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
+    return drawn
+
+
+def _rays(width: int, height: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Directions (H W, 3) of a camera that looks into the room, a little up or down and askew."""
+    focal = height * rng.uniform(0.8, 1.5)
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
+    turn, tip, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
+    x, y = np.cos(roll) * x - np.sin(roll) * y, np.sin(roll) * x + np.cos(roll) * y
+    ahead, up = focal * np.cos(tip) + y * np.sin(tip), focal * np.sin(tip) - y * np.cos(tip)
+    along = np.stack(
+        [np.cos(turn) * x - np.sin(turn) * ahead, np.sin(turn) * x + np.cos(turn) * ahead, up], -1
+    )
+    along = along.reshape(-1, 3)
+    along[np.abs(along) < 1e-6] = 1e-6
+    rays: NDArray[np.float32] = (along / np.linalg.norm(along, axis=1, keepdims=True)).astype(np.float32)
+    return rays
+
+
+def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
+    frames = np.zeros((6, 3, 11))
+    for wall in range(4):  # not on floor and ceiling
+        across = room[1 - wall // 2]
+        for number in range(int(rng.integers(0, 4))):
+            wide, high = rng.uniform((0.3, 0.3), (1.4, 1.2))
+            left, low = rng.uniform(0.0, 1.0, 2) * np.maximum([across - wide, room[2] - high], 0.01)
+            window = rng.random() < 0.3
+            glass = np.ones(3) if window else _paint(rng)
+            frames[wall, number] = left, low, wide, high, *_paint(rng), *glass, rng.uniform(-0.5, 0.5)
+    return _Walls(
+        rng.choice([_STRIPES, _TILES, _BOARDS, _PLAIN, _PLAIN], 6),
+        rng.uniform(0.06, 0.5, 6),
+        np.array([[_paint(rng), _paint(rng)] for _ in range(6)], dtype=np.float64),
+        rng.uniform(0.0, 0.5, 512),
+        frames,
+    )
+
+
+def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.random.Generator) -> _Boxes:
+    """Furniture that stands on the floor, or hangs on or stands by a wall."""
+    count = int(rng.integers(*_FURNITURE))
+    extents = rng.uniform((0.2, 0.2, 0.1), (1.6, 1.0, 1.9), (count, 3)) * rng.uniform(0.4, 1.0, (count, 1))
+    low = rng.uniform(0.001, 0.999, (count, 3)) * np.maximum(room - extents, 0.01)
+    low[:, 1] = np.maximum(low[:, 1], eye[1] + 0.7)  # ahead of the camera
+    low[rng.random(count) < 0.7, 2] = 0.0
+    return _Boxes(
+        np.stack([low, low + extents], axis=1),
+        np.array([[_paint(rng), _paint(rng)] for _ in range(count)], dtype=np.float64),
+        np.column_stack([rng.integers(0, 5, count), rng.uniform(0.05, 0.5, count)]),
+        rng.uniform(0.55, 1.0, (count, 3)),
+    )
+
+
+# Arrays come one by one: those in a tuple are counted at every access, which costs more than the casting.
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _cast(
+    rays: Any,
+    eye: Any,
+    room: Any,
+    patterns: Any,
+    pitches: Any,
+    colors: Any,
+    boards: Any,
+    frames: Any,
+    corners: Any,
+    box_colors: Any,
+    bands: Any,
+    shades: Any,
+    lamp: Any,
+    strength: float,
+    picture: Any,
+) -> None:
+    """Light (N, 3) that comes along each ray."""
+    place, color = np.empty(3), np.empty(3)
+    for ray in range(len(rays)):
+        reach, wall = np.inf, 0
+        for axis in range(3):
+            far = rays[ray, axis] > 0.0
+            way = ((room[axis] if far else 0.0) - eye[axis]) / rays[ray, axis]
+            if way < reach:
+                reach, wall = way, 2 * axis + int(far)
+        box, side, reach = _nearest_box(rays, ray, eye, corners, reach)
+        light = 0.35
+        for axis in range(3):
+            place[axis] = eye[axis] + reach * rays[ray, axis]
+            light += 0.09 * (place[axis] - lamp[axis]) ** 2
+        light = strength / light
+        if box < 0:
+            _wall_color(place, wall, patterns, pitches, colors, boards, frames, color)
+        else:
+            height = 0.999 * (place[2] - corners[box, 0, 2]) / (corners[box, 1, 2] - corners[box, 0, 2])
+            second = int(bands[box, 0] > 0.0 and (height * bands[box, 0]) % 1.0 < bands[box, 1])
+            light *= shades[box, side]
+            for channel in range(3):
+                color[channel] = box_colors[box, second, channel]
+        for channel in range(3):
+            picture[ray, channel] = light * color[channel]
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _nearest_box(rays: Any, ray: int, eye: Any, corners: Any, reach: float) -> Any:
+    """The first box along a ray within a reach, the axis of its face, and how far it is; -1 for none."""
+    nearest, face = -1, 0
+    for box in range(len(corners)):
+        enter, leave, side = -np.inf, np.inf, 0
+        for axis in range(3):
+            low = (corners[box, 0, axis] - eye[axis]) / rays[ray, axis]
+            high = (corners[box, 1, axis] - eye[axis]) / rays[ray, axis]
+            if min(low, high) > enter:
+                enter, side = min(low, high), axis
+            leave = min(leave, max(low, high))
+        if 0.05 < enter < leave and enter < reach:
+            nearest, face, reach = box, side, enter
+    return nearest, face, reach
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _wall_color(
+    place: Any, wall: int, patterns: Any, pitches: Any, colors: Any, boards: Any, frames: Any, color: Any
+) -> None:
+    """Write what is painted at a place of a wall: plain, stripes, tiles or boards, pictures and windows."""
+    axis = wall // 2
+    first, second = place[1 if axis == 0 else 0], place[1 if axis == 2 else 2]
+    pitch, pattern, share = pitches[wall], patterns[wall], 0.0
+    across, up = int(np.floor(first / pitch)), int(np.floor(second / pitch))
+    if pattern == _STRIPES:
+        share = across % 2
+    elif pattern == _TILES:
+        share = (across + up) % 2
+    elif pattern == _BOARDS:
+        share = boards[(up + 7 * int(first // (6.0 * pitch))) % len(boards)]
+    for channel in range(3):
+        color[channel] = colors[wall, 0, channel]
+        color[channel] += 0.5 * share * (colors[wall, 1, channel] - colors[wall, 0, channel])
+    for number in range(frames.shape[1]):
+        left, low = frames[wall, number, 0], frames[wall, number, 1]
+        wide, high = frames[wall, number, 2], frames[wall, number, 3]
+        if wide == 0.0:
+            continue
+        aside, above = (first - left) / wide, (second - low) / high
+        edge = min(aside, 1.0 - aside, above, 1.0 - above)
+        if edge > 0.0:
+            start = 4 if edge < _FRAME else 7
+            bright = 1.0 if edge < _FRAME else 1.0 + above * frames[wall, number, 10]
+            for channel in range(3):
+                color[channel] = bright * frames[wall, number, start + channel]
+
+
+def _paint(rng: np.random.Generator) -> NDArray[np.float32]:
+    """Linear light of some paint, wood or cloth."""
+    gray = rng.uniform(0.1, 0.95) ** 2.2
+    tint = np.exp(paint_tint(rng))
+    color: NDArray[np.float32] = np.clip(gray * tint, 0.003, 0.95).astype(np.float32)
+    return color
+
+
+def paint_tint(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Logarithms of a paint's red, green and blue over its gray: warm or cool, seldom green or magenta."""
+    warm, green = rng.normal(0.12, 0.28), rng.normal(0.0, 0.10)
+    tint: NDArray[np.float64] = np.array([warm, green, -1.1 * warm])
+    return tint

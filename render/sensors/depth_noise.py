@@ -1,0 +1,160 @@
+"""What a depth sensor makes of perfect depth."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import cv2
+import numpy as np
+
+from handsim.errors import ArgumentError, choices
+from render.cameras.camera import Camera
+from render.cameras.lens import Lens
+from render.sensors import structured_light, time_of_flight
+from render.sensors.structured_light import StructuredLight
+from render.sensors.time_of_flight import TimeOfFlight
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32, UInt8
+    from numpy.typing import NDArray
+
+DepthNoise = StructuredLight | TimeOfFlight
+# Numbers and their sources are in docs/sensors.md.
+_SENSORS: Final[dict[str, DepthNoise]] = {
+    "kinect1": StructuredLight(),
+    "d435": StructuredLight(
+        sensor="d435",
+        baseline=0.05,
+        step=1.0 / 32.0,
+        disparity_noise=0.08,
+        agreement=2.0,
+        nearest=0.2,
+        farthest=10.0,
+    ),
+    "kinect2": TimeOfFlight(),
+    "azure_kinect": TimeOfFlight(
+        sensor="azure_kinect",
+        sigma=(0.0, 1.0e-3, 0.0),
+        flying=0.1,
+        dropped=0.6,
+        weakest=0.0101,
+        nearest=0.5,
+        farthest=3.86,
+    ),
+}
+SENSORS: Final = tuple(_SENSORS)
+
+
+@dataclass(frozen=True, slots=True)
+class DepthNoiseConfig:
+    """Which depth sensors there are, and how far copies of one differ."""
+
+    sensors: tuple[str, ...] = ("kinect2",)
+    """One of them is drawn, see `SENSORS`; none: depth stays perfect."""
+    spread: float = 0.2
+    """Standard deviation of the logarithm of a copy's noise."""
+    offset: float = 0.0035
+    """Standard deviation of a time-of-flight camera's own offset [m]."""
+
+
+def named_sensor(name: str) -> DepthNoise:
+    """A depth sensor as it was published.
+
+    Raises:
+        ArgumentError: There is no sensor of that name.
+    """
+    if name not in _SENSORS:
+        raise ArgumentError(choices(name, _SENSORS, noun="depth sensor"))
+    return _SENSORS[name]
+
+
+def sample_depth_noise(config: DepthNoiseConfig, *, rng: np.random.Generator) -> DepthNoise | None:
+    """One copy of one of the sensors; None if there are none.
+
+    Raises:
+        ArgumentError: There is no sensor of some name.
+    """
+    sensors = [named_sensor(name) for name in config.sensors]
+    if not sensors:
+        return None
+    noise = sensors[int(rng.integers(len(sensors)))]
+    louder, offset = float(np.exp(config.spread * rng.standard_normal())), float(rng.standard_normal())
+    if isinstance(noise, StructuredLight):
+        return dataclasses.replace(noise, disparity_noise=louder * noise.disparity_noise)
+    c0, c1, c2 = (louder * c for c in noise.sigma)
+    return dataclasses.replace(noise, sigma=(c0, c1, c2), offset=config.offset * offset)
+
+
+def apply_depth_noise(
+    depth: Float32[np.ndarray, "H W"],
+    normals: Float32[np.ndarray, "H W 3"] | None,
+    noise: DepthNoise | None,
+    *,
+    camera: Camera,
+    reflectance: Float32[np.ndarray, "H W"] | None = None,
+    rng: np.random.Generator,
+) -> Float32[np.ndarray, "H W"]:
+    """Depth as a sensor has it [m], 0 where it has none.
+
+    Args:
+        depth: Along the camera's axis [m], 0 where there is nothing.
+        normals: Of the surfaces in the camera's axes; without them, all surfaces face the camera.
+        noise: The sensor; None leaves everything as it is.
+        camera: Whose picture it is.
+        reflectance: Share of infrared light that surfaces send back, for time-of-flight sensors; without it,
+            all are white. See `reflectance_of`.
+        rng: Randomness.
+
+    Raises:
+        ArgumentError: A picture is not as large as the camera's.
+    """
+    shape = camera.size[1], camera.size[0]
+    for name, picture in (("depth", depth), ("normals", normals), ("reflectance", reflectance)):
+        if picture is not None and picture.shape[:2] != shape:
+            raise ArgumentError(
+                f"{name} has shape {picture.shape}, expected {shape} as camera '{camera.name}' has"
+            )
+    if noise is None:
+        return depth.copy()
+    cosines = None if normals is None else _facing(normals, camera)
+    if isinstance(noise, StructuredLight):
+        return structured_light.measure(depth, cosines, noise, float(camera.K[0, 0]), rng=rng)
+    return time_of_flight.measure(depth, cosines, reflectance, noise, rng=rng)
+
+
+def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
+    """Cosines between normals and the rays that come back."""
+    (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
+    rays = _back(camera.size, (fx, fy, cx, cy), camera.lens)
+    cosines: NDArray[np.float32] = rays[0] * normals[..., 0]
+    cosines += rays[1] * normals[..., 1]
+    cosines += rays[2] * normals[..., 2]
+    np.maximum(cosines, np.float32(0.0), out=cosines)
+    return cosines
+
+
+@functools.lru_cache(maxsize=16)
+def _back(
+    size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
+) -> NDArray[np.float32]:
+    """Directions (3, H, W) from what is seen to the camera."""
+    fx, fy, cx, cy = middle
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    rays = np.nan_to_num(Camera("rays", size, K, lens=lens).rays())
+    back: NDArray[np.float32] = np.ascontiguousarray(-np.moveaxis(rays, -1, 0), dtype=np.float32)
+    return back
+
+
+def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+    """Share of infrared light that surfaces send back, guessed from how bright they look in sRGB."""
+    light: NDArray[np.float32] = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
+    return light
+
+
+@functools.cache
+def _luminance() -> NDArray[np.float32]:
+    table: NDArray[np.float32] = ((np.arange(256) / 255.0) ** 2.2).astype(np.float32)
+    return table

@@ -1,0 +1,168 @@
+"""What a color sensor makes of light: exposure, noise, white balance, vignetting, the sRGB curve, JPEG.
+
+The noise is EMVA 1288's (release 4.0) linear camera: shot noise of the electrons and the noise of reading
+them out, here as one normal number a pixel and channel with the variance of both.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import cv2
+import numpy as np
+
+from handsim.errors import ArgumentError
+from render.sensors.random_images import normal_numbers
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32, UInt8
+    from numpy.typing import NDArray
+
+_LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
+_BAND: Final = 32  # rows done at a time, so that they stay in the processor's cache
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """How one picture was taken. The defaults change nothing."""
+
+    stops: float = 0.0
+    """How much longer it was exposed than the light was meant for, as a power of two."""
+    balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """What red, green and blue are multiplied by after the sensor."""
+    white_electrons: float = 0.0
+    """Electrons in a pixel that is just white: full well over the sensor's gain; 0: no noise at all."""
+    read_noise: float = 0.0
+    """Standard deviation of a pixel in the dark [electrons]."""
+    vignetting: float = 0.0
+    """Share of the light that is missing in the corners."""
+    jpeg_quality: int | None = None
+    """Of a JPEG file that the picture has been through, 1 to 100; None: it has not."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureConfig:
+    """Within what limits pictures are taken; drawn evenly but for what is said."""
+
+    stops: tuple[float, float] = (-0.5, 0.4)
+    balance: float = 0.05
+    """Standard deviation of the logarithms of the factors of red and blue."""
+    white_electrons: tuple[float, float] = (1000.0, 10000.0)
+    """Drawn evenly on a logarithmic scale."""
+    read_noise: tuple[float, float] = (1.5, 6.0)
+    vignetting: tuple[float, float] = (0.0, 0.3)
+    jpeg_share: float = 0.5
+    """Of pictures that go through a JPEG file."""
+    jpeg_quality: tuple[int, int] = (70, 98)
+
+
+def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Exposure:
+    """How a picture is taken."""
+    red, blue = np.exp(config.balance * rng.standard_normal(2))
+    least, most = np.log(config.white_electrons)
+    goes = bool(rng.random() < config.jpeg_share)
+    quality = int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
+    return Exposure(
+        stops=float(rng.uniform(*config.stops)),
+        balance=(float(red), 1.0, float(blue)),
+        white_electrons=float(np.exp(rng.uniform(least, most))),
+        read_noise=float(rng.uniform(*config.read_noise)),
+        vignetting=float(rng.uniform(*config.vignetting)),
+        jpeg_quality=quality if goes else None,
+    )
+
+
+def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
+    """Light of sRGB colors, 1 for white. What was clipped at white stays there."""
+    light: NDArray[np.float32] = cv2.LUT(rgb, _decoded())
+    return light
+
+
+def expose(
+    linear: Float32[np.ndarray, "H W 3"], exposure: Exposure, *, rng: np.random.Generator
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The picture that a sensor takes of light, sRGB.
+
+    Args:
+        linear: Light, 1 for white; more than that is as white.
+        exposure: How it is taken.
+        rng: Randomness.
+
+    Raises:
+        ArgumentError: The light is no picture of three colors.
+    """
+    if linear.ndim != 3 or linear.shape[2] != 3:
+        raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
+    height, width = linear.shape[:2]
+    balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
+    rgb = np.empty((height, 3 * width), np.uint8)
+    for first in range(0, height, _BAND):
+        rows = slice(first, min(first + _BAND, height))
+        light = linear[rows].reshape(-1, 3 * width) * _gain(rows, (height, width), exposure)
+        if exposure.white_electrons > 0.0:
+            light += _noise(light, exposure, rng=rng)
+        light *= balance
+        rgb[rows] = encoded(light)
+    rgb = rgb.reshape(linear.shape)
+    return rgb if exposure.jpeg_quality is None else _through_jpeg(rgb, exposure.jpeg_quality)
+
+
+def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
+    """The sRGB picture of light, clipped to what it can show: the inverse of `linear_of`."""
+    scaled = light * np.float32(_LEVELS - 1)
+    scaled += np.float32(0.5)
+    np.clip(scaled, 0.0, _LEVELS - 1, out=scaled)
+    rgb: NDArray[np.uint8] = _curve().take(scaled.astype(np.uint16), mode="clip")
+    return rgb
+
+
+def _gain(rows: slice, shape: tuple[int, int], exposure: Exposure) -> NDArray[np.float32]:
+    """Factor of each pixel, three times a pixel: less towards the corners with the square of the distance."""
+    gain = 2.0**exposure.stops
+    if exposure.vignetting == 0.0:
+        return np.full((1, 1), gain, np.float32)
+    down, right = (
+        (np.arange(length) + 0.5 - 0.5 * length) ** 2 / (0.25 * (shape[0] ** 2 + shape[1] ** 2))
+        for length in shape
+    )
+    lost = np.repeat(right, 3).astype(np.float32) + down[rows, None].astype(np.float32)  # 1 in the corners
+    lost *= np.float32(-gain * exposure.vignetting)
+    lost += np.float32(gain)
+    return lost
+
+
+def _noise(
+    light: NDArray[np.float32], exposure: Exposure, *, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Electrons' noise, 1 for as many as white has."""
+    white = exposure.white_electrons
+    noise = light * np.float32(1.0 / white)
+    np.maximum(noise, 0.0, out=noise)
+    noise += np.float32((exposure.read_noise / white) ** 2)
+    np.sqrt(noise, out=noise)
+    noise *= normal_numbers(light.shape, rng=rng)
+    return noise
+
+
+def _through_jpeg(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
+    done, file = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    picture: NDArray[np.uint8] = cv2.cvtColor(cv2.imdecode(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    return picture
+
+
+@functools.cache
+def _decoded() -> NDArray[np.float32]:
+    """Light of the 256 sRGB values (IEC 61966-2-1)."""
+    value = np.arange(256) / 255.0
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+@functools.cache
+def _curve() -> NDArray[np.uint8]:
+    """The sRGB values of light in even steps."""
+    light = np.arange(_LEVELS) / (_LEVELS - 1)
+    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return np.rint(255.0 * value).astype(np.uint8)

@@ -1,0 +1,144 @@
+"""The arm behind the hand: what a picture shows beyond the wrist, though no bone of ours moves it.
+
+Girths are shares of the hand's breadth: ANSUR II (2012) has wrists of 176 and 154 mm and flexed forearms of
+309 and 263 mm around for hands of 88.3 and 78.2 mm (men's and women's means); a forearm at rest is about a
+tenth thinner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.errors import HandSimError
+from handsim.hand.shape import HandShape
+from handsim.space.transforms import MIRROR
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_LONGEST: Final = 0.5  # [m]
+_WRIST_GIRTH: Final = 1.92  # [hand breadths]
+_ARM_GIRTH: Final = 3.0
+_WIDEST: Final = 1.05  # how far behind the wrist the arm is widest [hand lengths]
+_BLEND: Final = 0.22  # over which the hand's own section becomes the arm's [hand lengths]
+_BEND: Final = 0.20  # over which the wrist bends [hand lengths]
+
+
+@dataclass(frozen=True, slots=True)
+class Forearm:
+    """A forearm in plain values.
+
+    Raises:
+        HandSimError: It is shorter than 2 cm or longer than half a meter, or its girth is not positive.
+    """
+
+    length: float = 0.22
+    """Behind the wrist [m]."""
+    flexion: float = 0.0
+    """Of the wrist, towards the palm [rad]."""
+    deviation: float = 0.0
+    """Of the wrist, towards the thumb [rad]."""
+    girth: float = 1.0
+    """Over the girth that goes with the hand's breadth."""
+    sleeve: float = 1.0
+    """Where a sleeve begins, behind the wrist [m]; beyond `length` where the arm is bare."""
+    sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)
+    """sRGB in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        if not 0.02 <= self.length <= _LONGEST:
+            raise HandSimError(f"a forearm of {self.length:g} m, expected 0.02 to {_LONGEST:g}")
+        if not self.girth > 0.0:
+            raise HandSimError(f"a forearm's girth is {self.girth:g}, expected a positive factor")
+
+
+def sample_forearm(*, rng: np.random.Generator) -> Forearm:
+    """A random forearm: wrists within half their range, a sleeve on one in three.
+
+    It is straight and longer than an arm is to the elbow, so that it leaves the picture as arms do.
+    """
+    length = rng.uniform(0.38, 0.48)
+    flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
+    girth = float(np.exp(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15)))
+    sleeve = rng.uniform(0.035, 0.12) if rng.random() < 1 / 3 else 1.0
+    red, green, blue = np.clip(rng.uniform(0.05, 0.85) + rng.normal(0.0, 0.12, 3), 0.02, 0.95)
+    return Forearm(
+        float(length),
+        float(flexion),
+        float(deviation),
+        girth,
+        float(sleeve),
+        (float(red), float(green), float(blue)),
+    )
+
+
+def forearm_rings(
+    shape: HandShape, forearm: Forearm, wrist: Float[np.ndarray, "R 3"], rings: int
+) -> Float[np.ndarray, "rings R 3"]:
+    """Rings of skin behind the wrist's own, outwards from the hand, in the wrist's frame [m].
+
+    Args:
+        shape: Whose arm.
+        forearm: How it is.
+        wrist: The ring that the arm joins.
+        rings: How many to make.
+    """
+    mirror = MIRROR if shape.side == "left" else np.eye(3)
+    right = wrist @ mirror
+    center = right.mean(axis=0)
+    section = (right - center)[:, 1:]
+    lean = right[:, 0] - center[0]  # the wrist's ring is not quite plane
+    # Rings lie closer together near the wrist, where all the bending is.
+    reach = forearm.length * np.linspace(0.0, 1.0, rings + 1)[1:] ** 1.35
+    width, depth = _half_axes(shape, forearm, reach)
+    extent = np.abs(section).max(axis=0)
+    angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
+    round_section = np.stack([width[:, None] * np.cos(angle), depth[:, None] * np.sin(angle)], axis=-1)
+    share = _smooth(reach / (_BLEND * shape.length))[:, None, None]
+    sections = (1.0 - share) * section + share * round_section
+    axes, middles = _course(shape, forearm, reach)
+    local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
+    points: NDArray[np.float64] = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
+    return points @ mirror
+
+
+def _half_axes(
+    shape: HandShape, forearm: Forearm, reach: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
+    share = _smooth(np.clip(reach / (_WIDEST * shape.length), 0.0, 1.0)) ** 0.9
+    girth = forearm.girth * shape.breadth * (_WRIST_GIRTH + (_ARM_GIRTH - _WRIST_GIRTH) * share)
+    flatness = 0.70 + 0.18 * share
+    # Ramanujan's ellipse: its girth over its half width
+    h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
+    around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))
+    return girth / around, flatness * girth / around
+
+
+def _course(
+    shape: HandShape, forearm: Forearm, reach: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
+    fine = np.linspace(0.0, reach[-1], 200)
+    share = _smooth(fine / (_BEND * shape.length))
+    # A hand that bends towards its palm (-z) or thumb (y) has its arm go there too, seen from the hand.
+    up, aside = forearm.flexion * share, forearm.deviation * share
+    ahead = np.stack([np.cos(up) * np.cos(aside), -np.sin(aside), np.sin(up) * np.cos(aside)], axis=-1)
+    way = np.concatenate([np.zeros((1, 3)), np.cumsum(-ahead[:-1] * np.diff(fine)[:, None], axis=0)])
+    middles = np.stack([np.interp(reach, fine, way[:, i]) for i in range(3)], axis=-1)
+    x = np.stack([np.interp(reach, fine, ahead[:, i]) for i in range(3)], axis=-1)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    z = np.array([0.0, 0.0, 1.0]) - x[:, 2:] * x
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1), middles
+
+
+def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 to 1 with level ends."""
+    inside = np.clip(share, 0.0, 1.0)
+    result: NDArray[np.float64] = inside * inside * (3.0 - 2.0 * inside)
+    return result

@@ -1,0 +1,127 @@
+"""What somebody's skin looks like, in plain values, and how such people are drawn.
+
+Tones go by the individual typology angle, arctan((L* - 50) / b*) in degrees, and its six classes (Chardon,
+Cretois and Hourseau 1991, Int. J. Cosmet. Sci. 13:191). Redness and yellowness over that angle are our own
+choice: chroma is highest in the middle and falls towards both ends. Palms hold little pigment in everybody,
+so that dark hands have palms much lighter than their backs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from handsim.errors import HandSimError
+
+TONES: Final[dict[str, tuple[float, float]]] = {
+    "very light": (55.0, 64.0),
+    "light": (41.0, 55.0),
+    "intermediate": (28.0, 41.0),
+    "tan": (10.0, 28.0),
+    "brown": (-30.0, 10.0),
+    "dark": (-52.0, -30.0),
+}
+"""Individual typology angles [deg] of the classes; the outer two end where measured skin does."""
+ALL_TONES: Final = (TONES["dark"][0], TONES["very light"][1])
+_ANGLES: Final = (-52.0, -30.0, 0.0, 20.0, 35.0, 50.0, 64.0)
+_YELLOWNESS: Final = (12.0, 15.5, 18.5, 18.5, 17.5, 15.5, 12.5)  # CIELAB b* of the back of the hand
+_REDNESS: Final = (8.8, 10.5, 12.0, 11.5, 10.5, 9.5, 8.5)  # CIELAB a*
+
+
+@dataclass(frozen=True, slots=True)
+class SkinLook:
+    """One person's skin. Colors are CIELAB (D65); strengths are factors, 1 for an average adult.
+
+    Raises:
+        HandSimError: The lightness is none of CIELAB's, or the roughness not within 0 and 1.
+    """
+
+    lightness: float = 62.0
+    """L* of the back of the hand."""
+    redness: float = 10.5
+    """a* of the back of the hand."""
+    yellowness: float = 17.0
+    """b* of the back of the hand."""
+    palm_lightness: float = 66.0
+    """L* of the palm."""
+    flush: float = 1.0
+    """How much redder finger tips, knuckles and the balls of the hand are."""
+    blotches: float = 1.0
+    """How uneven the color is."""
+    creases: float = 1.0
+    """How dark lines of the palm and wrinkles of the knuckles are."""
+    veins: float = 1.0
+    """How well veins show through the back."""
+    relief: float = 1.0
+    """How far tendons, knuckles and the skin's grain stand out."""
+    nail: tuple[float, float, float] = (4.0, 5.0, -3.0)
+    """L*, a*, b* of the nails above the skin's."""
+    polish: float = 0.0
+    """Share of the nails' color that is `polish_color`."""
+    polish_color: tuple[float, float, float] = (40.0, 50.0, 20.0)
+    """CIELAB."""
+    roughness: float = 0.55
+    """Of the microfacet model: 0 a mirror, 1 chalk."""
+    seed: int = 0
+    """Where blotches, veins and the course of lines are."""
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.lightness <= 100.0 and 0.0 <= self.palm_lightness <= 100.0):
+            raise HandSimError(
+                f"skin of lightness {self.lightness:g} and {self.palm_lightness:g}, "
+                "expected CIELAB's 0 to 100"
+            )
+        if not 0.0 <= self.roughness <= 1.0:
+            raise HandSimError(f"roughness is {self.roughness:g}, expected 0 to 1")
+
+    @property
+    def typology_angle(self) -> float:
+        """Individual typology angle of the back of the hand [deg]."""
+        return float(np.rad2deg(np.arctan2(self.lightness - 50.0, self.yellowness)))
+
+    @property
+    def infrared(self) -> float:
+        """Reflectance near 850 nm, where tones differ little.
+
+        Pigment absorbs less and less towards 1 um (Jacquez et al. 1955, J. Appl. Physiol. 8:297); the two
+        ends are our choice.
+        """
+        return float(np.interp(self.lightness, (25.0, 75.0), (0.45, 0.6)))
+
+
+def sample_skin_look(tones: tuple[float, float] = ALL_TONES, *, rng: np.random.Generator) -> SkinLook:
+    """A random person's skin.
+
+    Args:
+        tones: Between which typology angles [deg] to draw evenly; see `TONES`.
+        rng: Where the choices come from.
+    """
+    angle = rng.uniform(*tones)
+    yellowness = float(np.interp(angle, _ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))
+    redness = float(np.interp(angle, _ANGLES, _REDNESS)) + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
+    lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
+    # Palms of all people lie close together, near what light skin has on the back.
+    paleness = rng.uniform(0.6, 0.75)
+    palm = max(lightness, (1.0 - paleness) * lightness + paleness * 66.0) + rng.uniform(0.0, 2.0)
+    polish = rng.uniform(0.75, 1.0) if rng.random() < 0.08 else 0.0
+    color = rng.uniform((25.0, 10.0, -15.0), (75.0, 60.0, 30.0))
+    strengths = np.exp(np.clip(rng.normal(0.0, 0.3, 5), -0.7, 0.7))
+    nail = np.array([4.0, 5.0, -3.0]) + rng.normal(0.0, (1.5, 1.5, 1.0))
+    return SkinLook(
+        lightness=lightness,
+        redness=redness,
+        yellowness=yellowness,
+        palm_lightness=float(palm),
+        flush=float(strengths[0]),
+        blotches=float(strengths[1]),
+        creases=float(strengths[2]),
+        veins=float(strengths[3]),
+        relief=float(strengths[4]),
+        nail=(float(nail[0]), float(nail[1]), float(nail[2])),
+        polish=float(polish),
+        polish_color=(float(color[0]), float(color[1]), float(color[2])),
+        roughness=float(rng.uniform(0.4, 0.62)),
+        seed=int(rng.integers(2**31)),
+    )

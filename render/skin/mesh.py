@@ -1,0 +1,193 @@
+"""The skin as it is drawn: the hand's own surface on a forearm, with normals, shade, parts and texture.
+
+The hand's vertices are `HandModel.skin`'s, so that pictures show what occlusion was computed from; from the
+wrist's ring on, the short stump that closes that surface gives way to the forearm.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numba
+import numpy as np
+
+from handsim.hand.model import HandModel
+from handsim.hand.skin.skinning import skin_frames
+from handsim.hand.topology import NUM_BONES, PALM
+from render.frames import FOREARM
+from render.skin.atlas import RINGS, skin_atlas
+from render.skin.forearm import Forearm, forearm_rings
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Float32, Int, UInt8
+    from numpy.typing import NDArray
+
+_DARKEST: Final = 0.12  # no skin lies so deep that no light gets there
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnSkin:
+    """One hand in one pose, ready for the triangles of OpenGL."""
+
+    vertices: Float32[np.ndarray, "D 3"]
+    """In the world [m]; those on the borders of texture tiles come once for each tile."""
+    normals: Float32[np.ndarray, "D 3"]
+    """Outward unit normals."""
+    uv: Float32[np.ndarray, "D 2"]
+    """Places in the texture, the origin at its bottom left."""
+    shade: Float32[np.ndarray, "D"]
+    """Share of the light from all around that gets there past the hand itself, 0 to 1."""
+    faces: Int[np.ndarray, "F 3"]
+    """Triangles, counter-clockwise from outside."""
+    parts: UInt8[np.ndarray, "F"]
+    """Bone of each triangle, a place in `topology.BONES` or `FOREARM`."""
+
+
+class SkinMesh:
+    """The drawn skin of one person's hand.
+
+    Args:
+        model: The hand.
+        forearm: What it sits on.
+    """
+
+    def __init__(self, model: HandModel, forearm: Forearm | None = None) -> None:
+        self.model = model
+        self.forearm = Forearm() if forearm is None else forearm
+        atlas, surface = skin_atlas(), model.surface
+        hand = surface.vertices[atlas.used]
+        arm = forearm_rings(model.shape, self.forearm, hand[atlas.wrist], RINGS)
+        end = arm[-1].mean(axis=0, keepdims=True)
+        self.rest: Float[np.ndarray, "U 3"] = np.concatenate([hand, arm.reshape(-1, 3), end])
+        """Rest positions in the wrist's frame [m]: the hand, the forearm's rings, the middle of its end."""
+        beyond = len(self.rest) - len(hand)
+        to_palm, whole = np.zeros((beyond, 4), dtype=np.int64), np.tile([1.0, 0.0, 0.0, 0.0], (beyond, 1))
+        self._bones = np.concatenate([surface.bone_indices[atlas.used], to_palm + PALM])
+        self._weights = np.concatenate([surface.bone_weights[atlas.used], whole])
+        mirrored = model.shape.side == "left"
+        self.faces = np.ascontiguousarray(atlas.faces[:, ::-1] if mirrored else atlas.faces)
+        """Triangles (F, 3) of the vertices of `rest`: a closed surface."""
+        self._corner_faces = np.ascontiguousarray(
+            atlas.corner_faces[:, ::-1] if mirrored else atlas.corner_faces
+        )
+        self._rest_shade = self._open_sky(model.rest_transforms[None], self.rest, self.faces)
+
+    def posed(self, qpos: Float[np.ndarray, "27"]) -> DrawnSkin:
+        """The skin in one pose.
+
+        Raises:
+            ArgumentError: `qpos` is not (27,) or not finite.
+        """
+        atlas = skin_atlas()
+        transforms = self.model.forward_kinematics(qpos[None])
+        points = self.merged(transforms)
+        normals = mesh_normals(points, self.faces)
+        hidden = self._hidden(transforms, points, normals)
+        shade = np.clip(1.0 - np.maximum(hidden - self._rest_shade, 0.0), _DARKEST, 1.0)
+        corners = atlas.corners
+        return DrawnSkin(
+            points[corners].astype(np.float32),
+            normals[corners].astype(np.float32),
+            atlas.uv,
+            shade[corners].astype(np.float32),
+            self._corner_faces,
+            face_parts(),
+        )
+
+    def merged(self, transforms: Float[np.ndarray, "1 L 4 4"]) -> Float[np.ndarray, "U 3"]:
+        """Posed vertices of `rest` in the frame of the bones' transforms [m]."""
+        points: NDArray[np.float64] = skin_frames(
+            self.rest, self._bones, self._weights, self.model.rest_transforms, transforms
+        )[0]
+        return points
+
+    def _open_sky(
+        self, transforms: NDArray[np.float64], points: NDArray[np.float64], faces: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """What neighboring capsules hide in the flat hand, where they are the same flesh."""
+        return self._hidden(transforms, points, mesh_normals(points, faces))
+
+    def _hidden(
+        self, transforms: NDArray[np.float64], points: NDArray[np.float64], normals: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        capsules = self.model.capsules
+        hidden: NDArray[np.float64] = _hidden_share(
+            points, normals, capsules.posed(transforms)[0], capsules.radii * 1.2
+        )
+        return hidden
+
+
+@functools.cache
+def face_parts() -> UInt8[np.ndarray, "F"]:
+    """Bone of each triangle of `DrawnSkin.faces`: the one with the largest share in it, or `FOREARM`."""
+    atlas, surface = skin_atlas(), HandModel.named("M").surface  # weights are the same for every hand
+    shares = np.zeros((atlas.num_vertices, NUM_BONES + 1))
+    rows = np.arange(atlas.num_hand)[:, None]
+    shares[rows, surface.bone_indices[atlas.used]] = surface.bone_weights[atlas.used]
+    shares[atlas.num_hand :, FOREARM] = 1e3  # one vertex of the forearm makes a triangle the forearm's
+    parts: NDArray[np.uint8] = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
+    parts.setflags(write=False)
+    return parts
+
+
+def mesh_normals(
+    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> Float[np.ndarray, "V 3"]:
+    """`handsim.hand.skin.surface.vertex_normals`, compiled: outward unit normals, area-weighted."""
+    normals: NDArray[np.float64] = _normals(vertices, faces)
+    return normals
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _normals(vertices: Any, faces: Any) -> Any:
+    normals = np.zeros_like(vertices)
+    for f in range(len(faces)):
+        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        ux, uy, uz = (
+            vertices[b, 0] - vertices[a, 0],
+            vertices[b, 1] - vertices[a, 1],
+            vertices[b, 2] - vertices[a, 2],
+        )
+        vx, vy, vz = (
+            vertices[c, 0] - vertices[a, 0],
+            vertices[c, 1] - vertices[a, 1],
+            vertices[c, 2] - vertices[a, 2],
+        )
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        for corner in (a, b, c):
+            normals[corner, 0] += x
+            normals[corner, 1] += y
+            normals[corner, 2] += z
+    for v in range(len(normals)):
+        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
+        if length > 0.0:
+            for i in range(3):
+                normals[v, i] /= length
+    return normals
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _hidden_share(points: Any, normals: Any, segments: Any, radii: Any) -> Any:
+    """Share of each point's sky behind capsules, each taken for the ball that is nearest in it."""
+    hidden = np.empty(len(points))
+    axes = segments[:, 1] - segments[:, 0]
+    for v in range(len(points)):
+        free = 1.0
+        for k in range(len(radii)):
+            along, square = 0.0, 1e-12
+            for i in range(3):
+                along += (points[v, i] - segments[k, 0, i]) * axes[k, i]
+                square += axes[k, i] * axes[k, i]
+            along = min(max(along / square, 0.0), 1.0)
+            distance, facing = 0.0, 0.0
+            for i in range(3):
+                away = segments[k, 0, i] + along * axes[k, i] - points[v, i]
+                distance += away * away
+                facing += away * normals[v, i]
+            if facing > 0.0:
+                ratio = radii[k] * radii[k] / max(distance, radii[k] * radii[k])
+                free *= 1.0 - 0.85 * ratio * min(facing / np.sqrt(distance), 1.0)
+        hidden[v] = 1.0 - free
+    return hidden

@@ -1,0 +1,175 @@
+"""A skin's colors and roughness as a texture, painted on the map of `render.skin.texels`."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+
+from render.skin.atlas import skin_atlas
+from render.skin.fields import bump, noise, smooth
+from render.skin.forearm import Forearm
+from render.skin.lines import line_depth
+from render.skin.look import SkinLook
+from render.skin.relief import normal_map, relief
+from render.skin.texels import REFERENCE, skin_texels
+
+if TYPE_CHECKING:
+    from jaxtyping import UInt8
+    from numpy.typing import NDArray
+
+    from handsim.hand.topology import Side
+
+
+class SkinTexture(NamedTuple):
+    """Texture of `DrawnSkin.uv`, its top row first."""
+
+    color: UInt8[np.ndarray, "H W 3"]
+    """sRGB."""
+    roughness: UInt8[np.ndarray, "H W"]
+    """Roughness of the microfacet model, 255 for 1."""
+    normals: UInt8[np.ndarray, "H W 3"]
+    """Relief over the drawn normals, see `skin_relief.normal_map`."""
+
+
+class _Paint(NamedTuple):
+    """What is painted, texel by texel; all three are written to."""
+
+    lab: NDArray[np.float64]
+    """CIELAB."""
+    roughness: NDArray[np.float64]
+    height: NDArray[np.float64]
+    """Of the relief [m]."""
+
+
+def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side = "right") -> SkinTexture:
+    """Paint a skin; the same look gives the same texels.
+
+    Args:
+        look: The skin.
+        forearm: Its sleeve is painted too.
+        side: Of the hand; colors are the same on both.
+    """
+    color, roughness, height = _painted(look, forearm)
+    return SkinTexture(color, roughness, normal_map(height, side))
+
+
+@functools.lru_cache(maxsize=2)  # both hands of a person have the same
+def _painted(
+    look: SkinLook, forearm: Forearm | None
+) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], NDArray[np.float64]]:
+    """Color, roughness and height of the relief."""
+    texels, rng = skin_texels(), np.random.default_rng(look.seed)
+    back = texels.back
+    lab = np.empty((len(back), 3))
+    lab[:, 0] = look.palm_lightness + back * (look.lightness - look.palm_lightness)
+    # The palm of a dark hand is no redder or yellower than other palms: chroma goes with the pigment.
+    lab[:, 1] = 15.0 + back * (look.redness - 15.0)
+    lab[:, 2] = 16.0 + back * (look.yellowness - 16.0)
+    _flush(lab, look)
+    veins = _veins(rng)
+    lab += look.veins * veins[:, None] * [-1.6, -1.6, -2.2]
+    blotches = noise(texels.places, (0.05, 0.018, 0.007, 0.003), rng=rng)
+    lab += look.blotches * blotches[:, None] * [1.0, -0.6, 0.2]
+    lines = np.clip(line_depth(rng), 0.0, 1.0)
+    # Pigment gathers in the lines; how dark they are goes with the contrast that the skin has room for.
+    lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
+    height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
+    height += look.relief * 2e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
+    paint = _Paint(lab, np.minimum(look.roughness + 0.1 * (1.0 - back), 1.0), height)
+    _nails(paint, look)
+    if forearm is not None and forearm.sleeve < forearm.length:
+        _sleeve(paint, forearm, rng)
+    width, rows = skin_atlas().size
+    rough = np.rint(255.0 * paint.roughness).astype(np.uint8).reshape(rows, width)
+    return lab_to_srgb(paint.lab.reshape(rows, width, 3)), rough, paint.height
+
+
+def lab_to_srgb(lab: NDArray[np.float64]) -> UInt8[np.ndarray, "H W 3"]:
+    """SRGB of CIELAB colors (D65), cut to what sRGB holds."""
+    rgb = cv2.cvtColor(lab.astype(np.float32), cv2.COLOR_Lab2RGB)
+    color: NDArray[np.uint8] = np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
+    return color
+
+
+def _flush(lab: NDArray[np.float64], look: SkinLook) -> None:
+    """Blood in the finger tips, knuckles and balls of the hand; knuckles are darker, too."""
+    texels = skin_texels()
+    back = texels.back
+    for number, digit in enumerate(texels.digits):
+        first, middle, end = np.cumsum(digit.lengths)
+        mine = digit.texels
+        tips = smooth(digit.along, middle, end) * digit.share
+        lab[mine] += look.flush * tips[:, None] * [-1.0, 4.0, 0.0]
+        for joint, width in ((0.0, 0.010), (first, 0.0075), (middle, 0.006)):
+            if number == 0 and joint == 0.0:
+                continue  # the thumb's first joint lies deep under the skin
+            knuckle = bump(digit.along - joint, width) * back[mine] * np.abs(np.cos(digit.turn / 2))
+            darker = -1.5 - 0.06 * max(0.0, 60.0 - look.lightness)
+            lab[mine] += look.flush * knuckle[:, None] * [darker, 1.8, 0.3]
+    x, y = 1e3 * texels.places[:, 0], 1e3 * texels.places[:, 1]
+    palm = 1.0 - back
+    hollow = np.exp(-(((x - 50.0) / 22.0) ** 2) - (((y + 2.0) / 14.0) ** 2)) * palm
+    lab += look.flush * hollow[:, None] * [1.0, -3.0, 0.8]
+    balls = np.exp(-(((x - 88.0) / 9.0) ** 2)) * palm
+    balls += np.exp(-(((x - 35.0) / 22.0) ** 2) - (((y + 30.0) / 11.0) ** 2)) * palm
+    lab += look.flush * balls[:, None] * [-0.5, 2.2, 0.0]
+
+
+def _veins(rng: np.random.Generator) -> NDArray[np.float64]:
+    """How much of a vein shows at each texel: three of them wind along the back of hand and forearm."""
+    texels = skin_texels()
+    back = texels.back
+    x, y = texels.places[:, 0], texels.places[:, 1]
+    near = np.flatnonzero((back > 0.5) & (x > -0.16) & (x < 0.085))
+    x, y = x[near], y[near]
+    veins = np.zeros(len(back))
+    for start in (0.016, -0.004, -0.022):
+        knots = np.linspace(-0.17, 0.09, 9)
+        course = start + np.cumsum(rng.normal(0.0, 0.0035, 9)) - 0.006
+        veins[near] = np.maximum(veins[near], bump(y - np.interp(x, knots, course), 0.0017))
+    veins *= back
+    return veins
+
+
+def _nails(paint: _Paint, look: SkinLook) -> None:
+    """Nail plates: pinker and smoother than the skin, a pale moon, a whiter free edge, and a dark fold."""
+    for number, digit in enumerate(skin_texels().digits):
+        joint, tip = np.cumsum(digit.lengths)[1:]
+        start, end = joint + 0.34 * (tip - joint), tip - 0.0012
+        middle, half = 0.5 * (start + end), 0.5 * (end - start)
+        wide = 1.0 if number else 1.12
+        a = (digit.along - middle) / half
+        b = digit.turn / wide
+        where = np.abs(b) < 1.6
+        shape = (np.abs(a) ** 3.2 + np.abs(b) ** 3.2) ** (1 / 3.2)
+        plate = (1.0 - smooth(shape, 0.93, 1.03)) * where
+        fold = bump(shape - 1.06, 0.085) * where * (a < 0.75)
+        mine = digit.texels
+        bed = np.array([look.lightness, look.redness, look.yellowness]) * [0.35, 0.5, 0.6]
+        bed += np.array([68.0, 12.0, 13.0]) * [0.65, 0.5, 0.4]  # beds hold little pigment, as palms do
+        color = np.broadcast_to(bed + look.nail, (len(mine), 3)).copy()
+        color += (bump(a + 1.0, 0.42) * bump(b, 0.55))[:, None] * [4.0, -4.0, -1.0]
+        color += smooth(a, 0.72, 0.86)[:, None] * [8.0, -7.0, 1.0]
+        color += look.polish * (np.array(look.polish_color) - color)
+        paint.lab[mine] += plate[:, None] * (color - paint.lab[mine])
+        paint.lab[mine] += (look.creases * fold)[:, None] * [-7.0, 4.0, 0.0]
+        paint.roughness[mine] += plate * (0.28 - paint.roughness[mine])
+        paint.height[mine] *= 1.0 - plate
+        paint.height[mine] += 0.00025 * plate - 0.00035 * fold
+
+
+def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
+    """Cloth from some way behind the wrist on, with folds as darker and lighter bands."""
+    places = skin_texels().places
+    reach = -places[:, 0] * forearm.length / REFERENCE.length
+    cloth = smooth(reach, forearm.sleeve - 0.0015, forearm.sleeve + 0.0015)
+    color = cv2.cvtColor(np.array([[forearm.sleeve_color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
+    folds = noise(places * [0.5, 1.0, 1.0], (0.03, 0.012), rng=rng)
+    hem = bump(reach - forearm.sleeve, 0.0025)
+    painted = color + (4.0 * folds - 9.0 * hem)[:, None] * [1.0, 0.0, 0.0]
+    paint.lab[:] += cloth[:, None] * (painted - paint.lab)
+    paint.roughness[:] += cloth * (0.9 - paint.roughness)
+    paint.height[:] += cloth * (0.0008 * folds + 0.001 * hem - paint.height)

@@ -1,0 +1,155 @@
+"""The optical system: noise, merging, gates, false points, IDs."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gloves.optics.identities import number_runs, pack_columns
+from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from handsim.errors import ArgumentError
+from handsim.space.cameras import CameraRig, look_at, named_rig
+
+STILL = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0)
+RIG = named_rig("figure5")
+MIDDLE = np.array([0.0, 0.0, 1.1])
+
+
+def _all_seen(sources: np.ndarray, rig: CameraRig = RIG) -> np.ndarray:
+    return np.ones((*sources.shape[:2], len(rig.positions)), dtype=bool)
+
+
+def _grid(frames: int, count: int, step: float) -> np.ndarray:
+    return MIDDLE + step * np.tile(np.arange(count)[:, None] * [1.0, 0.7, 0.4], (frames, 1, 1))
+
+
+def test_without_noise_points_are_where_the_markers_are(rng: np.random.Generator) -> None:
+    sources = MIDDLE + rng.uniform(-0.2, 0.2, (50, 12, 3))
+    apart = np.linalg.norm(sources[:, :, None] - sources[:, None], axis=-1) + np.eye(12)
+    sources = sources[apart.min(axis=(1, 2)) > 0.03]
+    found = reconstruct(sources, _all_seen(sources), RIG, STILL, continuous=False, rng=rng)
+    there = np.isfinite(found.positions[..., 0])
+    assert there.mean() > 0.99  # in chance alignments, a few blobs touch in too many cameras
+    np.testing.assert_allclose(found.positions[there], sources[there], atol=1e-3)
+    assert np.median(np.linalg.norm(found.positions - sources, axis=-1)[there]) < 1e-9
+
+
+def test_noise_is_that_of_least_squares(rng: np.random.Generator) -> None:
+    """The covariance of a point follows from its cameras: linearized, as a textbook has it."""
+    config = OpticsConfig(noise=0.3, blob_loss=0.0, dropout=0.0)
+    sources = np.tile(MIDDLE + [0.03, 0.02, 0.05], (4000, 1, 1))
+    found = reconstruct(sources, _all_seen(sources), RIG, config, continuous=False, rng=rng)
+    off = found.positions[:, 0] - sources[:, 0]
+    weights, spread = np.zeros((3, 3)), np.zeros((3, 3))
+    for pose in RIG.T_world_camera:
+        ray, axis = sources[0, 0] - pose[:3, 3], pose[:3, 2]
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        sigma = config.noise * (axis @ ray) / RIG.focal_length  # in the plane of the picture, at the marker
+        weights += across
+        spread += sigma**2 * across @ (np.eye(3) - np.outer(axis, axis)) @ across
+    covariance = np.linalg.inv(weights) @ spread @ np.linalg.inv(weights)
+    assert np.abs(off.mean(axis=0)).max() < 4 * np.sqrt(covariance.trace() / len(off))
+    np.testing.assert_allclose(np.cov(off.T).trace(), covariance.trace(), rtol=0.1)
+
+
+def test_too_few_rays_make_no_point(rng: np.random.Generator) -> None:
+    sources = _grid(6, 1, 0.0)
+    seen = _all_seen(sources)
+    seen[..., 2:] = False
+    seen[5, :, 1] = False
+    started = reconstruct(sources, seen, RIG, STILL, continuous=True, rng=rng)
+    alone = reconstruct(sources, seen, RIG, STILL, continuous=False, rng=rng)
+    assert (started.rays == 0).all()  # two rays cannot start a point
+    assert (alone.rays[:5] == 2).all() and alone.rays[5, 0] == 0
+    seen[0, :, :4] = True
+    going_on = reconstruct(sources, seen, RIG, STILL, continuous=True, rng=rng)
+    assert going_on.rays[:, 0].tolist() == [4, 2, 2, 2, 2, 0]  # but two rays keep one up
+
+
+def test_two_rays_along_one_line_make_no_point(rng: np.random.Generator) -> None:
+    poses = np.stack([look_at(MIDDLE + np.array(at), MIDDLE) for at in ((1.5, 0, 0), (1.5, 0.1, 0))])
+    rig = CameraRig("narrow", poses, field_of_view=1.0)
+    sources = _grid(1, 1, 0.0)
+    found = reconstruct(sources, _all_seen(sources, rig), rig, STILL, continuous=False, rng=rng)
+    assert found.rays[0, 0] == 0
+    wide = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0, min_angle=1.0)
+    assert reconstruct(sources, _all_seen(sources, rig), rig, wide, continuous=False, rng=rng).rays[0, 0] == 2
+
+
+def test_markers_that_nearly_touch_are_one_point(rng: np.random.Generator) -> None:
+    near, far = _grid(200, 2, 0.0015), _grid(200, 2, 0.02)
+    found = reconstruct(near, _all_seen(near), RIG, STILL, continuous=False, rng=rng)
+    assert (np.isfinite(found.positions[..., 0]).sum(axis=1) == 1).all()
+    point = np.nanmean(found.positions, axis=1)
+    np.testing.assert_allclose(point, near.mean(axis=1), atol=1e-3)  # between the two
+    found = reconstruct(far, _all_seen(far), RIG, STILL, continuous=False, rng=rng)
+    assert (np.isfinite(found.positions[..., 0]).sum(axis=1) == 2).all()
+
+
+def test_rays_without_a_point_meet_by_chance(rng: np.random.Generator) -> None:
+    """Two cameras see one marker each, on rays that cross where no marker is."""
+    crossing = MIDDLE + np.array([0.05, 0.0, 0.0])
+    sources = np.stack(
+        [
+            crossing + 0.04 * (crossing - RIG.positions[c]) / np.linalg.norm(crossing - RIG.positions[c])
+            for c in (10, 13)
+        ]
+    )[None]
+    seen = np.zeros((1, 2, 16), dtype=bool)
+    seen[0, 0, 10] = seen[0, 1, 13] = True
+    found = reconstruct(sources, seen, RIG, STILL, continuous=False, rng=rng)
+    assert np.isnan(found.positions).all()
+    there = found.false_points[np.isfinite(found.false_points[..., 0])]
+    np.testing.assert_allclose(there, crossing[None], atol=1e-9)
+    strict = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0, min_rays=3)
+    assert np.isnan(reconstruct(sources, seen, RIG, strict, continuous=False, rng=rng).false_points).all()
+
+
+def test_the_same_seed_gives_the_same_points() -> None:
+    sources = _grid(30, 8, 0.02)
+    first, second = (
+        reconstruct(
+            sources, _all_seen(sources), RIG, OpticsConfig(), continuous=True, rng=np.random.default_rng(3)
+        )
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.positions, second.positions)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "sentence"),
+    [
+        ("noise", -1.0, "noise is -1, expected a finite number"),
+        ("blob_loss", 2.0, "blob_loss is 2, expected a chance"),
+        ("min_rays", 1, "expected 2 <= min_rays"),
+    ],
+)
+def test_nonsense_is_refused(field: str, value: float, sentence: str) -> None:
+    with pytest.raises(ArgumentError, match=sentence):
+        OpticsConfig(**{field: value})
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30), st.integers(1, 8), st.floats(0.1, 0.95))
+def test_ids_and_columns_tell_runs_apart(seed: int, frames: int, count: int, density: float) -> None:
+    rng = np.random.default_rng(seed)
+    present = rng.random((frames, count)) < density
+    ids = number_runs(present)
+    assert ((ids >= 0) == present).all()
+    follow = present[1:] & present[:-1]
+    assert (ids[1:] == ids[:-1])[follow].all()  # kept while seen
+    runs = {(ids[t, s], s) for t, s in zip(*np.nonzero(present), strict=True)}
+    assert (
+        len(runs)
+        == len({run for run, _ in runs})
+        == int((present & ~np.vstack([present[:1] & False, present[:-1]])).sum())
+    )
+    columns, width = pack_columns(present, rng=rng)
+    assert ((columns >= 0) == present).all() and columns.max(initial=-1) < width
+    assert width <= count + present.any(axis=0).sum()
+    table = np.full((frames, width), -1)
+    for t, s in zip(*np.nonzero(present), strict=True):
+        assert table[t, columns[t, s]] == -1  # one point a cell
+        table[t, columns[t, s]] = ids[t, s]
+    both = (table[1:] >= 0) & (table[:-1] >= 0)
+    assert (table[1:] == table[:-1])[both].all()  # no run follows another without a gap

@@ -1,0 +1,86 @@
+"""Atomic writing: a file is whole or not there, on success, errors, interrupts and a full disk."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from handsim.files.atomic import atomic_write
+
+
+def entries(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_writes_and_makes_folders(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "deep" / "take.truth.npz"
+    with atomic_write(path) as temporary:
+        assert temporary.parent == path.parent
+        assert temporary.suffix == ".npz"
+        assert temporary.name != path.name
+        temporary.write_bytes(b"whole")
+        assert not path.exists()
+    assert path.read_bytes() == b"whole"
+    assert entries(path.parent) == ["take.truth.npz"]
+
+
+def test_replaces_only_on_success(tmp_path: Path) -> None:
+    path = tmp_path / "take.trc"
+    path.write_text("old")
+    with pytest.raises(ZeroDivisionError), atomic_write(path) as temporary:
+        temporary.write_text("half")
+        _ = 1 / 0
+    assert path.read_text() == "old"
+    assert entries(tmp_path) == ["take.trc"]
+    with atomic_write(path) as temporary:
+        temporary.write_text("new")
+    assert path.read_text() == "new"
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, OSError])
+def test_leaves_nothing_behind(tmp_path: Path, error: type[BaseException]) -> None:
+    with pytest.raises(error), atomic_write(tmp_path / "a.trc") as temporary:
+        temporary.write_text("half")
+        raise error
+    assert entries(tmp_path) == []
+
+
+def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_write(tmp_path / "a.trc"):
+        pass
+    assert entries(tmp_path) == []
+
+
+def test_folders_and_devices_are_refused_before_any_work(tmp_path: Path) -> None:
+    for target in (tmp_path, Path(os.devnull)):
+        with pytest.raises(FileExistsError, match="not a regular file"), atomic_write(target):
+            pytest.fail("the block must not run")
+    assert Path(os.devnull).exists()
+
+
+def test_a_file_where_a_folder_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError), atomic_write(tmp_path / "file" / "a.trc"):
+        pytest.fail("the block must not run")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no file size limits")
+def test_a_write_that_does_not_fit_leaves_nothing(tmp_path: Path) -> None:
+    """A file size limit stands in for the full disk: the same OSError from the same system call."""
+    script = (
+        "import resource, sys\n"
+        "from handsim.files.atomic import atomic_write\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        "try:\n"
+        "    with atomic_write(sys.argv[1]) as temporary:\n"
+        "        temporary.write_bytes(bytes(5000))\n"
+        "except OSError as error:\n"
+        "    print(type(error).__name__)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "a.trc")], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "OSError"
+    assert entries(tmp_path) == []

@@ -1,0 +1,150 @@
+"""Kinematics and contact against MuJoCo, and what a mirrored or resized hand must keep."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from handsim.errors import ArgumentError
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import EVERYBODY, SIZES, named_shape, sample_shape
+from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS, SIDES
+from handsim.space.transforms import MIRROR, random_quaternions
+
+
+def random_qpos(model: HandModel, count: int, rng: np.random.Generator) -> np.ndarray:
+    low, high = model.skeleton.ranges.T
+    return join_qpos(
+        rng.uniform(low, high, size=(count, NUM_JOINTS)),
+        position=rng.normal(size=(count, 3)),
+        quaternion=random_quaternions(count, rng=rng),
+    )
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_forward_kinematics_is_mujocos(side, rng):
+    model = HandModel(sample_shape(EVERYBODY, side=side, rng=rng))
+    data = mujoco.MjData(model.mj_model)
+    qpos = random_qpos(model, 100, rng)
+    ours = model.forward_kinematics(qpos)
+    for frame, values in zip(ours, qpos, strict=True):
+        data.qpos[:] = values
+        mujoco.mj_kinematics(model.mj_model, data)
+        np.testing.assert_allclose(frame[:, :3, 3], data.xpos[1:], atol=1e-9)
+        np.testing.assert_allclose(frame[:, :3, :3], data.xmat[1:].reshape(-1, 3, 3), atol=1e-9)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_penetration_is_mujocos(side, rng):
+    model = HandModel(sample_shape(EVERYBODY, side=side, rng=rng))
+    data = mujoco.MjData(model.mj_model)
+    qpos = random_qpos(model, 200, rng)
+    depths = model.penetration(qpos)
+    assert (depths > 0.001).mean() > 0.1, "the test needs poses that collide"
+    for depth, values in zip(depths, qpos, strict=True):
+        data.qpos[:] = values
+        mujoco.mj_fwdPosition(model.mj_model, data)
+        deepest = max((-contact.dist for contact in data.contact), default=0.0)
+        assert depth == pytest.approx(max(deepest, 0.0), abs=1e-9)
+
+
+def test_degrees_of_freedom():
+    model = HandModel.named("M").mj_model
+    assert (model.nq, model.nv) == (27, 26)
+    assert [model.joint(name).name for name in JOINT_NAMES] == list(JOINT_NAMES)
+
+
+def test_left_hand_is_the_mirror_image(rng):
+    shape = sample_shape(side="right", rng=rng)
+    right, left = HandModel(shape), HandModel(shape.with_side("left"))
+    low, high = right.skeleton.ranges.T
+    qpos = join_qpos(rng.uniform(low, high, size=(20, NUM_JOINTS)))
+    ours, mirrored = left.forward_kinematics(qpos), right.forward_kinematics(qpos)
+    np.testing.assert_allclose(ours[..., :3, 3], mirrored[..., :3, 3] @ MIRROR, atol=1e-12)
+    np.testing.assert_allclose(left.skin(qpos[:3]), right.skin(qpos[:3]) @ MIRROR, atol=1e-12)
+    np.testing.assert_allclose(left.penetration(qpos), right.penetration(qpos), atol=1e-12)
+
+
+def test_positive_flexion_bends_towards_the_palm_and_the_thumb_opposes():
+    model = HandModel.named("M")
+    tip = model.skeleton.lengths
+
+    def fingertip(bone: int, **degrees: float) -> np.ndarray:
+        angles = np.zeros((1, NUM_JOINTS))
+        for name, value in degrees.items():
+            angles[0, JOINT_NAMES.index(name)] = np.deg2rad(value)
+        frame = model.forward_kinematics(join_qpos(angles))[0, bone]
+        return frame[:3, :3] @ [tip[bone], 0.0, 0.0] + frame[:3, 3]
+
+    flat, bent = fingertip(6), fingertip(6, index_MCP_flexion=60.0)
+    assert bent[2] < flat[2] - 0.03
+    assert fingertip(6, index_MCP_abduction=15.0)[1] > flat[1] + 0.01
+    resting = fingertip(3)
+    opposed = fingertip(
+        3, thumb_CMC_abduction=28.0, thumb_CMC_flexion=30.0, thumb_MCP_flexion=30.0, thumb_IP_flexion=30.0
+    )
+    little = fingertip(15, little_MCP_flexion=70.0, little_PIP_flexion=60.0, little_DIP_flexion=30.0)
+    assert np.linalg.norm(opposed - little) < 0.6 * np.linalg.norm(resting - little)
+
+
+def test_exported_xml_opens_and_moves_alike(tmp_path, rng):
+    from handsim.hand.mjcf import build_spec
+
+    model = HandModel(sample_shape(rng=rng))
+    spec = build_spec(model.skeleton, model.capsules)
+    spec.compile()
+    path = tmp_path / "hand.xml"
+    path.write_text(spec.to_xml())
+    again = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(again)
+    data.qpos[:] = random_qpos(model, 1, rng)[0]
+    mujoco.mj_kinematics(again, data)
+    ours = model.forward_kinematics(data.qpos[None])[0, :, :3, 3]
+    np.testing.assert_allclose(ours, data.xpos[1:], atol=1e-5)  # XML keeps six digits
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_named_sizes_have_their_measures(size):
+    length, breadth = SIZES[size]
+    shape = named_shape(size)
+    model = HandModel(shape)
+    tip = model.forward_kinematics(join_qpos(np.zeros((1, NUM_JOINTS))))[0, 9]
+    reach = (tip[:3, :3] @ [shape.bone_lengths[2, 2], 0, 0] + tip[:3, 3])[0]
+    assert reach == pytest.approx(length * 1e-3, rel=0.03)
+    assert shape.breadth == pytest.approx(breadth * 1e-3)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=50, deadline=None)
+def test_sampled_people_are_plausible(seed):
+    shape = sample_shape(EVERYBODY, rng=np.random.default_rng(seed))
+    assert 0.09 < shape.length < 0.23
+    assert 0.35 < shape.breadth / shape.length < 0.58
+    assert (shape.bone_lengths > 0.008).all()
+
+
+def test_population_varies_length_and_breadth_separately(rng):
+    shapes = [sample_shape(rng=rng) for _ in range(400)]
+    lengths, breadths = np.array([(shape.length, shape.breadth) for shape in shapes]).T
+    assert 0.45 < np.corrcoef(lengths, breadths)[0, 1] < 0.85  # ANSUR II, both sexes mixed: 0.7
+    assert lengths.mean() == pytest.approx(0.187, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("qpos", "sentence"),
+    [
+        (np.zeros((2, 26)), r"qpos has shape \(2, 26\), expected \(\.\.\., any, 27\)"),
+        (np.full((1, 27), np.nan), "qpos holds NaN or infinite values, expected finite numbers"),
+    ],
+)
+def test_bad_qpos_is_told(qpos, sentence):
+    with pytest.raises(ArgumentError, match=sentence):
+        HandModel.named("M").forward_kinematics(qpos)
+
+
+def test_unknown_size_is_told():
+    with pytest.raises(ArgumentError, match=r"unknown size 'XXL' .* valid names: XS, S, M, L, XL"):
+        named_shape("XXL")

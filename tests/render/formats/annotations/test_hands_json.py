@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from handsim.space.transforms import quaternion_matrix
+from render.cameras.camera import Camera, camera_from_record
+from render.cameras.lens import Lens
+from render.formats.annotations.common import to_json
+from render.formats.annotations.hands_json import camera_record, frame_record, hands_record, markers_record
+
+
+def polynomial(kind: str, flat: np.ndarray, k: list[float]) -> np.ndarray:
+    """The distortions that UmeTrack's tools publish, in their order of coefficients."""
+    square = (flat**2).sum(axis=-1, keepdims=True)
+    if kind == "PinholePlane":
+        return flat
+    if kind == "OculusVisionFishEye":
+        return flat * (1 + k[0] * square + k[1] * square**2 + k[2] * square**3 + k[3] * square**4)
+    x, y = flat[:, :1], flat[:, 1:]
+    radial = 1 + k[0] * square + k[1] * square**2 + k[2] * square**3
+    p1, p2 = k[3:]
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
+    bent_y = y * radial + 2 * p2 * x * y + p1 * (square + 2 * y * y)
+    return np.concatenate([bent_x, bent_y], axis=1)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(),
+        Lens("brown", (0.1, -0.05, 0.01, -0.02, 0.03)),
+        Lens("fisheye", (0.05, -0.01, 0.004, -0.001)),
+    ],
+)
+def test_a_reader_projects_as_we_do(camera: Camera, lens: Lens, rng: np.random.Generator) -> None:
+    bent = dataclasses.replace(camera, lens=lens)
+    record = json.loads(to_json(camera_record(bent)))
+    pose, calibration = record["T_world_from_camera"], record["calibration"]
+    points = rng.uniform(-0.2, 0.2, (20, 3))
+    rotation = quaternion_matrix(np.array(pose["quaternion_wxyz"]))
+    x, y, z = ((points - pose["translation_xyz"]) @ rotation).T
+    flat = np.stack([x / z, y / z], axis=1)
+    kind = calibration["projection_model_type"]
+    if kind == "OculusVisionFishEye":
+        across = np.hypot(x, y)
+        flat = np.stack([x, y], axis=1) * (np.arctan2(across, z) / across)[:, None]
+    fx, fy, cx, cy, *rest = calibration["projection_params"]
+    window = polynomial(kind, flat, rest) * (fx, fy) + (cx, cy)
+    np.testing.assert_allclose(window + 0.5, bent.project(points), atol=1e-9)
+    assert "rgb" in calibration["label"]
+    assert camera_from_record(record["camera"]).record() == bent.record()
+
+
+def test_hands_are_named_by_side_and_stream(make_frame, camera: Camera) -> None:
+    other = dataclasses.replace(camera, name="other")
+    views = [make_frame(4, ("left",), camera=view) for view in (camera, other)]
+    record = json.loads(to_json(hands_record(views)))
+    assert record["right"] is None
+    hand = views[0].hands[0]
+    assert set(record["left"]["pixels"]) == {"small", "other"}
+    np.testing.assert_allclose(np.array(record["left"]["pixels"]["small"]) + 0.5, hand.pixels, atol=1e-4)
+    np.testing.assert_allclose(record["left"]["landmarks"][5], hand.keypoints[0], atol=1e-8)
+    np.testing.assert_allclose(record["left"]["umetrack_pose"]["joint_angles"], hand.qpos[7:])
+    pose = record["left"]["umetrack_pose"]["T_world_from_wrist"]
+    np.testing.assert_allclose(pose["translation_xyz"], hand.qpos[:3])
+    np.testing.assert_allclose(
+        quaternion_matrix(np.array(pose["quaternion_wxyz"])),
+        np.array(record["left"]["umetrack_pose"]["wrist_xform"])[:3, :3],
+        atol=1e-12,
+    )
+
+
+def test_markers_raw_and_labeled(make_frame) -> None:
+    frame = make_frame()
+    record = json.loads(to_json(markers_record(frame)))
+    np.testing.assert_allclose(record["points"], frame.points, atol=1e-8)
+    assert record["labels"] == [1, 0, -1, 1]
+    assert record["label_names"] == ["first", "second"]
+    assert record["hands"][0]["marker_names"] == ["first", "second"]
+
+
+def test_our_own_record_counts_from_the_corner(make_frame) -> None:
+    frame = make_frame(away=True, sides=("right", "right"))  # here two of a side are welcome
+    record = json.loads(to_json(frame_record(frame)))
+    pixels = np.array(record["hands"][0]["pixels"], dtype=float)  # null becomes NaN
+    np.testing.assert_allclose(pixels, frame.hands[0].pixels, atol=1e-4)
+    assert record["hands"][0]["box"] == [None] * 4
+    assert record["choices"]["light"] == {"strength": 1.5, "direction": [0.0, 1.0, None]}

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from handsim.errors import ArgumentError
+from render.formats.annotations.joint_orders import ABSENT, JOINT_ORDERS, from_order, joint_order, to_order
+from render.keypoints import KEYPOINT_NAMES
+
+# Names as the formats' own documents list them, in our words.
+THUMB = ("thumb_CMC", "thumb_MCP", "thumb_IP", "thumb_tip")
+
+
+def finger(name: str) -> tuple[str, ...]:
+    return tuple(f"{name}_{part}" for part in ("MCP", "PIP", "DIP", "tip"))
+
+
+INDEX, MIDDLE, RING, LITTLE = (finger(name) for name in ("index", "middle", "ring", "little"))
+PUBLISHED = {
+    "freihand": ("wrist", *THUMB, *INDEX, *MIDDLE, *RING, *LITTLE),
+    "mano": (
+        "wrist",
+        *INDEX[:3],
+        *MIDDLE[:3],
+        *LITTLE[:3],
+        *RING[:3],
+        *THUMB[:3],
+        *(THUMB[3], INDEX[3], MIDDLE[3], RING[3], LITTLE[3]),
+    ),
+    "interhand": (*THUMB[::-1], *INDEX[::-1], *MIDDLE[::-1], *RING[::-1], *LITTLE[::-1], "wrist"),
+    "hands17": (
+        *("wrist", THUMB[0], INDEX[0], MIDDLE[0], RING[0], LITTLE[0]),
+        *(*THUMB[1:], *INDEX[1:], *MIDDLE[1:], *RING[1:], *LITTLE[1:]),
+    ),
+    "openxr": (None, "wrist", *THUMB, None, *INDEX, None, *MIDDLE, None, *RING, None, *LITTLE),
+    "webxr": ("wrist", *THUMB, None, *INDEX, None, *MIDDLE, None, *RING, None, *LITTLE),
+    "umetrack": (
+        *(THUMB[3], INDEX[3], MIDDLE[3], RING[3], LITTLE[3], "wrist", *THUMB[1:3]),
+        *(*INDEX[:3], *MIDDLE[:3], *RING[:3], *LITTLE[:3]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_orders_are_the_published_ones(name: str) -> None:
+    names = [None if place == ABSENT else KEYPOINT_NAMES[place] for place in joint_order(name)]
+    assert names == list(PUBLISHED[name])
+
+
+def test_mano_undoes_the_table_of_ho3d() -> None:
+    """HO-3D publishes the places in MANO's order of joints in the plain one."""
+    table = [0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20]
+    points = np.arange(21.0)[:, None]
+    np.testing.assert_array_equal(to_order(points, "mano")[table], points)
+
+
+@pytest.mark.parametrize(
+    ("name", "count"), [("openxr", 26), ("webxr", 25), ("hot3d", 20), ("umetrack21", 21)]
+)
+def test_counts(name: str, count: int) -> None:
+    assert to_order(np.zeros((21, 3)), name).shape == (count, 3)
+
+
+@pytest.mark.parametrize("name", JOINT_ORDERS)
+@given(points=hnp.arrays(np.float64, (2, 21, 3), elements=st.floats(-1e3, 1e3)))
+def test_there_and_back(name: str, points: np.ndarray) -> None:
+    known = np.isin(np.arange(21), joint_order(name))
+    back = from_order(to_order(points, name), name)
+    np.testing.assert_array_equal(back[:, known], points[:, known])
+    assert np.isnan(back[:, ~known]).all()
+
+
+@pytest.mark.parametrize("name", JOINT_ORDERS)
+@given(data=st.data())
+def test_back_and_there(name: str, data: st.DataObject) -> None:
+    order = np.array(joint_order(name))
+    points = data.draw(hnp.arrays(np.float32, (len(order), 2), elements=st.floats(-8, 8, width=16)))
+    again = to_order(from_order(points, name), name)
+    assert again.dtype == np.float32
+    np.testing.assert_array_equal(again[order != ABSENT], points[order != ABSENT])
+    assert np.isnan(again[order == ABSENT]).all()
+
+
+def test_every_order_has_each_joint_at_most_once() -> None:
+    for order in JOINT_ORDERS.values():
+        known = [place for place in order if place != ABSENT]
+        assert len(set(known)) == len(known)
+
+
+def test_mistakes_are_told() -> None:
+    with pytest.raises(ArgumentError, match=r"unknown joint order 'open_xr' \(did you mean 'openxr'"):
+        to_order(np.zeros((21, 3)), "open_xr")
+    with pytest.raises(ArgumentError, match=r"expected \(\.\.\., 21, k\)"):
+        to_order(np.zeros((20, 3)), "mano")
+    with pytest.raises(ArgumentError, match=r"expected \(\.\.\., 26, k\)"):
+        from_order(np.zeros((25, 3)), "openxr")

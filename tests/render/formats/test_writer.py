@@ -1,0 +1,241 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from handsim.errors import DatasetError, HandSimError
+from handsim.hand.model import HandModel
+from handsim.space.cameras import look_at
+from render.formats.exr import read_exr
+from render.formats.png_depth import decode_depth, read_depth
+from render.formats.writer import FORMATS, FrameWriter, open_writer
+from render.frames import RenderedFrame
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
+
+
+def broken(frame: RenderedFrame) -> Iterator[RenderedFrame]:
+    yield frame
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_shard_is_there_whole_or_not_at_all(name: str, make_frame, tmp_path: Path) -> None:
+    writer = open_writer(name, tmp_path / "set")
+    assert writer.done() == frozenset()
+    writer.write(3, [make_frame(0), make_frame(1)])
+    whole = files(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        writer.write(12, broken(make_frame(2)))
+    assert writer.done() == {3}
+    assert files(tmp_path) == whole
+    assert open_writer(name, tmp_path / "set").done() == {3}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_same_frames_give_the_same_bytes_in_any_order(name: str, make_frame, tmp_path: Path) -> None:
+    for folder, order in (("a", (0, 1)), ("b", (1, 0))):
+        writer = open_writer(name, tmp_path / folder)
+        for shard in order:
+            writer.write(shard, [make_frame(2 * shard, ("right", "left")), make_frame(2 * shard + 1)])
+        writer.finish()
+        writer.finish()
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_shard_may_be_written_anew(name: str, make_frame, tmp_path: Path) -> None:
+    writer = open_writer(name, tmp_path / "a")
+    writer.write(0, [make_frame(0), make_frame(1), make_frame(2)])
+    writer.write(0, [make_frame(4)])
+    other = open_writer(name, tmp_path / "b")
+    other.write(0, [make_frame(4)])
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_what_killed_writers_left_is_cleared(name: str, make_frame, tmp_path: Path) -> None:
+    writer = open_writer(name, tmp_path)
+    writer.write(0, [make_frame()])
+    (place,) = (path.parent for path in tmp_path.rglob("shard-00000*"))
+    (place / ".shard-00000.tmp-1").mkdir()
+    (place / ".shard-00000.tmp-1" / "rest.jpg").write_bytes(b"")
+    (place / ".shard-00000.tmp-2.tar").write_bytes(b"")
+    (place / ".shard-00007.tmp-3").mkdir()  # somebody else's, at work
+    writer.write(0, [make_frame()])
+    assert [path.name for path in place.glob(".shard*")] == [".shard-00007.tmp-3"]
+    assert writer.done() == {0}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_place_that_takes_no_files_is_told(name: str, make_frame, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    writer = open_writer(name, tmp_path / "file" / "set")
+    with pytest.raises(
+        HandSimError, match="writing shard 0 failed: Not a directory; shards that were"
+    ) as told:
+        writer.write(0, [make_frame()])
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_full_disk_is_told_and_finished_shards_stay(
+    name: str, make_frame, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file system's own limit on a file's size stands for a full disk; both are an OSError."""
+    resource = pytest.importorskip("resource")
+    import signal
+
+    writer = open_writer(name, tmp_path)
+    writer.write(0, [make_frame(0)])
+    before = files(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300, hard))
+        with pytest.raises(HandSimError, match="writing shard 1 failed"):
+            writer.write(1, [make_frame(1)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
+    assert files(tmp_path) == before
+    assert writer.done() == {0}
+
+
+def test_an_unknown_format_is_told(tmp_path: Path) -> None:
+    with pytest.raises(HandSimError, match=r"unknown format 'web'.*valid names: webdataset, coco, freihand"):
+        open_writer("web", tmp_path)
+
+
+@pytest.mark.parametrize("name", ["coco", "freihand", "interhand"])
+@pytest.mark.parametrize("content", ["[{", "{}", "[1]"])
+def test_a_damaged_index_is_told(name: str, content: str, make_frame, tmp_path: Path) -> None:
+    writer = open_writer(name, tmp_path)
+    writer.write(0, [make_frame()])
+    (index,) = tmp_path.rglob("index.json")
+    index.write_text(content)
+    with pytest.raises(DatasetError, match=r"index\.json: damaged.*delete the folder shard-00000"):
+        writer.finish()
+    index.unlink()
+    with pytest.raises(DatasetError, match="cannot be read"):
+        writer.finish()
+
+
+@pytest.mark.parametrize("name", ["png", "exr", "coco", "interhand"])
+def test_two_frames_of_one_name_are_told(name: str, make_frame, tmp_path: Path) -> None:
+    with pytest.raises(HandSimError, match="two frames of a shard are called 'small_000001'"):
+        open_writer(name, tmp_path).write(0, [make_frame(1), make_frame(1)])
+
+
+def test_png_and_exr_hold_the_pictures(make_frame, tmp_path: Path) -> None:
+    frame = make_frame(7, ("right", "left"), noisy=True)
+    for name in ("png", "exr"):
+        open_writer(name, tmp_path / name).write(0, [frame])
+        record = json.loads((tmp_path / name / "shard-00000" / "small_000007.json").read_text())
+        assert [hand["side"] for hand in record["hands"]] == ["right", "left"]
+    start = str(tmp_path / "png" / "shard-00000" / "small_000007")
+    np.testing.assert_array_equal(cv2.imread(f"{start}.png")[..., ::-1], frame.noisy.rgb)
+    np.testing.assert_allclose(read_depth(f"{start}.depth.png"), frame.noisy.depth, atol=1e-4)
+    back = read_exr(tmp_path / "exr" / "shard-00000" / "small_000007.exr")
+    np.testing.assert_array_equal(back.ideal.depth, frame.ideal.depth)
+
+
+# ---- clips
+
+
+@pytest.fixture
+def clip(make_frame, camera, tmp_path: Path) -> tuple[Path, list[RenderedFrame]]:
+    other = dataclasses.replace(camera, name="other").at(look_at(np.array([0.1, -0.5, -0.3]), np.zeros(3)))
+    frames = [
+        make_frame(number, ("right", "left"), camera=view, noisy=True)
+        for number in (4, 5)
+        for view in (camera, other)
+    ]
+    writer: FrameWriter = open_writer("webdataset", tmp_path)
+    writer.write(0, frames)
+    writer.finish()
+    return tmp_path / "shard-00000.tar", frames
+
+
+def test_a_tar_holds_samples_and_the_hand(clip) -> None:
+    path, _ = clip
+    with tarfile.open(path) as tar:
+        members = tar.getmembers()
+        shapes = json.load(tar.extractfile("__hand_shapes.json__"))
+    assert {(member.mtime, member.uid, member.gid, member.uname) for member in members} == {(0, 0, 0, "")}
+    names = [member.name for member in members]
+    assert len(set(names)) == len(names)
+    assert {name.partition(".")[2] for name in names if name.startswith("000004.")} == {
+        *(f"image_{stream}.jpg" for stream in ("small", "other")),
+        *(
+            f"{kind}_{stream}.png"
+            for kind in ("depth", "depth_ideal", "normals", "ids")
+            for stream in ("small", "other")
+        ),
+        *(f"{kind}.json" for kind in ("cameras", "hands", "objects", "markers", "choices", "info")),
+    }
+    assert len(shapes["umetrack"]["mesh_vertices"]) == len(HandModel.named("M").surface.vertices)
+
+
+def test_webdataset_iterates_it(clip) -> None:
+    webdataset = pytest.importorskip("webdataset")
+    path, frames = clip
+    samples = list(webdataset.WebDataset(str(path), shardshuffle=False))
+    assert [sample["__key__"] for sample in samples] == ["000004", "000005"]
+    for sample, frame in zip(samples, frames[::2], strict=True):
+        np.testing.assert_allclose(decode_depth(sample["depth_small.png"]), frame.noisy.depth, atol=1e-4)
+        np.testing.assert_allclose(
+            decode_depth(sample["depth_ideal_small.png"]), frame.ideal.depth, atol=1e-4
+        )
+        picture = cv2.imdecode(np.frombuffer(sample["image_other.jpg"], np.uint8), cv2.IMREAD_COLOR)
+        assert picture.shape == (72, 96, 3)
+        assert set(json.loads(sample["cameras.json"])) == {"small", "other"}
+        assert json.loads(sample["objects.json"])["pen"][0]["object_name"] == "pen"
+
+
+def test_people_who_share_a_clip_get_no_common_hand(make_frame, tmp_path: Path) -> None:
+    frame = make_frame(0)
+    small = HandModel.named("S").shape
+    other = dataclasses.replace(make_frame(1), hands=(dataclasses.replace(frame.hands[0], shape=small),))
+    open_writer("webdataset", tmp_path).write(0, [frame, other])
+    with tarfile.open(tmp_path / "shard-00000.tar") as tar:
+        assert "__hand_shapes.json__" not in tar.getnames()
+
+
+def test_what_a_clip_cannot_hold_is_told(make_frame, camera, tmp_path: Path) -> None:
+    writer = open_writer("webdataset", tmp_path)
+    first, second = make_frame(0), make_frame(1)
+    for frames, told in [
+        ([first, second, first], "the pictures of frame 0 do not follow one another"),
+        ([first, first], "frame 0 has two pictures of one camera: small, small"),
+        ([make_frame(0, ("left", "left"))], "hands left and left"),
+        ([make_frame(camera=dataclasses.replace(camera, name="a.b"))], "camera 'a.b': a stream's name"),
+    ]:
+        with pytest.raises(HandSimError, match=told):
+            writer.write(0, frames)
+    assert writer.done() == frozenset()
+
+
+def test_writers_need_no_window() -> None:
+    """Files can be written, and read, where nothing can be drawn."""
+    code = (
+        "import sys, render.formats.writer; "
+        "print([x for x in ('pyrender', 'OpenGL', 'torch') if x in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,154 @@
+"""Colors of the compiled painter: where the answer is known, and against OpenGL's."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gloves.fit import fit_glove
+from gloves.layout import load_layout
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import SIDES, Side
+from handsim.space.cameras import look_at
+from poses.shapes.library import gesture
+from render.cameras.camera import Camera, pinhole
+from render.painting.figures import Drawn, HandFigure, sample_people
+from render.painting.lights import Lamp, Lighting, sample_lighting
+from render.painting.materials import Material
+from render.painting.painter import Painter, paint, put_before
+from render.painting.rasterizer import Triangles, rasterize
+from render.skin.look import TONES
+
+CAMERA = pinhole("small", (96, 72), 90.0)
+DARK = (0.0, 0.0, 0.0)
+
+
+def thing(mesh: trimesh.Trimesh, material: Material, smooth: bool = True) -> Drawn:
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
+    if not smooth:
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    normals = np.array(mesh.vertex_normals if smooth else np.repeat(mesh.face_normals, 3, axis=0))
+    ids = np.ones(len(faces), dtype=np.uint8)
+    triangles = Triangles(vertices, faces, normals, ids, ids, ids)
+    return Drawn(triangles, np.ones((len(vertices), 4), dtype=np.float32), None, lambda: material)
+
+
+def ball(material: Material, place: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Drawn:
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.2)
+    return thing(mesh.apply_translation(place), material)
+
+
+def plain(level: float = 0.5, roughness: float = 1.0) -> Material:
+    return Material(np.full(3, level), roughness)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.0, 1.0), st.floats(0.05, 1.0))
+def test_light_from_everywhere_shows_a_surface_in_its_own_color(level: float, strength: float) -> None:
+    picture = paint(CAMERA, [ball(plain(level))], Lighting((), (strength,) * 3))
+    inside = picture[..., 3] == 255
+    assert inside.sum() > 500
+    wanted = 255.0 * (level * strength) ** (1 / 2.2)
+    assert np.abs(picture[inside][:, :3] - wanted).max() <= 1.0
+
+
+def test_a_wall_that_faces_the_lamp_sends_back_its_color_and_a_glint() -> None:
+    wall = thing(trimesh.creation.box((8.0, 8.0, 0.1)).apply_translation([0, 0, 2.0]), plain(), smooth=False)
+    shown = paint(CAMERA, [wall], Lighting((Lamp((0.0, 0.0, -1.0), 1.0),), DARK))[36, 48]
+    # What is not mirrored of its 0.5, and the peak of chalk's microfacets: a quarter of 0.04.
+    light = 0.5 * 0.96 * 0.96 + 0.04 / 4
+    assert np.abs(shown[:3] - 255.0 * light ** (1 / 2.2)).max() <= 1.5
+    behind = paint(CAMERA, [wall], Lighting((Lamp((0.0, 0.0, 1.0), 1.0),), DARK))[36, 48]
+    assert behind.tolist() == [0, 0, 0, 255]
+
+
+def test_edges_cover_pixels_in_part_as_much_as_the_surface_does() -> None:
+    picture = paint(CAMERA, [ball(plain())], Lighting((), (1.0,) * 3))
+    covered = picture[..., 3] / 255.0
+    assert set(np.unique(picture[..., 3])) <= {0, 64, 128, 191, 255}
+    radius = 90.0 * 0.2 / np.sqrt(1.0 - 0.04)  # of the ball's outline [px]
+    assert covered.sum() == pytest.approx(np.pi * radius**2, rel=0.01)
+    whole = paint(
+        dataclasses.replace(CAMERA, size=(192, 144), K=CAMERA.K * [[2], [2], [1]]),
+        [ball(plain())],
+        Lighting((), (1.0,) * 3),
+    )
+    folded = whole[..., 3].reshape(72, 2, 96, 2).mean(axis=(1, 3)) / 255.0
+    assert np.abs(folded - covered).mean() < 0.003
+
+
+def test_only_the_first_lamp_casts_shadows() -> None:
+    floor = thing(
+        trimesh.creation.box((4.0, 4.0, 0.02)).apply_translation([0, 0, 1.6]), plain(), smooth=False
+    )
+    above = ball(plain(), (-0.15, 0.0, 1.2))
+    aslant = (-0.8, 0.0, -1.0)
+    first = paint(CAMERA, [floor, above], Lighting((Lamp(aslant, 1.0),), DARK))
+    other = paint(CAMERA, [floor, above], Lighting((Lamp((0.0, 0.0, 1.0), 0.0), Lamp(aslant, 1.0)), DARK))
+    # The shadow lies where the lamp's ray through the ball's middle meets the floor.
+    x = -0.15 + 0.8 * (1.59 - 1.2)
+    column = int(90.0 * x / 1.59 + 48)
+    assert first[36, column, :3].max() == 0
+    assert other[36, column, :3].min() > 100
+    far = first[5, 5, :3].astype(int)
+    assert far.min() > 100 and np.abs(far - other[5, 5, :3]).max() <= 1
+
+
+def test_a_ball_casts_no_shadow_on_its_lit_side() -> None:
+    lamp = Lighting((Lamp((-0.5, -0.5, -1.0), 1.0),), DARK)
+    hidden = Lighting((Lamp((0.0, 0.0, 1.0), 0.0), Lamp((-0.5, -0.5, -1.0), 1.0)), DARK)
+    shown, free = (paint(CAMERA, [ball(plain())], light).astype(int) for light in (lamp, hidden))
+    assert np.abs(shown - free).max() <= 2
+
+
+def hand(side: Side, tone: str, seed: int) -> tuple[Camera, list[Drawn]]:
+    rng = np.random.default_rng(seed)
+    model = HandModel.named("M", side=side)
+    look = sample_people(1, False, tones=TONES[tone], rng=rng)[0]
+    qpos = join_qpos(gesture("relaxed")[None])
+    figure = HandFigure(fit_glove(load_layout("dense19"), model), look, first_marker=0)
+    eye = rng.normal(size=3)
+    place = np.array([0.07, 0.0, 0.0])
+    camera = pinhole("some", (160, 120), 170.0).at(look_at(place + 0.45 * eye / np.linalg.norm(eye), place))
+    return camera, figure.drawn(qpos[0], 0)
+
+
+@pytest.mark.usefixtures("drawing")
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("tone", ["light", "dark"])
+def test_opengl_paints_the_same(side: Side, tone: str) -> None:
+    for seed in range(3):
+        camera, drawn = hand(side, tone, seed)
+        lighting = sample_lighting(rng=np.random.default_rng(seed))
+        names: tuple[Painter, Painter] = ("compiled", "opengl")
+        ours, theirs = (paint(camera, drawn, lighting, name).astype(int) for name in names)
+        both = (ours[..., 3] == 255) & (theirs[..., 3] == 255)
+        off = np.abs(ours - theirs)[both][:, :3]
+        assert both.sum() > 1500
+        assert np.median(off) <= 1.0
+        assert off.mean() < 4.0
+        assert np.abs(ours[..., 3] - theirs[..., 3]).mean() < 1.5
+
+
+def test_colors_lie_where_the_ids_are() -> None:
+    camera, drawn = hand("right", "tan", 1)
+    painted = paint(camera, drawn, sample_lighting(rng=np.random.default_rng(0)))
+    truth = rasterize(camera, drawn[0].triangles)
+    inside = truth.parts > 0
+    assert (painted[..., 3][inside] >= 64).all()
+    assert (painted[..., 3][~inside] < 255).mean() > 0.99
+
+
+def test_nothing_gives_nothing_and_a_background_shows_through(rng: np.random.Generator) -> None:
+    behind = rng.uniform(0.0, 255.0, (72, 96, 3)).astype(np.float32)
+    empty = paint(CAMERA, [], Lighting((), DARK))
+    assert not empty.any()
+    np.testing.assert_array_equal(put_before(empty, behind), behind.astype(np.uint8))
+    half = np.full((72, 96, 4), 128, dtype=np.uint8)
+    mixed = put_before(half, behind)
+    np.testing.assert_allclose(mixed, np.minimum(128 + (1 - 128 / 255) * behind, 255), atol=1.001)

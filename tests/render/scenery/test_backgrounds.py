@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from handsim.errors import HandSimError
+from render.scenery.backgrounds import KINDS, Background, BackgroundConfig, draw_background, sample_background
+
+SIZE = (160, 120)
+NOTHING = {"plain": 0.0, "gradient": 0.0, "noise": 0.0, "clutter": 0.0, "room": 0.0}
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    """Two photographs, one of them in a subfolder, and files that are none."""
+    folder = tmp_path / "photos"
+    (folder / "more").mkdir(parents=True)
+    assert cv2.imwrite(str(folder / "blue.png"), np.full((300, 500, 3), (200, 10, 10), dtype=np.uint8))
+    assert cv2.imwrite(str(folder / "more" / "red.jpg"), np.full((90, 70, 3), (10, 10, 200), dtype=np.uint8))
+    (folder / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photograph at all")
+    (folder / "empty.png").write_bytes(b"")
+    (folder / "notes.txt").write_text("not a picture", encoding="utf-8")
+    return folder
+
+
+def only(kind: str, **more: str) -> BackgroundConfig:
+    return BackgroundConfig(**{**NOTHING, kind: 1.0}, **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "photo"])
+def test_backgrounds_repeat_and_differ(kind: str) -> None:
+    first, again, other = (sample_background(only(kind), rng=np.random.default_rng(s)) for s in (1, 1, 2))
+    assert first == again
+    assert first.kind == kind
+    picture = draw_background(first, SIZE)
+    assert picture.shape == (120, 160, 3)
+    assert picture.dtype == np.float32
+    assert picture.min() >= 0.0
+    assert picture.max() <= 1.0
+    assert picture.tobytes() == draw_background(again, SIZE).tobytes()
+    assert np.abs(picture - draw_background(other, SIZE)).max() > 0.01
+    values = json.loads(json.dumps(dataclasses.asdict(first)))
+    assert (draw_background(Background(**values), SIZE) == picture).all()
+
+
+def test_what_each_kind_is() -> None:
+    def spread(kind: str, seed: int) -> float:
+        background = sample_background(only(kind), rng=np.random.default_rng(seed))
+        return float(np.ptp(draw_background(background, SIZE), axis=(0, 1)).max())
+
+    assert max(spread("plain", seed) for seed in range(5)) == 0.0
+    for kind in ("noise", "clutter", "room"):
+        assert np.median([spread(kind, seed) for seed in range(5)]) > 0.15
+
+
+def test_shares_are_kept(rng: np.random.Generator) -> None:
+    config = BackgroundConfig(plain=1.0, gradient=0.0, noise=3.0, clutter=0.0, room=0.0)
+    kinds = [sample_background(config, rng=rng).kind for _ in range(400)]
+    assert set(kinds) == {"plain", "noise"}
+    assert 0.66 < kinds.count("noise") / 400 < 0.84
+
+
+def test_photographs_fill_the_picture_and_broken_files_are_passed_over(photos: Path) -> None:
+    config = only("photo", photos=str(photos))
+    seen = set()
+    for seed in range(12):
+        background = sample_background(config, rng=np.random.default_rng(seed))
+        assert background.photo is not None
+        seen.add(Path(background.photo).name)
+        picture = draw_background(background, SIZE)
+        assert picture.shape == (120, 160, 3)
+        assert picture[..., 1].max() < 0.01
+        blue = Path(background.photo).name == "blue.png"
+        assert picture[..., 2 if blue else 0].min() > 0.4
+        assert picture[..., 0 if blue else 2].max() < 0.05
+    assert seen == {"blue.png", "red.jpg"}
+
+
+def test_folders_without_photographs_are_told(photos: Path, tmp_path: Path) -> None:
+    for name in ("blue.png", "more/red.jpg"):
+        (photos / name).unlink()
+    with pytest.raises(HandSimError, match=r"photos: no photograph that can be read"):
+        sample_background(only("photo", photos=str(photos)), rng=np.random.default_rng(0))
+    with pytest.raises(HandSimError, match="no such folder"):
+        sample_background(only("photo", photos=str(tmp_path / "none")), rng=np.random.default_rng(0))
+
+
+def test_impossible_configs_are_told() -> None:
+    with pytest.raises(HandSimError, match="shares of backgrounds"):
+        BackgroundConfig(**NOTHING)
+    with pytest.raises(HandSimError, match="shares of backgrounds"):
+        BackgroundConfig(plain=-1.0)
+    with pytest.raises(HandSimError, match="`photos`"):
+        BackgroundConfig(photo=1.0)
+    with pytest.raises(HandSimError, match=r"unknown background .rom. .did you mean .room."):
+        draw_background(Background("rom", ((0.1, 0.1, 0.1),) * 2, 0), SIZE)  # type: ignore[arg-type]
+    gone = Background("photo", ((0.1, 0.1, 0.1),) * 2, 0, photo="/nowhere/a.jpg")  # type: ignore[arg-type]
+    with pytest.raises(HandSimError, match=r"/nowhere/a\.jpg: not a readable photograph"):
+        draw_background(gone, SIZE)

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from handsim.errors import HandSimError
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import sample_shape
+from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.topology import BONES, NUM_BONES, SIDES, Side
+from handsim.space.transforms import MIRROR
+from poses.shapes.library import gesture
+from render.frames import FOREARM
+from render.skin.atlas import skin_atlas
+from render.skin.forearm import Forearm, sample_forearm
+from render.skin.mesh import SkinMesh, face_parts, mesh_normals
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_drawn_skin_is_closed_and_faces_outwards(side: Side, rng: np.random.Generator) -> None:
+    for _ in range(3):
+        mesh = SkinMesh(HandModel(sample_shape(side=side, rng=rng)), sample_forearm(rng=rng))
+        solid = trimesh.Trimesh(mesh.rest, mesh.faces, process=False)
+        assert solid.is_watertight
+        assert solid.is_winding_consistent
+        assert 5e-4 < solid.volume < 3e-3  # [m3]: a hand on 16 to 25 cm of forearm
+
+
+def test_the_hands_own_vertices_are_the_models(model: HandModel) -> None:
+    qpos = join_qpos(gesture("ok")[None], position=np.array([0.3, 0.1, 1.0]))[0]
+    mesh, atlas = SkinMesh(model), skin_atlas()
+    drawn = mesh.posed(qpos)
+    skin = model.skin(qpos[None])[0][atlas.used]
+    np.testing.assert_array_equal(mesh.merged(model.forward_kinematics(qpos[None]))[: len(skin)], skin)
+    own = atlas.corners < atlas.num_hand
+    np.testing.assert_allclose(drawn.vertices[own], skin[atlas.corners[own]], atol=1e-6)
+    # and all that is missing lies behind the wrist
+    gone = np.setdiff1d(np.arange(len(model.surface.vertices)), atlas.used)
+    assert model.surface.vertices[gone, 0].max() < -0.003
+
+
+def test_drawn_faces_are_the_closed_surfaces_own(model: HandModel) -> None:
+    mesh, atlas = SkinMesh(model), skin_atlas()
+    drawn = mesh.posed(join_qpos(gesture("flat")[None])[0])
+    np.testing.assert_array_equal(atlas.corners[drawn.faces], mesh.faces)
+    assert len(drawn.faces) == len(drawn.parts) < 20_000  # two hands stay below 40 000
+
+
+def test_normals_agree_with_the_models_and_are_shared_across_seams(model: HandModel) -> None:
+    mesh, atlas = SkinMesh(model), skin_atlas()
+    normals = mesh_normals(mesh.rest, mesh.faces)
+    np.testing.assert_allclose(normals, vertex_normals(mesh.rest, mesh.faces), atol=1e-9)
+    drawn = mesh.posed(join_qpos(gesture("flat")[None])[0])
+    order = np.argsort(atlas.corners, kind="stable")
+    same = atlas.corners[order][1:] == atlas.corners[order][:-1]
+    assert same.sum() > 2000
+    assert (drawn.normals[order][1:][same] == drawn.normals[order][:-1][same]).all()
+
+
+def test_parts_follow_the_weights(model: HandModel) -> None:
+    parts, atlas = face_parts(), skin_atlas()
+    assert set(parts.tolist()) == {*range(NUM_BONES), FOREARM}
+    on_arm = (atlas.faces >= atlas.num_hand).any(axis=1)
+    assert ((parts == FOREARM) == on_arm).all()
+    surface = model.surface
+    strongest = surface.bone_indices[atlas.used][:, 0]
+    uniform = (strongest[np.minimum(atlas.faces, atlas.num_hand - 1)] == parts[:, None]).all(axis=1)
+    assert uniform[~on_arm].mean() > 0.9
+    # a part's middle lies along its bone
+    rest, middles = model.rest_transforms, SkinMesh(model).rest[atlas.faces].mean(axis=1)
+    for number, bone in enumerate(BONES):
+        if bone.digit > 0:
+            local = (middles[parts == number].mean(axis=0) - rest[number, :3, 3]) @ rest[number, :3, :3]
+            assert 0.0 < local[0] < model.skeleton.lengths[number]
+            assert np.hypot(*local[1:]) < 0.006
+
+
+def test_left_hand_is_the_mirror_image() -> None:
+    right, left = (SkinMesh(HandModel.named("M", side=side), Forearm(flexion=0.2)) for side in SIDES[::-1])
+    np.testing.assert_allclose(left.rest, right.rest @ MIRROR, atol=1e-9)
+    qpos = join_qpos(gesture("pinch_index")[None])[0]
+    np.testing.assert_allclose(left.posed(qpos).shade, right.posed(qpos).shade, atol=1e-5)
+
+
+def test_folds_are_darker_than_what_lies_open(model: HandModel) -> None:
+    mesh, parts = SkinMesh(model), face_parts()
+    flat, fist = (mesh.posed(join_qpos(gesture(name)[None])[0]) for name in ("spread", "fist"))
+    assert flat.shade.min() >= 0.0
+    assert fist.shade.max() <= 1.0
+    assert flat.shade.mean() > 0.97
+    for bone in (5, 8, 11):  # middle phalanges: their pads lie on the palm
+        corners = np.unique(fist.faces[parts == bone])
+        assert fist.shade[corners].min() < 0.5
+    assert fist.shade[np.unique(fist.faces[parts == FOREARM])].mean() > 0.9
+
+
+def test_a_bent_wrist_has_the_arm_come_from_the_palms_side() -> None:
+    model = HandModel.named("M")
+    straight, bent, aside = (
+        SkinMesh(model, Forearm(length=0.2, flexion=flexion, deviation=deviation)).rest[-1]
+        for flexion, deviation in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.3))
+    )
+    assert straight[0] < -0.19
+    assert bent[2] < straight[2] - 0.05
+    assert aside[1] > straight[1] + 0.04
+
+
+def test_arms_are_as_thick_as_people_are() -> None:
+    model, atlas = HandModel.named("L"), skin_atlas()
+    rings = SkinMesh(model, Forearm(length=0.22)).rest[atlas.num_hand : -1].reshape(-1, len(atlas.wrist), 3)
+    girths = np.linalg.norm(rings - np.roll(rings, 1, axis=1), axis=-1).sum(axis=1)
+    assert 0.150 < girths.min() < 0.180  # [m]: men's wrists, ANSUR II
+    assert 0.24 < girths[-1] < 0.30
+    assert (np.diff(girths)[3:] > 0.0).all()
+
+
+def test_impossible_forearms_are_told() -> None:
+    with pytest.raises(HandSimError, match="forearm of 5 m"):
+        Forearm(length=5.0)
+    with pytest.raises(HandSimError, match="girth"):
+        Forearm(girth=0.0)
+
+
+def test_texture_places_lie_on_texels_of_their_own_tile() -> None:
+    atlas = skin_atlas()
+    width, height = atlas.size
+    texel = atlas.uv * [width, height]
+    assert (texel > 0.49).all()
+    assert (texel < np.array([width, height]) - 0.49).all()
+    # no triangle reaches over more than a quarter of a tile, or of the forearm's strip
+    spans = np.ptp(texel[atlas.corner_faces], axis=1)
+    on_hand = (atlas.faces < atlas.num_hand).all(axis=1)
+    assert spans[on_hand].max() < 4.5

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import SIDES, Side
+from poses.shapes.library import gesture
+from render.painting.gl import load_pyrender, offscreen_renderer
+from render.painting.lights import Lamp, Lighting, add_lights
+from render.painting.materials import skin_material
+from render.painting.scene import OPENGL_FROM_OPENCV, view_along
+from render.skin.atlas import skin_atlas
+from render.skin.mesh import SkinMesh
+from render.skin.relief import normal_map, relief
+from render.skin.texels import skin_texels
+from render.skin.texture import SkinTexture
+
+SIZE = (400, 400)
+
+
+def test_no_relief_is_the_skins_own_normals() -> None:
+    width, rows = skin_atlas().size
+    normals = normal_map(np.zeros(width * rows), "right").astype(int)
+    assert normals.shape == (rows, width, 3)
+    assert np.ptp(normals[..., :2] - 127) <= 1
+    assert (normals[..., 2] == 255).all()
+
+
+def test_relief_stays_under_a_millimeter_and_off_the_palm() -> None:
+    texels = skin_texels()
+    back = np.clip(texels.dorsal, 0.0, 1.0)
+    height = relief()
+    assert 3e-4 < height.max() < 1e-3
+    assert -1e-3 < height.min()
+    assert np.abs(height[texels.dorsal < -0.5]).max() < 1e-9
+    # tendons and knuckles stand above what lies between the fingers
+    knuckles = HandModel.named("M").shape.knuckles[1:, :2]
+    top = [
+        height[(np.linalg.norm(texels.places[:, :2] - at, axis=1) < 0.004) & (back > 0.7)].max()
+        for at in knuckles
+    ]
+    assert min(top) > 3e-4
+
+
+@pytest.mark.usefixtures("drawing")
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("axis", [0, 1])
+def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> None:
+    """A ridge over the back of the hand, lengthwise or across, with a lamp to the left of it or above."""
+    pyrender, model = load_pyrender(), HandModel.named("M", side=side)
+    texels, (width, rows) = skin_texels(), skin_atlas().size
+    where = (0.05, 0.0)[axis]
+    height = 0.0015 * np.exp(-(((texels.places[:, axis] - where) / 0.004) ** 2)) * (texels.dorsal > 0.0)
+    gray = np.full((rows, width, 3), 150, dtype=np.uint8)
+    texture = SkinTexture(gray, np.full((rows, width), 255, dtype=np.uint8), normal_map(height, side))
+    plain = texture._replace(normals=normal_map(0.0 * height, side))
+    skin = SkinMesh(model).posed(join_qpos(gesture("flat")[None])[0])
+    view = view_along(np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), skin.vertices, SIZE)
+    lamp = Lamp((-1.0, 0.0, -1.0) if axis == 1 else (0.0, -1.0, -1.0), 1.0)
+    drawn = []
+    for paint in (texture, plain):
+        scene = pyrender.Scene(bg_color=[0.0] * 4)
+        primitive = pyrender.Primitive(
+            positions=skin.vertices,
+            normals=skin.normals,
+            indices=skin.faces,
+            texcoord_0=skin.uv,
+            material=skin_material(paint).for_pyrender(),
+        )
+        scene.add(pyrender.Mesh([primitive]))
+        camera = pyrender.PerspectiveCamera(view.field_of_view, znear=0.05, zfar=10.0)
+        scene.add(camera, pose=view.T_world_camera @ OPENGL_FROM_OPENCV)
+        add_lights(pyrender, scene, Lighting((lamp,), (0.1, 0.1, 0.1)), view.T_world_camera)
+        picture, _ = offscreen_renderer(*SIZE).render(scene, flags=pyrender.RenderFlags.NONE)
+        drawn.append(picture[..., 0].astype(float))
+    change = drawn[0] - drawn[1]
+    # Seen from the back with the fingers up, x is up in the picture; y is to the left on a right hand.
+    lit, dim = np.array([[0.05, 0.0, 0.02], [0.05, 0.0, 0.02]])
+    step = 0.003
+    if axis == 0:
+        lit[0], dim[0] = lit[0] + step, dim[0] - step
+    else:
+        lit[0] = dim[0] = 0.06
+        towards = view.T_world_camera[:3, 0] @ [0.0, 1.0, 0.0]  # is y to the right in the picture?
+        lit[1], dim[1] = -np.sign(towards) * step, np.sign(towards) * step
+    values = []
+    for point in (lit, dim):
+        column, row = view.project(point, SIZE).astype(int)
+        values.append(change[row - 1 : row + 2, column - 1 : column + 2].mean())
+    assert values[0] > 4.0
+    assert values[1] < -4.0

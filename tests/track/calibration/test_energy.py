@@ -1,0 +1,98 @@
+"""The equations of a calibration are the derivative of its energy, for poses, shape, markers and touches."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from handsim.hand.model import join_qpos
+from handsim.space.transforms import random_quaternions
+from poses.shapes.touch import touching_angles
+from poses.shapes.validity import sample_valid_angles
+from track.calibration.contacts import place_contacts, slide_contacts
+from track.calibration.energy import Guess, Problem
+from track.calibration.hand_parameters import NUM_PARAMETERS
+from track.calibration.skin_walk import nearest_places
+from track.calibration.solver import descend, eliminate, marker_rms
+
+FRAMES = 12
+SHARED = NUM_PARAMETERS + 57
+
+
+@pytest.fixture(scope="module")
+def problem_and_guess():
+    """A hand in poses of which two are touches, looked for 3 mm and more away from where it is."""
+    rng = np.random.default_rng(7)
+    hand = nominal_fit(load_layout("dense19"), "M", "right")
+    angles = sample_valid_angles(hand.model, FRAMES, rng=rng)
+    touches = [(0, "index"), (1, "ring")]
+    for frame, finger in touches:
+        angles[frame] = touching_angles(hand.model, finger)
+    qpos = join_qpos(
+        angles, position=rng.normal(size=(FRAMES, 3)), quaternion=random_quaternions(FRAMES, rng=rng)
+    )
+    bones = hand.model.forward_kinematics(qpos)
+    targets = hand.attachment.centers(hand.model, bones) + rng.normal(scale=0.001, size=(FRAMES, 19, 3))
+    targets[3, 5] = np.nan
+    places = nearest_places(hand.attachment.points, hand.model.shape)
+    problem = Problem(hand.model.shape, places, 0.0032, targets, noise=0.001, reach=0.01)
+    contacts = place_contacts(hand.model, touches, bones[:2])
+    guess = Guess(np.zeros(NUM_PARAMETERS), hand.attachment.points, places, qpos, contacts)
+    shared = rng.normal(size=SHARED) * np.r_[np.full(NUM_PARAMETERS, 0.002), np.full(57, 0.0005)]
+    guess = problem.moved(guess, rng.normal(scale=0.02, size=(FRAMES, 26)), shared)
+    fit = problem.fit(guess)
+    return problem, dataclasses.replace(guess, contacts=slide_contacts(contacts, fit.model, fit.bones[:2]))
+
+
+def direction(kind, rng):
+    poses, shared = np.zeros((FRAMES, 26)), np.zeros(SHARED)
+    if kind == "poses":
+        poses = rng.normal(size=poses.shape)
+    elif kind == "shape":
+        shared[:NUM_PARAMETERS] = rng.normal(size=NUM_PARAMETERS) * 0.1
+    else:
+        shared[NUM_PARAMETERS:] = rng.normal(size=57) * 0.01
+    return poses, shared
+
+
+# E_prior's normals are held within a step, and a marker that moves along the skin turns its own.
+@pytest.mark.parametrize(("kind", "tolerance"), [("poses", 2e-3), ("shape", 2e-3), ("markers", 3e-2)])
+def test_the_gradient_is_the_energys(kind, tolerance, problem_and_guess, rng, monkeypatch):
+    # How far a touch is trusted is held within a step, which is what reweighting means.
+    monkeypatch.setattr("track.calibration.energy.trust", lambda meeting, fingers: np.full(len(fingers), 0.7))
+    problem, guess = problem_and_guess
+    equations = problem.equations(guess, problem.fit(guess))
+    poses, shared = direction(kind, rng)
+    step = 1e-5
+    there, back = (
+        problem.fit(problem.moved(guess, sign * poses, sign * shared)).cost for sign in (step, -step)
+    )
+    told = (equations.pose_gradient * poses).sum() + equations.shared_gradient @ shared
+    assert told == pytest.approx((there - back) / (4 * step), rel=tolerance)
+
+
+def test_elimination_solves_the_whole_system(problem_and_guess):
+    problem, guess = problem_and_guess
+    equations = problem.equations(guess, problem.fit(guess))
+    reduced, solved = eliminate(equations, 0.0)
+    shared = -np.linalg.solve(reduced[:, :-1], reduced[:, -1])
+    poses = -solved[..., -1] - solved[..., :-1] @ shared
+    left = equations.shared @ shared + np.einsum("fps,fp->s", equations.mixed, poses)
+    scale = np.sqrt(equations.shared.diagonal())
+    np.testing.assert_allclose((left + equations.shared_gradient) / scale, 0.0, atol=1e-6)
+    rest = np.einsum("fpq,fq->fp", equations.pose, poses) + equations.mixed @ shared + equations.pose_gradient
+    np.testing.assert_allclose(rest / np.sqrt(np.einsum("fpp->fp", equations.pose)), 0.0, atol=1e-6)
+
+
+def test_steps_go_down_and_are_told(problem_and_guess):
+    problem, guess = problem_and_guess
+    told = []
+    _, fit, steps = descend(problem, guess, 10, 14, lambda *values: told.append(values))
+    assert fit.cost < 0.2 * problem.fit(guess).cost
+    assert [row[0] for row in told] == list(range(11, steps + 1))
+    assert told[-1][1] == marker_rms(problem, fit) < 0.0015
+    assert told[-1][2] < 0.001

@@ -1,0 +1,174 @@
+"""A user's hand and glove come back from their markers, and what the capture lacks is told."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from gloves.attach import attach
+from gloves.fit import GloveFit, nominal_fit
+from gloves.layout import load_layout
+from handsim.errors import HandSimError
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import named_shape
+from handsim.hand.topology import JOINT_NAMES, SIDES
+from handsim.space.transforms import MIRROR
+from poses.motion.wrist_paths import WristConfig, wrist_path
+from track.calibration.picture import save_picture
+from track.calibration.skin_walk import slip
+from track.calibration.user_calibration import Calibration, CalibrationError, calibrate, calibrate_hands
+from track.evaluation.hand_errors import hand_errors
+from track.user import load_user, save_user
+from train.simulation.calibration_take import CalibrationTakeConfig, calibration_angles
+
+LAYOUT = load_layout("dense19")
+RATE = 30.0
+RING = np.array([number for number, name in enumerate(JOINT_NAMES) if name.startswith("ring")])
+
+
+@cache
+def somebody():
+    """A right hand unlike the mean one, its glove 5 mm off, and the angles of a short capture."""
+    rng = np.random.default_rng(5)
+    mean = named_shape("M")
+    shape = dataclasses.replace(
+        mean,
+        length=1.07 * mean.length,
+        bone_lengths=1.07 * mean.bone_lengths * np.exp(rng.normal(scale=0.04, size=(5, 3))),
+        knuckles=1.06 * mean.knuckles,
+        breadth=1.05 * mean.breadth,
+        radii=1.03 * mean.radii,
+    )
+    model = HandModel(shape)
+    worn = slip(attach(LAYOUT, model), shape, 0.005, rng=rng)
+    angles = calibration_angles(model, CalibrationTakeConfig(free=12.0, rounds=1), rng=rng)
+    angles = angles[::4]
+    where = wrist_path(len(angles), RATE, WristConfig(), rng=rng)
+    qpos = join_qpos(angles, position=where[0], quaternion=where[1])
+    return GloveFit(model, worn), qpos
+
+
+def markers_of(hand, qpos):
+    return hand.attachment.centers(hand.model, hand.model.forward_kinematics(qpos))
+
+
+@cache
+def calibrated() -> dict[str, tuple[GloveFit, Calibration, list]]:
+    """Somebody's two hands calibrated together, and the steps that were told.
+
+    Some labels of the right hand are wrong; the left one is alike, but its ring finger does not move.
+    """
+    rng = np.random.default_rng(6)
+    right, qpos = somebody()
+    still = qpos.copy()
+    still[:, 7 + RING] = np.deg2rad([0.0, 20.0, 25.0, 15.0])
+    markers = {"right": markers_of(right, qpos), "left": markers_of(right, still) @ MIRROR}
+    for side in SIDES:
+        markers[side] += rng.normal(scale=0.0001, size=markers[side].shape)
+        markers[side][rng.random(markers[side].shape[:2]) < 0.01] = np.nan
+    wrong = rng.random(markers["right"].shape[:2]) < 0.01
+    markers["right"][wrong] += rng.normal(scale=0.03, size=(int(wrong.sum()), 3))
+    start = [nominal_fit(LAYOUT, "M", side) for side in SIDES]
+    told = {side: [] for side in SIDES}
+    results = calibrate_hands(markers, start, RATE, progress=lambda side, *values: told[side].append(values))
+    return {
+        side: (right.with_side(side), result, told[side]) for side, result in zip(SIDES, results, strict=True)
+    }
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_hand_and_its_glove_come_back(side):
+    true, result, _ = calibrated()[side]
+    before, after = hand_errors(result.start, true), hand_errors(result.hand, true)
+    moving = [0, 1, 2, 4] if side == "left" else [0, 1, 2, 3, 4]  # digits, the thumb first
+    assert result.hand.side == side
+    assert before.places.mean() > 0.004
+    assert after.places.mean() < 0.0008
+    assert np.abs(before.lengths).mean() > 0.06
+    assert np.abs(after.lengths[moving]).mean() < 0.015
+    assert result.rms_before > 0.003
+    assert result.rms_after < 0.0005
+    assert 0.004 < result.shifts.mean() < 0.006
+
+
+def test_errors_are_as_large_as_told():
+    true, result, _ = calibrated()["right"]
+    errors = hand_errors(result.hand, true).wrist_places
+    assert (errors < 2.5 * result.place_errors).mean() > 0.75
+    off = np.abs(result.hand.model.shape.bone_lengths - true.model.shape.bone_lengths)[:, :2]
+    assert (off < 2.5 * result.length_errors[:, :2]).mean() > 0.75
+    assert result.length_errors.max() < 0.005
+
+
+def test_touches_are_found_and_closed():
+    _, result, _ = calibrated()["right"]
+    fingers = {touch.finger for touch in result.touches if touch.trust > 0.5}
+    assert len(fingers) >= 3
+    before, after = result.gaps()
+    assert after < 0.0007 < before
+    assert result.trusted_touches
+
+
+def test_progress_is_told():
+    _, result, told = calibrated()["right"]
+    steps, rms, gaps = np.array(told).T
+    np.testing.assert_array_equal(steps, np.arange(1, len(steps) + 1))
+    assert rms[-1] < 0.1 * result.rms_before
+    assert np.isnan(gaps[0])
+    assert gaps[-1] < 0.001
+
+
+def test_a_finger_that_does_not_move_is_told():
+    _, result, _ = calibrated()["left"]
+    still = {JOINT_NAMES[number] for number in RING}
+    assert still <= set(result.still_joints)
+    assert not {"index_PIP_flexion", "middle_PIP_flexion"} & set(result.still_joints)
+    advice = " / ".join(result.advice())
+    assert "move the ring more: MCP abduction, MCP flexion, PIP flexion, DIP flexion" in advice
+    assert calibrated()["right"][1].length_errors[3, 0] < result.length_errors[3, 0]
+
+
+def test_the_result_can_be_kept_and_drawn(tmp_path):
+    _, result, _ = calibrated()["left"]
+    save_user(tmp_path / "user.json", (result.hand,))
+    (again,) = load_user(tmp_path / "user.json")
+    np.testing.assert_array_equal(again.attachment.points, result.hand.attachment.points)
+    save_picture(tmp_path / "picture.png", result)
+    assert (tmp_path / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_hand_that_does_not_move_is_told(rng):
+    hand, qpos = somebody()
+    still = join_qpos(
+        np.tile(qpos[300, 7:], (200, 1)) + rng.normal(scale=0.02, size=(200, 20)),
+        position=qpos[:200, :3],
+        quaternion=qpos[:200, 3:7],
+    )
+    markers = markers_of(hand, still)
+    start = [nominal_fit(LAYOUT, "M", side) for side in SIDES]
+    shown = {"right": markers, "left": np.full_like(markers, np.nan)}  # a hand that is not there is left out
+    with pytest.raises(CalibrationError, match="of the right hand's 20 hinges cover less than 30%"):
+        calibrate_hands(shown, start, RATE)
+    with pytest.raises(CalibrationError, match="no marker of the left or right hand"):
+        calibrate_hands({"left": shown["left"]}, start, RATE)
+
+
+@pytest.mark.parametrize(
+    ("markers", "rate", "told"),
+    [
+        (np.zeros((100, 13, 3)), 120.0, r"shape \(100, 13, 3\), expected \(T, 19, 3\)"),
+        (np.zeros((100, 19, 3)), 0.0, "rate is 0 Hz, expected a positive number"),
+        (
+            np.zeros((20, 19, 3)),
+            120.0,
+            "20 of 20 frames have 14 or more of the right hand's 19 markers, expected at least 100",
+        ),
+        (np.full((100, 19, 3), np.nan), 120.0, "0 of 100 frames"),
+    ],
+)
+def test_what_cannot_be_calibrated_is_told(markers, rate, told):
+    with pytest.raises(HandSimError, match=told):
+        calibrate(markers, nominal_fit(LAYOUT, "M", "right"), rate)

@@ -1,0 +1,214 @@
+"""`handsim track` and `handsim calibrate` through the command line, on captures and on a live stream."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from gloves.attach import wear
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.fit import GloveFit, nominal_fit
+from gloves.layout import load_layout
+from gloves.takes.take import load_take
+from gloves.takes.tracked_take import LOST, load_tracked_take
+from handsim.app.cli import main
+from handsim.hand.model import HandModel
+from handsim.hand.shape import sample_shape
+from handsim.space.objects import named_object
+from track.bodies.body_file import load_body
+from track.evaluation.hand_errors import hand_errors
+from track.streams.natnet_server import ReplayServer
+from track.streams.point_stream import open_stream
+from track.user import load_user
+from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    out = tmp_path_factory.mktemp("take") / "take.c3d"
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
+    return out
+
+
+@pytest.fixture(scope="module")
+def user(tmp_path_factory):
+    """A user's capture for calibration, their hand and what the command made of it."""
+    folder, rng = tmp_path_factory.mktemp("user"), np.random.default_rng(5)
+    shape = sample_shape(side="right", rng=rng)
+    model = HandModel(shape)
+    worn = wear(load_layout("dense19"), model, along=0.05, around=0.2, rng=rng)
+    config = CalibrationTakeConfig(free=2.0, rounds=0)
+    take = simulate_calibration(((model, worn),), config, rng=rng)
+    columns = tuple(f"*{number}" for number in range(take.points.shape[1]))
+    write_capture(folder / "user.c3d", Capture(columns, take.points, take.rate))
+    arguments = [str(folder / "user.c3d"), "--size", "L", "--out", str(folder / "user.json")]
+    assert main(["calibrate", *arguments]) == 0
+    return folder, GloveFit(model, worn)
+
+
+def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
+    folder, true = user
+    (found,) = load_user(folder / "user.json")
+    assert found.side == "right", "the left hand is not in the capture"
+    errors = hand_errors(found, true)
+    start = hand_errors(nominal_fit(load_layout("dense19"), "L", "right"), true)
+    assert np.median(errors.places) < 0.5 * np.median(start.places)
+    assert main(["track", str(folder / "user.c3d"), "--shape", str(folder / "user.json"), "--out",
+                 str(folder / "take.npz")]) == 0  # fmt: skip
+    take = load_tracked_take(folder / "take.npz")
+    assert take.sides == ("right",) and take.settings["user"] == "user.json"
+    assert np.nanmedian(take.rms) < 0.0005
+    np.testing.assert_array_equal(take.hands[0].attachment.points, found.attachment.points)
+    assert "right hand: tracked" in capsys.readouterr().out
+
+
+def test_users_that_do_not_fit_are_told(user, capture, tmp_path, capsys):
+    shape, out = str(user[0] / "user.json"), str(tmp_path / "out.npz")
+    for arguments, words in (
+        (["--size", "M"], "expected one of them"),
+        (["--hands", "left"], "unknown hand 'left'; valid names: right"),
+        (["--glove", "sparse13"], "but glove 'sparse13' has"),
+    ):
+        assert main(["track", str(capture), "--shape", shape, "--out", out, *arguments]) == 1
+        assert words in capsys.readouterr().err
+    assert main(["calibrate", str(capture), "--hands", "left", "--out", str(tmp_path / "user.json")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("handsim calibrate: ") and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
+    out, labeled = tmp_path / "new" / "tracked.npz", tmp_path / "labeled.trc"
+    assert main(["track", str(capture), "--out", str(out), "--labeled", str(labeled), "--size", "L"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{out}: {FRAMES} frames, 0.5 s at 120 Hz"
+    assert lines[1].startswith("right hand: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median")
+    assert lines[2].startswith("left hand: ") and " mm, " in lines[2]
+    assert lines[3].endswith("points are no markers") and lines[4].endswith(" ms a frame")
+    take, truth = load_tracked_take(out), load_take(capture.with_suffix(".truth.npz"))
+    assert take.sides == ("right", "left")
+    assert take.settings["capture"] == "take.c3d" and take.settings["user"] == "L"
+    json.dumps(take.settings)
+    true = np.where(truth.labels < 38, truth.labels, -1)
+    assert np.mean(take.labels == true) > 0.95
+    columns = read_capture(labeled)
+    assert columns.names[:38] == take.label_names
+    seen = columns.positions[:, :19]
+    np.testing.assert_allclose(seen, take.observed("right"), atol=1e-6)
+    unlabeled = np.isfinite(columns.positions[:, 38:, 0]).sum()
+    assert f"{unlabeled} of " in lines[3]
+
+
+def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
+    truth = load_take(capture.with_suffix(".truth.npz"))
+    wand, out, labeled = tmp_path / "wand.toml", tmp_path / "take.npz", tmp_path / "labeled.c3d"
+    assert main(["body", str(capture.with_suffix(".truth.npz")), "--out", str(wand)]) == 0
+    assert capsys.readouterr().out == f"{wand}: controller, 6 markers, at most 99.9 mm apart\n"
+    asked = ["--hands", "right", "--body", str(wand), "--body", "mug", "--labeled", str(labeled)]
+    assert main(["track", str(capture), "--out", str(out), *asked]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].startswith(
+        "controller: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median RMS"
+    )
+    assert lines[3] == (
+        "mug: tracked 0.0 %, found 0.0 %, coasting 0.0 %, lost 100.0 %; it was never found: are these its "
+        "markers?"
+    )
+    take, first = load_tracked_take(out), truth.hand_labels[-1].stop
+    assert [body.name for body in take.bodies] == ["controller", "mug"]
+    np.testing.assert_allclose(take.bodies[0].places, named_object("controller").markers, atol=1e-12)
+    mine = truth.labels >= first
+    assert np.mean(take.labels[mine] - 19 == truth.labels[mine] - first) > 0.99
+    columns = read_capture(labeled)
+    assert columns.names[: len(take.label_names)] == take.label_names
+    assert take.label_names[19] == "controller:ring_front"
+    seen = columns.positions[:, 19:25]
+    true = truth.observed(range(first, first + 6))
+    there = np.isfinite(true[..., 0])
+    np.testing.assert_array_equal(np.isfinite(seen[..., 0]), there)
+    np.testing.assert_allclose(seen[there], true[there], atol=1e-6)
+
+
+def test_a_body_is_learned_from_a_capture_of_it(capture, tmp_path, capsys):
+    truth = load_take(capture.with_suffix(".truth.npz"))
+    alone = np.where((truth.labels >= truth.hand_labels[-1].stop)[..., None], truth.points, np.nan)
+    alone = alone[:, np.isfinite(alone[..., 0]).any(axis=0)]
+    file, wand = tmp_path / "alone.trc", tmp_path / "wand.toml"
+    write_capture(file, Capture(tuple(f"*{n}" for n in range(alone.shape[1])), alone, truth.rate))
+    assert main(["body", str(file), "--out", str(wand)]) == 0
+    assert capsys.readouterr().out.startswith(f"{wand}: wand, 6 markers, at most 99.9 mm apart")
+    body, true = load_body(wand), load_body("controller")
+    np.testing.assert_allclose(np.sort(body.sides.ravel()), np.sort(true.sides.ravel()), atol=0.0002)
+
+
+def test_a_body_is_followed_through_a_stream(capture, tmp_path, capsys):
+    out = tmp_path / "live.npz"
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+        asked = ["--live", server.url, "--seconds", "0.2", "--body", "controller", "--out", str(out)]
+        assert main(["track", *asked]) == 0
+    assert (load_tracked_take(out).body_status != LOST).all()
+    assert "controller: tracked" in capsys.readouterr().out
+
+
+def test_the_same_command_writes_the_same_bytes(capture, tmp_path):
+    for name in ("one.npz", "two.npz"):
+        assert main(["track", str(capture), "--out", str(tmp_path / name), "--hands", "right"]) == 0
+    take = load_tracked_take(tmp_path / "one.npz")
+    assert take.sides == ("right",) and (take.status != LOST).all()
+    assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
+
+
+def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys):
+    out = tmp_path / "live.npz"
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+        assert main(["track", "--live", server.url, "--seconds", "0.3", "--out", str(out)]) == 0
+    take = load_tracked_take(out)
+    assert take.num_frames == 37 and take.rate == pytest.approx(120.0, rel=1e-3)
+    assert take.settings["capture"] == server.url
+    assert (take.status[-1] != LOST).all()
+    assert "right hand: tracked" in capsys.readouterr().out
+
+
+def test_an_interrupt_writes_what_there_is(capture, tmp_path):
+    out, before = tmp_path / "live.npz", signal.getsignal(signal.SIGINT)
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+
+        def interrupt() -> None:
+            while not server._clients or signal.getsignal(signal.SIGINT) is before:
+                time.sleep(0.01)
+            time.sleep(0.3)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        thread = threading.Thread(target=interrupt, daemon=True)
+        thread.start()
+        assert main(["track", "--live", server.url, "--out", str(out)]) == 0
+        thread.join()
+    assert 2 <= load_tracked_take(out).num_frames <= FRAMES
+
+
+def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("track.commands.track.open_stream", functools.partial(open_stream, silence=0.2))
+    take = load_take(capture.with_suffix(".truth.npz"))
+    with ReplayServer(take.points[:1], take.ids[:1], 120.0) as server:
+        arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]
+        assert main(arguments) == 1
+    assert "1 frames came, expected two or more" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,290 @@
+"""The real client against a server on this machine: all frames arrive, whatever comes between them."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from gloves.takes.take import Take
+from handsim.errors import CaptureError
+from handsim.space.objects import named_object
+from track.bodies.rigid_body import BodyTracker, RigidTemplate
+from track.streams import natnet
+from track.streams import point_stream as streaming
+from track.streams.natnet import Kind, MarkerFrame, ServerInfo
+from track.streams.natnet_server import ReplayServer
+from track.streams.point_stream import open_stream
+from track.tracked_frame import Status
+from train.simulation.twins import TwinConfig, simulate_twin
+
+LOOPBACK = "127.0.0.1"
+
+
+@functools.cache
+def twin() -> Take:
+    return simulate_twin(TwinConfig(kind="hand-controller", num_frames=60, seed=5))
+
+
+class Puppet:
+    """A server that says what a test tells it to, and answers a greeting."""
+
+    def __init__(self, *infos: ServerInfo | bytes, deaf: int = 0) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((LOOPBACK, 0))
+        self.socket.settimeout(0.05)
+        self.url = f"natnet://{LOOPBACK}:{self.socket.getsockname()[1]}"
+        self.heard: list[int] = []
+        self._answers = [info if isinstance(info, bytes) else natnet.pack_server_info(info) for info in infos]
+        self._deaf, self._ended = deaf, threading.Event()
+        self._thread = threading.Thread(target=self._answer, daemon=True)
+        self._thread.start()
+
+    def _answer(self) -> None:
+        while not self._ended.is_set():
+            try:
+                packet, self.client = self.socket.recvfrom(4096)
+            except TimeoutError:
+                continue
+            self.heard.append(natnet.unpack(packet)[0])
+            if self.heard[-1] == Kind.CONNECT and len(self.heard) > self._deaf:
+                for answer in self._answers:
+                    self.socket.sendto(answer, self.client)
+
+    def say(self, packet: bytes) -> None:
+        self.socket.sendto(packet, self.client)
+
+    def __enter__(self) -> Puppet:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.socket.close()
+
+
+def unicast(version: tuple[int, int]) -> ServerInfo:
+    return ServerInfo("puppet", version, 1511, None)
+
+
+def frame(number: int, version: tuple[int, int]) -> bytes:
+    points = np.array([[number, 0.0, 1.0]]) / 128.0
+    return natnet.pack_frame(MarkerFrame(number, number / 100.0, points, np.array([number])), version)
+
+
+@pytest.mark.parametrize("version", [(3, 0), (4, 0), (4, 1)])
+def test_a_take_arrives_whole(version):
+    take = twin()
+    with ReplayServer.of_take(take, version=version) as server, open_stream(server.url) as stream:
+        assert stream.server.version == version and stream.server.application == "handsim replay"
+        start = time.monotonic()
+        got = list(itertools.islice(stream, take.num_frames))
+        assert time.monotonic() - start > 0.9 * take.num_frames / take.rate, "in real time"
+        assert (stream.damaged, stream.late) == (0, 0)
+    for number, one in enumerate(got):
+        there = np.isfinite(take.points[number, :, 0])
+        assert (one.number, one.silent) == (number, False)
+        assert one.time == pytest.approx(number / take.rate)
+        np.testing.assert_array_equal(one.points, np.float32(take.points[number, there]))
+        np.testing.assert_array_equal(one.ids, take.ids[number, there])
+
+
+def test_a_body_is_tracked_live():
+    take = twin()
+    tracker = BodyTracker(RigidTemplate.of(named_object("controller")))
+    with ReplayServer.of_take(take) as server, open_stream(server.url) as stream:
+        words = [
+            tracker.step(one.points, one.ids, one.time).status
+            for one in itertools.islice(stream, take.num_frames)
+        ]
+    assert words == [Status.FOUND] + [Status.TRACKED] * (take.num_frames - 1)
+
+
+def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
+    positions = np.arange(24.0).reshape(4, 2, 3) / 100.0
+    positions[1, 0] = np.nan
+    with (
+        ReplayServer.of_capture(Capture(("a", "b"), positions, 100.0)) as server,
+        open_stream(server.url) as stream,
+    ):
+        ids = [list(one.ids) for one in itertools.islice(stream, 4)]
+    assert ids == [[0, 1], [1], [2, 1], [2, 1]]
+
+
+def test_a_stream_that_stops_says_so():
+    take = twin()
+    server = ReplayServer(take.points[:3], take.ids[:3], take.rate)
+    with server, open_stream(server.url, silence=0.2) as stream:
+        got = list(itertools.islice(stream, 5))
+    assert [one.silent for one in got] == [False] * 3 + [True] * 2
+    assert (got[3].number, got[3].time) == (2, got[2].time)
+    assert got[3].points.shape == (0, 3) and got[3].ids.shape == (0,)
+
+
+def test_bad_packets_are_counted_and_left_out():
+    rng = np.random.default_rng(0)
+    with Puppet(unicast((4, 0))) as server, open_stream(server.url, silence=0.5) as stream:
+        for number in range(20):
+            packet = frame(number, (4, 0))
+            for bad in (
+                packet[: rng.integers(len(packet))],
+                rng.bytes(rng.integers(1, 300)),
+                natnet.pack(Kind.FRAME, rng.bytes(200)),
+                natnet.pack(Kind.SERVER_INFO, b"short"),
+            ):
+                server.say(bad)
+            server.say(natnet.pack(Kind.KEEP_ALIVE))  # good, but no frame
+            server.say(packet)
+        got = list(itertools.islice(stream, 20))
+    assert [one.number for one in got] == list(range(20))
+    assert stream.damaged >= 60
+
+
+def test_only_bad_packets_are_silence():
+    with Puppet(unicast((4, 0))) as server, open_stream(server.url, silence=0.3) as stream:
+        ended = threading.Event()
+
+        def babble() -> None:
+            while not ended.wait(0.005):
+                server.say(b"\x07\x00\xff\xff?")
+
+        thread = threading.Thread(target=babble)
+        thread.start()
+        assert next(stream).silent
+        ended.set()
+        thread.join()
+    assert stream.damaged > 10
+
+
+def test_frames_out_of_order_are_left_out_but_a_take_may_start_again():
+    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=0.3) as stream:
+        for number in (500, 501, 501, 500, 502, 0, 1):
+            server.say(frame(number, (4, 1)))
+        got = list(itertools.islice(stream, 5))
+    assert [one.number for one in got] == [500, 501, 502, 0, 1]
+    assert stream.late == 2
+
+
+@pytest.mark.parametrize(("said", "spoken"), [((4, 1), (3, 1)), ((3, 1), (4, 1)), ((4, 7), (4, 1))])
+def test_a_server_that_speaks_another_layout_than_it_says_is_understood(said, spoken):
+    with Puppet(unicast(said)) as server, open_stream(server.url, silence=0.3) as stream:
+        for number in range(3):
+            server.say(frame(number, spoken))
+        assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
+        assert stream.damaged == 0
+
+
+def test_packets_of_others_are_not_heard():
+    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=0.3) as stream:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            try:
+                stranger.bind(("127.0.0.2", 0))
+            except OSError:
+                pytest.skip("this machine has one loopback address only")
+            stranger.sendto(frame(9, (4, 1)), server.client)
+        server.say(frame(10, (4, 1)))
+        assert next(stream).number == 10
+
+
+def test_the_client_listens_on_loopback_only_and_takes_leave():
+    with Puppet(unicast((4, 1)), deaf=1) as server:
+        with open_stream(server.url) as stream:
+            assert server.client[0] == LOOPBACK
+            assert stream._sockets[0].getsockname()[0] == LOOPBACK
+        assert list(stream) == []
+        time.sleep(0.05)
+        assert server.heard == [Kind.CONNECT, Kind.CONNECT, Kind.DISCONNECT], (
+            "called twice, as it was deaf once"
+        )
+
+
+def test_a_quiet_server_is_greeted_anew(monkeypatch):
+    monkeypatch.setattr(streaming, "_ALIVE", 0.1)
+    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=0.35) as stream:
+        assert next(stream).silent
+        assert server.heard[1:].count(Kind.CONNECT) >= 2
+        server.heard.clear()
+        for number in range(10):
+            server.say(frame(number, (4, 1)))
+            assert next(stream).number == number
+            time.sleep(0.03)
+        time.sleep(0.05)
+        assert Kind.KEEP_ALIVE in server.heard and Kind.CONNECT not in server.heard
+
+
+def test_multicast_is_heard_on_loopback():
+    group = "239.255.42.98"
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind((LOOPBACK, 0))
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind((LOOPBACK, 0))
+            port = probe.getsockname()[1]
+        with Puppet(ServerInfo("puppet", (4, 1), port, group)) as server:
+            try:
+                stream = open_stream(server.url, silence=0.5)
+                sender.sendto(frame(0, (4, 1)), (group, port))
+            except (CaptureError, OSError):
+                pytest.skip("no multicast on this machine's loopback")
+            with stream:
+                sender.sendto(frame(1, (4, 1)), (group, port))
+                assert [one.number for one in itertools.islice(stream, 2)] == [0, 1]
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["", "natnet://", "http://localhost", "localhost:1510", "natnet://localhost:99999", "natnet://localhost:x",
+     "natnet://localhost:0", "natnet://localhost/take", "natnet://[::1"],
+)  # fmt: skip
+def test_addresses_that_are_none_are_told(url):
+    with pytest.raises(CaptureError, match="expected natnet://host or natnet://host:port"):
+        open_stream(url)
+
+
+def test_servers_that_cannot_be_used_are_told(monkeypatch):
+    monkeypatch.setattr(streaming, "_PATIENCE", 0.2)
+    monkeypatch.setattr(streaming, "_GREETING", 0.1)
+    with Puppet() as server, pytest.raises(CaptureError, match="no NatNet server answers; in Motive, switch"):
+        open_stream(server.url)
+    with (
+        Puppet(b"", b"nonsense", natnet.pack(Kind.SERVER_INFO)) as server,
+        pytest.raises(CaptureError, match="no Nat"),
+    ):
+        open_stream(server.url)
+    with (
+        Puppet(unicast((2, 10))) as server,
+        pytest.raises(CaptureError, match=r"speaks NatNet 2\.10, expected 3\.0"),
+    ):
+        open_stream(server.url)
+    with (
+        Puppet(ServerInfo("x", (4, 1), 1511, "10.0.0.1")) as server,
+        pytest.raises(CaptureError, match=r"10\.0\.0\.1"),
+    ):
+        open_stream(server.url)
+    with pytest.raises(CaptureError, match="cannot be reached"):
+        open_stream("natnet://no-such-host.invalid")
+    with pytest.raises(CaptureError, match="cannot be reached"):
+        open_stream("natnet://127.0.0.1", local="192.0.2.7")
+
+
+def test_what_cannot_be_replayed_is_told():
+    points, ids = np.zeros((2, 3, 3)), np.zeros((2, 3), dtype=int)
+    for arguments, options, words in (
+        ((points, ids[:1], 100.0), {}, "expected (T, N, 3) and (T, N)"),
+        ((points, ids, 0.0), {}, "the rate is 0 Hz"),
+        ((points, ids, 100.0), {"version": (2, 9)}, "unknown NatNet version '2.9'"),
+        ((np.zeros((1, 2000, 3)), np.zeros((1, 2000), dtype=int), 100.0), {}, "expected at most 1500"),
+    ):  # fmt: skip
+        with pytest.raises(CaptureError) as caught:
+            ReplayServer(*arguments, **options)
+        assert words in str(caught.value)
+    with ReplayServer(points, ids, 100.0) as server:
+        port = int(server.url.rpartition(":")[2])
+        with pytest.raises(CaptureError, match=f"port {port} cannot be listened at"):
+            ReplayServer(points, ids, 100.0, port=port)

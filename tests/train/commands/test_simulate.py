@@ -1,0 +1,131 @@
+"""`handsim simulate`, `handsim reproduce` and `handsim evaluate` of a take, through the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from gloves.captures.formats import read_capture
+from gloves.takes.take import load_take
+from handsim.app.cli import main
+from train.simulation.twins import KINDS, TWINS
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Two test processes with two threads each would wait for one another most of the time."""
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("take")
+    out = folder / "take.c3d"
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
+    return out
+
+
+def test_the_capture_and_its_truth_agree(taken):
+    assert sorted(path.name for path in taken.parent.iterdir()) == ["take.c3d", "take.truth.npz"]
+    capture, truth = read_capture(taken), load_take(taken.with_suffix(".truth.npz"))
+    assert capture.positions.shape == truth.points.shape == (FRAMES, truth.points.shape[1], 3)
+    assert capture.rate == truth.rate == 120.0
+    np.testing.assert_array_equal(np.isnan(capture.positions), np.isnan(truth.points))
+    np.testing.assert_allclose(capture.positions, truth.points, rtol=2e-7, atol=2e-7)
+    assert all(name.startswith("Unlabeled") for name in capture.names), "no name tells a marker"
+    assert truth.settings["kind"] == "hand-controller" and truth.settings["seed"] == 0
+    json.dumps(truth.settings)
+
+
+def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, capsys):
+    out = tmp_path / "again" / "take.c3d"
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
+    said = capsys.readouterr().out
+    assert f"{out}: {FRAMES} frames, " in said and str(out.with_suffix(".truth.npz")) in said
+    assert out.read_bytes() == taken.read_bytes()
+    assert main(["simulate", "--num-frames", "20", "--out", str(tmp_path / "text.trc"), "--seed", "4"]) == 0
+    trc, truth = read_capture(tmp_path / "text.trc"), load_take(tmp_path / "text.truth.npz")
+    np.testing.assert_allclose(trc.positions, truth.points, atol=1e-6)
+    present = truth.markers_present()
+    assert present.shape == (20, 38) and present.mean() > 0.8
+
+
+@pytest.mark.parametrize("name", ["take.csv", "take.npz", "take"])
+def test_another_suffix_is_refused_before_the_work(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    # An hour of frames would take minutes.
+    assert main(["simulate", "--num-frames", "432000", "--out", name]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and ".trc, .c3d" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["simulate", "--kind", "hand-foot", "--out", str(tmp_path / "take.c3d")])
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert all(kind in said for kind in KINDS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsys):
+    truth, figures = taken.with_suffix(".truth.npz"), tmp_path / "figures.json"
+    assert main(["evaluate", str(truth), "--json", str(figures)]) == 0
+    assert "1 takes, 120 frames of one hand" in capsys.readouterr().out
+    found = json.loads(figures.read_text())
+    assert found["frames"] == 2 * FRAMES
+    assert found["figures"]["slot_accuracy"] > 0.8
+    assert set(found["slot_accuracy_by_marker"]) == set(load_take(truth).hands[0].layout.names)
+    for option in (["--occlude", "3"], ["--ghosts", "1"]):
+        assert main(["evaluate", str(truth), *option]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "leave out --occlude and --ghosts" in said
+    assert main(["evaluate", str(truth), str(truth)]) == 0
+    assert "2 takes, 240 frames of one hand" in capsys.readouterr().out
+
+
+def test_a_take_and_a_capture_are_not_measured_together(taken, capsys):
+    assert main(["evaluate", str(taken.with_suffix(".truth.npz")), str(taken)]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and ".npz" in said
+
+
+def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
+    out = tmp_path / "take.c3d"
+    assert main(["simulate", "--num-frames", "5", "--glove", "sparse13", "--out", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "the labeler knows" in said
+
+
+def test_table_3_has_a_row_a_capture_with_the_papers_figures(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert main(["reproduce", "table3"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for kind in KINDS:
+        row, by_marker = (line for line in lines if line.split("│")[1:2] and kind in line.split("│")[1])
+        paper, ghosts = TWINS[kind].paper, TWINS[kind].ghost_ratio
+        frames, gaps, length, missing, share = (cell.strip() for cell in row.split("│")[2:7])
+        assert frames == f"{paper.frames} ({paper.frames})"
+        for cell, wanted in (
+            (gaps, paper.gaps),
+            (length, paper.average_length),
+            (missing, paper.average_missing),
+        ):
+            ours, theirs = cell.rstrip(")").split(" (")
+            assert float(theirs) == pytest.approx(wanted)
+            assert float(ours) == pytest.approx(wanted, rel=0.4), f"{kind}: {cell}"
+        assert share.endswith(f"({100 * ghosts:.2f} %)")
+        assert by_marker.count("%") == 3
+    assert any("real finger markers" in line for line in lines)

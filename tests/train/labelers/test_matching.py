@@ -1,0 +1,88 @@
+"""One-to-one matching against brute force, and probabilities against counting all labelings."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from train.labelers.matching import GHOST, match_probabilities, match_scores, pair_probabilities
+
+
+def log_softmax(raw):
+    return raw - np.log(np.exp(raw).sum(axis=1, keepdims=True))
+
+
+def scores(seed, count, num_labels, sharp=2.0):
+    rng = np.random.default_rng(seed)
+    by_point = log_softmax(sharp * rng.normal(size=(count, num_labels + 1)))
+    return by_point, log_softmax(sharp * rng.normal(size=(num_labels, count + 1)))
+
+
+def product(labels, probabilities):
+    """Of a labeling: pairs count for the point and for the label."""
+    value = 1.0
+    for point, label in enumerate(labels):
+        value *= probabilities[point, label] ** (1 if label == GHOST else 2)
+    for label in set(range(probabilities.shape[1] - 1)) - set(labels):
+        value *= probabilities[-1, label]
+    return value
+
+
+def one_to_one(count, num_labels):
+    for choice in itertools.product(range(-1, num_labels), repeat=count):
+        named = [label for label in choice if label != GHOST]
+        if len(set(named)) == len(named):
+            yield choice
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 4), num_labels=st.integers(1, 3))
+@settings(max_examples=60, deadline=None)
+def test_no_labeling_is_likelier(seed, count, num_labels):
+    probabilities = pair_probabilities(*scores(seed, count, num_labels))
+    labels = match_probabilities(probabilities)
+    best = max(product(choice, probabilities) for choice in one_to_one(count, num_labels))
+    assert np.isclose(product(labels.tolist(), probabilities), best)
+    named = labels[labels != GHOST]
+    assert len(set(named.tolist())) == len(named)
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 30), num_labels=st.integers(1, 25))
+@settings(max_examples=60, deadline=None)
+def test_every_point_and_every_label_is_spent_once(seed, count, num_labels):
+    by_point, by_label = scores(seed, count, num_labels)
+    probabilities = pair_probabilities(by_point, by_label)
+    assert (probabilities >= 0).all()
+    np.testing.assert_allclose(probabilities[:-1].sum(axis=1), 1.0)
+    np.testing.assert_allclose(probabilities[:, :-1].sum(axis=0), 1.0, atol=0.2)  # nearly, after 20 rounds
+    labels, confidence = match_scores(by_point, by_label)
+    assert ((confidence >= 0) & (confidence <= 1)).all()
+    assert labels.shape == confidence.shape == (count,)
+
+
+def test_order_of_points_and_labels_does_not_matter(rng):
+    by_point, by_label = scores(0, 9, 7)
+    points, labels = rng.permutation(9), rng.permutation(7)
+    turned = pair_probabilities(
+        by_point[np.ix_(points, [*labels, 7])], by_label[np.ix_(labels, [*points, 9])]
+    )
+    straight = pair_probabilities(by_point, by_label)
+    np.testing.assert_allclose(turned, straight[np.ix_([*points, 9], [*labels, 7])])
+
+
+def test_two_points_that_both_look_like_one_marker_share_it():
+    """Alone each would be sure; together one of the two must be a ghost, and neither is sure any more."""
+    by_point = np.log([[0.98, 0.02], [0.98, 0.02]])
+    by_label = np.log([[0.49, 0.49, 0.02]])
+    labels, confidence = match_scores(by_point, by_label)
+    assert sorted(labels.tolist()) == [GHOST, 0]
+    assert (confidence < 0.6).all()
+
+
+def test_scores_that_rule_something_out_altogether():
+    by_point, by_label = np.array([[0.0, -1e4], [-1e4, 0.0]]), np.array([[0.0, -1e4, -1e4]])
+    labels, confidence = match_scores(by_point, by_label)
+    assert labels.tolist() == [0, GHOST]
+    np.testing.assert_allclose(confidence, 1.0)

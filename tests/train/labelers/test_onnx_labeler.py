@@ -1,0 +1,90 @@
+"""The ONNX file says what torch says, needs no torch, and tells what is wrong with it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.layout import load_layout
+from handsim.app.cli import main
+from handsim.errors import HandSimError, WeightsError
+from train.config import SetLabelerConfig
+from train.labelers.kinds import new_network
+from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
+from train.labelers.storage import load_labeler
+
+NO_TORCH = """
+import sys
+
+class NoTorch:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "torch":
+            raise ModuleNotFoundError("torch is not installed")
+
+sys.meta_path.insert(0, NoTorch())
+"""
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    path = tmp_path_factory.mktemp("onnx") / "dense19.onnx"
+    assert main(["export", "dense19", "--out", str(path)]) == 0
+    return path
+
+
+def test_labels_are_those_of_torch(exported, rng):
+    frames = [
+        rng.normal(scale=0.04, size=(count, 3)) for count in rng.integers(3, 40, size=50)
+    ]  # two points are alike
+    ours, theirs = load_labeler(exported), load_labeler("dense19")
+    assert ours.marker_names == theirs.marker_names
+    for one, other in zip(ours.label_frames(frames), theirs.label_frames(frames), strict=True):
+        np.testing.assert_array_equal(one.labels, other.labels)
+        np.testing.assert_allclose(one.confidence, other.confidence, atol=1e-4)
+
+
+def test_a_capture_is_labeled_without_torch(exported, tmp_path, rng):
+    names = load_layout("dense19").names
+    capture = Capture(names, rng.uniform(0.0, 0.15, size=(4, 19, 3)), 120.0)
+    write_capture(tmp_path / "take.trc", capture)
+    arguments = ["label", str(tmp_path / "take.trc"), "--labeler", str(exported)]
+    arguments += ["--out", str(tmp_path / "out.trc")]
+    program = NO_TORCH + f"from handsim.app.cli import main\nraise SystemExit(main({arguments!r}))"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+    assert read_capture(tmp_path / "out.trc").names[:19] == names
+
+
+def test_damaged_files_are_told(exported, tmp_path):
+    for name, content in (
+        ("cut.onnx", exported.read_bytes()[:-5000]),
+        ("empty.onnx", b""),
+        ("words.onnx", b"x" * 500),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(WeightsError, match=rf"{name} is damaged or no labeler's"):
+            OnnxLabeler(tmp_path / name)
+    with pytest.raises(WeightsError, match=r"none\.onnx is missing"):
+        OnnxLabeler(tmp_path / "none.onnx")
+
+
+def test_another_kind_of_network_is_told(tmp_path):
+    with pytest.raises(HandSimError, match="only labelers of kind 'set' can be exported"):
+        export_onnx(new_network("cnn", SetLabelerConfig()), ("a",) * 19, tmp_path / "cnn.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("missing", ["onnx", "onnxruntime"])
+def test_what_is_not_installed_is_told(exported, tmp_path, monkeypatch, missing):
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(
+        HandSimError, match=rf"needs {missing}; install it with: pip install 'handsim\[onnx\]'"
+    ):
+        if missing == "onnx":
+            export_onnx(new_network("set", SetLabelerConfig()), ("a",) * 19, tmp_path / "x.onnx")
+        else:
+            OnnxLabeler(exported)

@@ -1,0 +1,57 @@
+"""Left and right hands are told apart by what their markers are called."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.attach import attach
+from gloves.layout import load_layout
+from handsim.hand.model import HandModel, join_qpos
+from handsim.space.transforms import quaternion_matrix, random_quaternions
+from poses.shapes.validity import sample_valid_angles
+from train.labelers.side import SideTeller
+
+
+@pytest.fixture(scope="module", params=["dense19", "sparse13"])
+def teller(request):
+    layout = load_layout(request.param)
+    return layout, SideTeller(layout, rng=np.random.default_rng(0))
+
+
+def hands(layout, side, rng, count=60):
+    hand = HandModel.named("M", side=side)
+    qpos = join_qpos(sample_valid_angles(hand, count, rng=rng), quaternion=random_quaternions(count, rng=rng))
+    return attach(layout, hand).markers(hand, hand.forward_kinematics(qpos))[0]
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_unknown_poses_are_told_also_with_markers_missing(teller, side, rng):
+    layout, tells = teller
+    right = whole = 0
+    for points in hands(layout, side, rng):
+        whole += tells.tell(points, np.arange(len(points)))[0] == side
+        here = rng.permutation(len(points))[3:]
+        right += tells.tell(points[here], here)[0] == side
+    assert whole >= 58
+    assert right >= 55
+
+
+def test_a_mirror_turns_the_answer_and_nothing_else_matters(teller, rng):
+    layout, tells = teller
+    (points,) = hands(layout, "right", rng, count=1)
+    side, clear = tells.tell(points, np.arange(len(points)))
+    moved = points @ quaternion_matrix(random_quaternions(1, rng=rng))[0].T + [1.0, -2.0, 0.5]
+    order = rng.permutation(len(points))
+    assert tells.tell(moved[order], order) == (side, pytest.approx(clear))
+    mirrored, as_clear = tells.tell(points * (1.0, 1.0, -1.0), np.arange(len(points)))
+    assert {side, mirrored} == {"left", "right"}
+    assert as_clear == pytest.approx(clear)
+
+
+def test_too_few_points_say_nothing(teller, rng):
+    _, tells = teller
+    points = rng.normal(size=(5, 3))
+    for labels in ([0, 1, 2, -1, -1], [-1] * 5):
+        assert tells.tell(points, np.array(labels)) == ("right", 0.0)
+    assert tells.tell(np.zeros((0, 3)), np.zeros(0, dtype=int)) == ("right", 0.0)

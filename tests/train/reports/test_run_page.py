@@ -1,0 +1,161 @@
+"""The page of a run: what it says, that a stopped run's is the whole run's, and that any glove has one."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import torch
+
+from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace
+from handsim.hand.topology import BONES
+from train.config import SetLabelerConfig, TrainConfig
+from train.data.shards import Dataset
+from train.evaluation.labeler_evaluation import Report
+from train.evaluation.metrics import macro_f1, percent
+from train.evaluation.reliability import error_without, expected_calibration_error
+from train.history import History
+from train.labelers.storage import load_labeler
+from train.loop import CHECKPOINT, train_labeler
+from train.reports.run_page import PAGE, write_run_page
+from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.training_state import TrainingState
+
+pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
+SMALL = TrainConfig(samples=2560, batch=128, network=SetLabelerConfig(width=16, gates=4, depth=1))
+
+
+def pictures(page: Path) -> list[str]:
+    found = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page.read_text("utf-8"))
+    return [base64.b64decode(picture).decode() for picture in found]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sets") / "small"
+    generate_dataset(DatasetConfig(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
+    return Dataset(out)
+
+
+@pytest.fixture(scope="module")
+def run(dataset, tmp_path_factory):
+    """A whole run and its model card."""
+    out = tmp_path_factory.mktemp("whole") / "run"
+    return out, train_labeler(dataset, SMALL, out)
+
+
+def test_the_page_says_what_the_card_says(run):
+    out, card = run
+    text = (out / PAGE).read_text("utf-8")
+    assert "<title>Labeler run</title>" in text
+    assert "Set labeler for glove dense19 (19 markers), trained on 2,560 clouds of a set of 400" in text
+    for figures in card["held_out_simulated"].values():
+        for figure in ("slot_accuracy", "macro_f1", "calibration_error", "error_without_least_sure"):
+            assert f"<td>{percent(figures[figure])}</td>" in text
+    drawn = pictures(out / PAGE)
+    assert len(drawn) == 4
+    for picture in drawn:
+        assert len(list(ElementTree.fromstring(picture).iter())) > 100
+    assert load_labeler(out).marker_names == tuple(card["marker_names"])
+
+
+def test_a_stopped_runs_page_is_the_whole_runs(dataset, run, tmp_path):
+    class Stopped(Exception):
+        pass
+
+    def stop(done, total, loss):
+        if done in (896, 1792):
+            raise Stopped
+
+    out = tmp_path / "run"
+    for _ in range(2):
+        with pytest.raises(Stopped):
+            train_labeler(dataset, SMALL, out, progress=stop, save_every=0.0)
+    train_labeler(dataset, SMALL, out, save_every=0.0)
+    whole, resumed = (torch.load(path / CHECKPOINT, weights_only=True)["history"] for path in (run[0], out))
+    assert resumed == whole
+    assert [done for done, _, _ in whole["losses"]] == list(range(128, 2561, 128))
+    assert [done for done, _ in whole["accuracies"]] == list(range(256, 2561, 256))
+    assert (out / PAGE).read_bytes() == (run[0] / PAGE).read_bytes()
+
+
+def test_the_last_look_agrees_with_the_card(run):
+    out, card = run
+    accuracies = torch.load(out / CHECKPOINT, weights_only=True)["history"]["accuracies"]
+    assert accuracies[-1][1] == card["held_out_simulated"]["occlude 5, ghosts 2"]["slot_accuracy"]
+
+
+def test_looking_at_held_out_frames_leaves_the_training_alone(dataset, run, tmp_path, monkeypatch):
+    monkeypatch.setattr(TrainingState, "look", lambda state, rows, names: None)
+    train_labeler(dataset, SMALL, tmp_path / "blind")
+    one, other = (torch.load(path / CHECKPOINT, weights_only=True) for path in (run[0], tmp_path / "blind"))
+    for name, values in one["network"].items():
+        assert torch.equal(values, other["network"][name])
+
+
+def test_checkpoints_without_a_history_go_on(dataset, run, tmp_path):
+    train_labeler(dataset, SMALL, tmp_path / "run")
+    path = tmp_path / "run" / CHECKPOINT
+    content = torch.load(path, weights_only=True)
+    del content["history"]
+    torch.save(content, path)
+    train_labeler(dataset, SMALL, tmp_path / "run")
+    assert len(pictures(tmp_path / "run" / PAGE)) == 4
+
+
+def made_up(count: int, rng: np.random.Generator, *, perfect: bool = False) -> tuple[dict, Report]:
+    """A card and a report of a glove with names that pages and formulas take for their own."""
+    places = []
+    for number in range(count):
+        bone = BONES[number % len(BONES)].name
+        across = 0.2 if bone == "palm" else 0.0
+        along = 0.2 + 0.2 * (number // len(BONES))
+        places.append(MarkerPlace(f"<b>${number}$&_{number}" + "^" * number, bone, along, 0.0, across))
+    layout = MarkerLayout("<i>odd</i>", tuple(places), 0.003)
+    confusion = rng.poisson(0.3, (count + 1, count + 1)) * (not perfect) + 500 * np.eye(count + 1, dtype=int)
+    wrong = int(confusion.sum() - confusion.trace())
+    right = np.arange(confusion.sum()) >= wrong
+    confidences = rng.uniform(size=right.size)
+    figures = {
+        "slot_accuracy": 0.9, "point_accuracy": float(right.mean()), "occlusion_ratio": 0.1,
+        "occlusion_recall": float("nan"), "ghost_ratio": 0.05, "macro_f1": macro_f1(confusion),
+        "calibration_error": expected_calibration_error(confidences, right),
+        "error_without_least_sure": error_without(confidences, right),
+    }  # fmt: skip
+    card = {
+        "dataset": {"layout": dataclasses.asdict(layout), "num_frames": 1000},
+        "train": dataclasses.asdict(TrainConfig(labeler="cnn", average=0.0)),
+        "held_out_simulated": {"clean": figures, "occlude 1, ghosts 2": figures},
+    }
+    accuracy = confusion.diagonal()[:-1] / confusion[:-1].sum(axis=1)
+    return card, Report(figures, accuracy, 500, confusion, confidences, right)
+
+
+@pytest.mark.parametrize("count", [FEWEST_MARKERS, MOST_MARKERS])
+def test_any_glove_and_either_network_have_a_page(tmp_path, rng, count):
+    card, report = made_up(count, rng)
+    history = History([(256, 3.0, 0.6), (512, 2.0, 0.6)], [(512, 0.4)])
+    page = write_run_page(tmp_path, card, history, report)
+    text = page.read_text("utf-8")
+    assert "The paper&#x27;s network for glove &lt;i&gt;odd" in text
+    assert "<b>" not in text and "<i>" not in text
+    assert len([ElementTree.fromstring(picture) for picture in pictures(page)]) == 4
+    assert text.count("<td>&lt;b&gt;$") > 0
+    first = page.read_bytes()
+    assert write_run_page(tmp_path, card, history, report).read_bytes() == first
+
+
+def test_a_labeler_without_mistakes_has_a_page(tmp_path, rng):
+    card, report = made_up(19, rng, perfect=True)
+    page = write_run_page(tmp_path, card, History([(256, 0.1, 0.6)], [(256, 1.0)]), report)
+    assert "No marker was taken for another" in page.read_text("utf-8")

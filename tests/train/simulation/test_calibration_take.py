@@ -1,0 +1,47 @@
+"""A simulated calibration capture holds what the user is asked for: motion, and touches of every finger."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.attach import attach
+from gloves.layout import load_layout
+from handsim.errors import ArgumentError
+from handsim.hand.model import HandModel
+from poses.shapes.touch import FINGERS, is_touching
+from poses.shapes.validity import is_valid
+from train.simulation.calibration_take import CalibrationTakeConfig, calibration_angles, simulate_calibration
+
+SHORT = CalibrationTakeConfig(free=1.0, rounds=1)
+
+
+def test_the_thumb_touches_every_finger(rng):
+    model = HandModel.named("M")
+    angles = calibration_angles(model, SHORT, rng=rng)
+    assert is_valid(model, angles).all()
+    for finger in FINGERS:
+        assert is_touching(model, angles, finger).any()
+
+
+def test_a_take_of_both_hands_has_its_truth(rng):
+    hands = [HandModel.named("M", side=side) for side in ("right", "left")]
+    worn = tuple((hand, attach(load_layout("dense19"), hand)) for hand in hands)
+    take = simulate_calibration(worn, CalibrationTakeConfig(free=0.5, rounds=0), rng=rng)
+    assert [hand.shape.side for hand in take.hands] == ["right", "left"]
+    assert take.settings["kind"] == "calibration"
+    assert take.markers_present().mean() > 0.9
+    for label, hand, (model, glove) in zip(take.hand_labels, take.hands, worn, strict=True):
+        off = take.observed(label) - glove.centers(model, model.forward_kinematics(hand.qpos))
+        assert np.nanmedian(np.linalg.norm(off, axis=-1)) < 0.0005
+    middles = [np.nanmedian(take.observed(label), axis=(0, 1)) for label in take.hand_labels]
+    assert np.linalg.norm(middles[0] - middles[1]) > 0.2
+
+
+def test_bad_values_are_told(rng):
+    with pytest.raises(ArgumentError, match="expected a positive time"):
+        CalibrationTakeConfig(free=0.0)
+    with pytest.raises(ArgumentError, match="expected 0 or more"):
+        CalibrationTakeConfig(rounds=-1)
+    with pytest.raises(ArgumentError, match="0 hands, expected one or two"):
+        simulate_calibration((), SHORT, rng=rng)

@@ -1,0 +1,182 @@
+"""Training sets: the same bytes however they are made, and damage that is named."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from handsim.errors import DatasetError, LayoutError
+from handsim.hand.model import HandModel, join_qpos
+from poses.shapes.couplings import HIGH, LOW
+from train.data.shards import Dataset, checksum, hands_name, rows_name
+from train.simulation import synthesis
+from train.simulation.synthesis import DatasetConfig, generate_dataset
+
+CONFIG = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+COMMAND = """
+import sys
+from pathlib import Path
+from train.simulation import synthesis
+synthesis.ROWS_PER_SHARD = 200
+if __name__ == "__main__":
+    config = synthesis.DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+    synthesis.generate_dataset(config, Path(sys.argv[1]), workers=1)
+"""
+
+# A pause after each shard, so that the kill comes before the end however busy the machine is.
+SLOWLY = """
+import time
+make_shard = synthesis.make_shard
+def make_slowly(*arguments):
+    shard = make_shard(*arguments)
+    time.sleep(1.0)
+    return shard
+synthesis.make_shard = make_slowly
+"""
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch):
+    monkeypatch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sets") / "undisturbed"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+        generate_dataset(CONFIG, out, workers=1)
+    return out
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: checksum(path) for path in folder.iterdir()}
+
+
+def test_rows_are_what_they_say(finished):
+    dataset = Dataset(finished)
+    rows = dataset.rows()
+    assert len(rows) == 700
+    assert dataset.marker_names[4] == "IndexMCP"
+    first = dataset.shards[0]
+    assert [shape.side for shape in dataset.hands(0)[:4]] == ["left", "right"] * 2
+    rows_a_person = np.bincount(first["hand"] // 2)
+    assert (rows_a_person[:-1] == 50).all()
+    for number in np.unique(first["hand"]):
+        shape = dataset.hands(0)[number]
+        model, mine = HandModel(shape), first[first["hand"] == number]
+        qpos = mine["qpos"].astype(np.float64)
+        assert (qpos[:, 7:] > LOW - 1e-6).all()
+        assert (qpos[:, 7:] < HIGH + 1e-6).all()
+        assert model.penetration(join_qpos(qpos[:, 7:])).max() < 0.001 + 1e-6
+        reach = np.linalg.norm(mine["markers"] - qpos[:, None, :3], axis=-1)
+        assert 0.01 < reach.min() < reach.max() < 1.3 * shape.length
+    assert {0, 1} == set(rows["hand"] % 2)
+    assert (rows["cameras"] > 0).mean() > 0.9
+    off = np.linalg.norm(rows["observed"] - rows["markers"], axis=-1)
+    assert 0.85 < np.isfinite(off).mean() < 1.0
+    assert np.nanmedian(off) < 0.0005
+    assert 0.1 < np.isfinite(rows["ghosts"][..., 0]).sum(axis=1).mean() < 2.0
+
+
+def test_two_workers_make_the_same_bytes(finished, tmp_path, monkeypatch):
+    monkeypatch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+    out = tmp_path / "two"
+    script = tmp_path / "make.py"
+    script.write_text(COMMAND.replace("workers=1", "workers=2"))
+    subprocess.run([sys.executable, script, out], check=True, env=environment())
+    assert contents(out) == contents(finished)
+
+
+def environment() -> dict[str, str]:
+    root = str(Path(__file__).resolve().parents[3])
+    return {**os.environ, "PYTHONPATH": root}
+
+
+def test_a_killed_run_goes_on_to_the_same_bytes(finished, tmp_path):
+    out, script = tmp_path / "killed", tmp_path / "make.py"
+    script.write_text(COMMAND.replace("if __name__", SLOWLY + "if __name__"))
+    process = subprocess.Popen([sys.executable, script, out], env=environment())
+    deadline = time.monotonic() + 60
+    while not (out / rows_name(1)).exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    (out / ".rows-00002.tmp-1.npy").write_bytes(
+        b"half a shard"
+    )  # what a kill in the middle of a write leaves
+    with pytest.raises(DatasetError, match="is unfinished; run handsim generate again"):
+        Dataset(out)
+    generate_dataset(CONFIG, out, workers=1)
+    assert contents(out) == contents(finished)
+
+
+def test_another_seed_makes_other_rows(finished, tmp_path):
+    import dataclasses
+
+    generate_dataset(dataclasses.replace(CONFIG, seed=4), tmp_path / "other", workers=1)
+    assert contents(tmp_path / "other")[rows_name(0)] != contents(finished)[rows_name(0)]
+
+
+def test_other_settings_in_the_same_folder_are_told(finished):
+    import dataclasses
+
+    with pytest.raises(DatasetError, match=r"begun with other settings \(num_frames, seed\)"):
+        generate_dataset(dataclasses.replace(CONFIG, seed=9, num_frames=9), finished)
+
+
+def test_a_damaged_shard_is_named(finished, tmp_path):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    with (copy / rows_name(2)).open("r+b") as file:
+        file.seek(5000)
+        file.write(b"\x00\xff\x00\xff")
+    with pytest.raises(DatasetError, match=r"rows-00002\.npy is damaged"):
+        Dataset(copy)
+    (copy / hands_name(1)).unlink()
+    with pytest.raises(DatasetError, match=r"(rows-00002|hands-00001)\.npy is (damaged|missing)"):
+        Dataset(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "sentence"),
+    [
+        ({"glove": "dense91"}, LayoutError, "unknown glove 'dense91' .*did you mean 'dense19'"),
+        ({"rig": "figure6"}, Exception, "unknown camera rig 'figure6'"),
+        ({"min_cameras": 17}, DatasetError, "min_cameras is 17, but rig 'figure5' has 16"),
+    ],
+)
+def test_bad_settings_leave_nothing_behind(tmp_path, change, error, sentence):
+    out = tmp_path / "set"
+    with pytest.raises(error, match=sentence):
+        generate_dataset(DatasetConfig(num_frames=10, **change), out)
+    assert not out.exists()
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(DatasetError, match="is not empty and holds no training set"):
+        generate_dataset(CONFIG, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_full_disk_is_told_and_leaves_nothing_half_written(tmp_path, monkeypatch, capsys):
+    from handsim.app.cli import main
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device", str(tmp_path / "set" / rows_name(0)))
+
+    monkeypatch.setattr(np.lib.format, "write_array_header_1_0", full)
+    code = main(["generate", "--num-frames", "300", "--out", str(tmp_path / "set"), "--workers", "1"])
+    assert code == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert [path.name for path in (tmp_path / "set").iterdir()] == ["config.json"]

@@ -1,0 +1,139 @@
+"""Twins of the paper's captures: every kind, valid in every frame, and Table 3 near the paper's."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from gloves.captures.gaps import count_gaps
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError, HandSimError
+from handsim.hand.model import HandModel
+from handsim.space.cameras import ROOM_CENTER
+from handsim.space.objects import named_object
+from handsim.space.transforms import quaternion_matrix
+from poses.contact.two_hands import two_hands_penetration
+from poses.grasps.object_motion import object_penetration
+from poses.shapes.couplings import HIGH, LOW
+from train.simulation.twins import _SPACE, KINDS, RATE, TWINS, TwinConfig, simulate_twin
+
+FRAMES = 200
+SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
+
+
+@functools.cache
+def short(kind: str) -> Take:
+    return simulate_twin(TwinConfig(kind=kind, num_frames=FRAMES))
+
+
+@functools.cache
+def whole() -> Take:
+    return simulate_twin(TwinConfig(kind="hand-controller"))
+
+
+def models(take: Take) -> tuple[HandModel, HandModel]:
+    right, left = (HandModel(hand.shape) for hand in take.hands)
+    return right, left
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_shapes_and_settings(kind):
+    take = short(kind)
+    columns = take.points.shape[1]
+    assert take.points.shape == (FRAMES, columns, 3)
+    assert take.ids.shape == take.labels.shape == (FRAMES, columns)
+    assert [hand.qpos.shape for hand in take.hands] == [(FRAMES, 27)] * 2
+    assert [hand.shape.side for hand in take.hands] == ["right", "left"]
+    assert take.rate == RATE
+    assert take.settings["kind"] == kind and take.settings["num_frames"] == FRAMES
+    thing = {"hand-pen": "pen", "hand-controller": "controller"}.get(kind)
+    assert (take.body.name if take.body else None) == thing
+    there = np.isfinite(take.points[..., 0])
+    assert (take.labels[~there] == -1).all() and (take.ids[~there] == -1).all()
+    for label in take.hand_labels:
+        assert np.isfinite(take.observed(label)[..., 0]).mean() > 0.5, "clasped hands hide a lot"
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "the whole hand-controller"])
+def test_every_frame_is_valid(kind):
+    take = short(kind) if kind in KINDS else whole()
+    right, left = models(take)
+    for model, hand in zip((right, left), take.hands, strict=True):
+        angles = hand.qpos[:, 7:]
+        assert (angles >= LOW - 1e-9).all() and (angles <= HIGH + 1e-9).all()
+        assert model.penetration(hand.qpos).max() <= SELF_DEEPEST + 1e-9
+        assert np.abs(hand.qpos[:, :3] - ROOM_CENTER).max() <= _SPACE, "where no camera may stand"
+    assert two_hands_penetration(right, left, *(hand.qpos for hand in take.hands)).max() <= DEEPEST
+    if take.body is not None:
+        thing = named_object(take.body.name)
+        for model, hand in zip((right, left), take.hands, strict=True):
+            assert object_penetration(model, thing, hand.qpos, take.body.T_world_body).max() <= DEEPEST
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hands_move_as_hands_do(kind):
+    for hand in short(kind).hands:
+        wrist = np.linalg.norm(np.diff(hand.qpos[:, :3], axis=0), axis=1) * RATE
+        assert wrist.max() < 3.0, "m/s"
+        turns = quaternion_matrix(hand.qpos[:, 3:7])
+        cosine = (np.einsum("tij,tij->t", turns[1:], turns[:-1]) - 1.0) / 2.0
+        assert np.arccos(np.clip(cosine, -1.0, 1.0)).max() * RATE < 12.0, "rad/s"
+        assert np.abs(np.diff(hand.qpos[:, 7:], axis=0)).max() * RATE < 15.0
+
+
+def test_the_pen_points_at_markers_of_the_other_hand():
+    take = short("hand-pen")
+    tip = np.einsum("tij,j->ti", take.body.T_world_body, np.append(named_object("pen").markers[0], 1.0))
+    away = np.linalg.norm(take.observed(take.hand_labels[1]) - tip[:, None, :3], axis=2)
+    nearest = np.nanmin(away, axis=1)
+    assert (nearest < 0.025).mean() > 0.4
+    assert len(np.unique(np.nanargmin(away, axis=1)[nearest < 0.025])) >= 2
+
+
+def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
+    config = TwinConfig(kind="hand-hand", num_frames=40, glove="sparse13", rig="eight", seed=7)
+    first, again = simulate_twin(config), simulate_twin(config)
+    for name in ("points", "ids", "labels"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+    assert first.hand_labels == (range(13), range(13, 26))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_single_frame_is_a_capture(kind):
+    take = simulate_twin(TwinConfig(kind=kind, num_frames=1))
+    assert take.num_frames == 1 and (take.labels >= 0).sum() > 30
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"kind": "hand-pn"}, "unknown kind of capture 'hand-pn' (did you mean 'hand-pen'?); valid names: "),
+        ({"num_frames": 0}, "num_frames is 0, expected at least 1"),
+        ({"num_frames": -5}, "num_frames is -5, expected at least 1"),
+        ({"seed": -1}, "seed is -1, expected 0 or more"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_sentence(arguments, words):
+    with pytest.raises(ArgumentError) as caught:
+        TwinConfig(**arguments)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"), [({"glove": "dens19"}, "dense19"), ({"rig": "ten"}, "figure5")]
+)
+def test_unknown_gloves_and_rigs_are_told(arguments, words):
+    with pytest.raises(HandSimError, match=words):
+        simulate_twin(TwinConfig(num_frames=5, **arguments))
+
+
+def test_the_whole_hand_controller_twin_is_near_table_3():
+    take = whole()
+    paper = TWINS["hand-controller"].paper
+    observed = np.concatenate([take.observed(label) for label in take.hand_labels], axis=1)
+    ours = count_gaps(np.isfinite(observed[..., 0]))
+    assert ours.frames == paper.frames == 2645
+    for name in ("gaps", "average_length", "average_missing"):
+        assert abs(getattr(ours, name) / getattr(paper, name) - 1.0) < 0.25, name

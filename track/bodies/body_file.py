@@ -1,0 +1,103 @@
+"""Rigid bodies as TOML files: a name, and the markers' places in millimeters in the body's own frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from handsim.errors import ArgumentError, HandSimError, choices
+from handsim.files.atomic import atomic_write, read_toml
+from handsim.files.toml_values import check_keys, numbers, quoted, tables_of, text_of, written
+from handsim.hand.topology import SIDES
+from handsim.space.objects import named_object, object_names
+from track.bodies.constellation import FEWEST
+from track.bodies.rigid_body import RigidTemplate
+
+SUFFIX: Final = ".toml"
+_BODY_KEYS: Final = ("name", "description", "marker")
+_MARKER_KEYS: Final = ("name", "place_mm")
+
+
+def load_body(name_or_path: str | Path) -> RigidTemplate:
+    """The markers of one of handsim's objects by its name, or of anybody's by the path of a `.toml` file.
+
+    Raises:
+        ArgumentError: No such object or file, or the file describes no body that can be tracked; the sentence
+            names the file.
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in object_names():
+        return RigidTemplate.of(named_object(str(name_or_path)))
+    if path.suffix.lower() != SUFFIX:
+        ours = [name for name in object_names() if len(named_object(name).markers) >= FEWEST]
+        unknown = choices(str(name_or_path), ours, noun="body")
+        raise ArgumentError(f"{unknown}, or the path of a .toml file")
+    table = read_toml(path, error=ArgumentError)
+    try:
+        return _parse_body(table)
+    except HandSimError as error:
+        raise ArgumentError(f"{path}: {error}") from error
+
+
+def load_bodies(names_or_paths: Iterable[str | Path]) -> tuple[RigidTemplate, ...]:
+    """Bodies that are tracked together.
+
+    Raises:
+        ArgumentError: One cannot be loaded, or its name is another's, or a hand's.
+    """
+    bodies: list[RigidTemplate] = []
+    for name_or_path in names_or_paths:
+        body = load_body(name_or_path)
+        taken = (*SIDES, *(other.name for other in bodies))
+        if body.name in taken:
+            raise ArgumentError(
+                f"{name_or_path}: a body is named '{body.name}', expected a name of its own; taken are "
+                f"{', '.join(taken)}"
+            )
+        bodies.append(body)
+    return tuple(bodies)
+
+
+def save_body(path: str | Path, body: RigidTemplate) -> None:
+    """Write a body as TOML, numbers to nine decimals; `load_body` gives the same body again.
+
+    Raises:
+        ArgumentError: The file cannot be written.
+    """
+    lines = [f"name = {quoted(body.name)}"]
+    for name, place in zip(body.marker_names, 1e3 * body.places, strict=True):
+        places = ", ".join(written(value) for value in place.tolist())
+        lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{places}]"]
+    try:
+        with atomic_write(path) as temporary:
+            temporary.write_text("\n".join(lines) + "\n", "utf-8")
+    except OSError as error:
+        raise ArgumentError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
+    check_keys(table, "the file", _BODY_KEYS, optional=("description", "marker"))
+    text_of(table, "description", default="")
+    name = _printable("the body's name", text_of(table, "name"))
+    markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
+    places = np.array([place for _, place in markers]).reshape(-1, 3)
+    return RigidTemplate(name, tuple(marker for marker, _ in markers), 1e-3 * places)
+
+
+def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:
+    name = table.get("name")
+    owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
+    check_keys(table, owner, _MARKER_KEYS)
+    name = _printable("marker name", text_of(table, "name", f"{owner}: "))
+    wanted = "three numbers [x, y, z] in millimeters"
+    return name, numbers(f"{owner}: place_mm", table["place_mm"], (3,), wanted).tolist()
+
+
+def _printable(what: str, name: str) -> str:
+    """A name that can stand in a marker file."""
+    if not name or name != name.strip() or not name.isprintable():
+        raise ArgumentError(f"{what} {name!r}: expected printable characters without outer blanks")
+    return name

@@ -1,0 +1,48 @@
+"""The command `handsim body`: a rigid body's markers as a file, for `handsim track --body`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from gloves.captures.formats import read_capture
+from gloves.takes.take import SUFFIX, load_take
+from handsim.errors import HandSimError
+from handsim.space.objects import named_object
+from track.bodies.body_file import SUFFIX as TOML
+from track.bodies.body_file import save_body
+from track.bodies.rigid_body import RigidTemplate
+from track.calibration.body_learning import learn_body
+from track.evaluation.take_summary import say
+
+
+def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
+    """Write the markers of a rigid body, from a capture in which it moves and nothing else is.
+
+    The body is called as the file is, and its markers Marker1, Marker2, ...; both may be changed there.
+
+    Args:
+        source: A .trc, .c3d or Motive .csv file, whose names are not used; or the .truth.npz of a simulated
+            capture, whose object it is then.
+        out: The body's file, .toml.
+    """
+    if out.suffix.lower() != TOML:
+        raise HandSimError(f"--out is {out}, expected a file name that ends in {TOML}")
+    found = _held(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
+    save_body(out, found)
+    widest = 1e3 * np.max(found.sides)
+    say(f"{out}: {found.name}, {len(found.places)} markers, at most {widest:.1f} mm apart")
+
+
+def _held(truth: Path) -> RigidTemplate:
+    """The object of a simulated take."""
+    held = load_take(truth).body
+    if held is None:
+        raise HandSimError(
+            f"{truth}: nobody holds anything in it, "
+            "expected a take of handsim simulate --kind hand-controller"
+        )
+    return RigidTemplate.of(named_object(held.name))

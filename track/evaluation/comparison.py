@@ -1,0 +1,180 @@
+"""All trackers on the same takes, with calibrated hands and without: the figures of the tracking tables."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError
+from handsim.space.objects import named_object
+from track.baselines.assignment_trackers import HungarianTracker, NearestNeighborTracker
+from track.baselines.paper_tracker import PaperTracker
+from track.bodies.rigid_body import RigidTemplate
+from track.evaluation.take_evaluation import (
+    FrameTracker,
+    TrackingReport,
+    evaluate_tracker,
+    seen_frame,
+    true_users,
+    usual_users,
+)
+from track.evaluation.trials import FEWEST_FRAMES, cut, first_locks, recoveries
+from track.tracker import Tracker
+from train.labelers.protocol import Labeler
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    MakeTracker = Callable[[Take, Sequence[GloveFit]], FrameTracker]
+
+OURS: Final = "handsim"
+PAPERS_LOOP: Final = "paper's loop"
+GIVEN_FIRST: Final = ("nearest point", "Hungarian")
+"""Those that are given the labels of the first frame, and so do not begin by themselves."""
+USERS: Final[dict[str, Callable[[Take], list[GloveFit]]]] = {
+    "calibrated": true_users,
+    "uncalibrated": usual_users,
+}
+TRIALS: Final = 10
+_WARM_UP: Final = 30  # frames before the clock counts: kernels are loaded
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """What one tracker made of one take with one pair of hands."""
+
+    method: str
+    users: str
+    capture: str
+    report: TrackingReport
+    locks: Float[np.ndarray, "S"]
+    """Frames until all was right, from random ones of the take; NaN for more than a second. See `trials`."""
+    recoveries: Float[np.ndarray, "S"]
+    """The same after a second in the dark."""
+
+    def record(self) -> dict[str, Any]:
+        """All figures, for JSON; None where there is nothing to count."""
+        figures = {name: number_or_none(value) for name, value in self.report.figures().items()}
+        errors = [
+            {
+                "missing": list(bounds),
+                "hands": count,
+                "joint_error": number_or_none(joint),
+                "angle_error": number_or_none(angle),
+            }
+            for bounds, (count, joint, angle) in self.report.by_occlusion().items()
+        ]
+        return {
+            "method": self.method,
+            "hands": self.users,
+            "capture": self.capture,
+            "frames": len(self.report.right),
+            **figures,
+            "by_occlusion": errors,
+            "first_lock_frames": [number_or_none(value) for value in self.locks],
+            "recovery_frames": [number_or_none(value) for value in self.recoveries],
+        }
+
+
+def trackers(labeler: Labeler, seed: int) -> dict[str, MakeTracker]:
+    """What makes a tracker for a take (or a part of it) and hands, by the method's name.
+
+    Args:
+        labeler: Labeler of those that need one.
+        seed: Seed of the paper's loop.
+    """
+    return {
+        OURS: lambda take, users: Tracker(users, labeler),
+        PAPERS_LOOP: lambda take, users: PaperTracker(users, labeler, rng=np.random.default_rng(seed)),
+        GIVEN_FIRST[0]: lambda take, users: NearestNeighborTracker(users, seen_frame(take, 0).labels),
+        GIVEN_FIRST[1]: lambda take, users: HungarianTracker(users, seen_frame(take, 0).labels),
+    }
+
+
+def compare_trackers(
+    takes: Mapping[str, Take],
+    labeler: Labeler,
+    *,
+    seed: int,
+    trials: int = 0,
+    done: Callable[[], None] | None = None,
+) -> list[Measured]:
+    """Run every tracker over every take, with every kind of hands.
+
+    Args:
+        takes: Simulated takes, by name.
+        labeler: Labeler of those that need one.
+        seed: Seed of the paper's loop, and of where trials begin.
+        trials: How often first lock and recovery are measured in each take that is long enough.
+        done: Called after every frame of a take; trials are not counted.
+    """
+    wearers = {
+        (users, capture): hands_of(take)
+        for users, hands_of in USERS.items()
+        for capture, take in takes.items()
+    }
+    measured = []
+    for name, make in trackers(labeler, seed).items():
+        for (users, capture), hands in wearers.items():
+            take = takes[capture]
+            report = _report(take, hands, make, done)
+            waits = _try(take, hands, name, make, trials, seed)
+            measured.append(Measured(name, users, capture, report, *waits))
+    return measured
+
+
+def measure_with_body(
+    capture: str, take: Take, labeler: Labeler, *, done: Callable[[], None] | None = None
+) -> list[Measured]:
+    """Run our tracker over a take whose body it follows beside the hands; the body's labels count too.
+
+    Args:
+        capture: The take's name.
+        take: A simulated take with one of handsim's objects.
+        labeler: Of the hands' glove.
+        done: Called after every frame.
+
+    Raises:
+        ArgumentError: The take has no body, or one with too few markers.
+    """
+    if take.body is None:
+        raise ArgumentError(f"{capture}: the take has no body, expected one with three markers or more")
+    body = RigidTemplate.of(named_object(take.body.name))
+    nothing, measured = np.zeros(0), []
+    for users, hands_of in USERS.items():
+        report = _report(take, hands_of(take), lambda _, hands: Tracker(hands, labeler, (body,)), done)
+        measured.append(Measured(f"{OURS}, {body.name} too", users, capture, report, nothing, nothing))
+    return measured
+
+
+def _report(
+    take: Take, hands: Sequence[GloveFit], make: MakeTracker, done: Callable[[], None] | None
+) -> TrackingReport:
+    """What a tracker makes of a take, once it is warm."""
+    start = cut(take, 0, min(_WARM_UP, take.num_frames))
+    evaluate_tracker(start, hands, make(start, hands))
+    return evaluate_tracker(take, hands, make(take, hands), done=done)
+
+
+def _try(
+    take: Take, hands: Sequence[GloveFit], name: str, make: MakeTracker, trials: int, seed: int
+) -> tuple[Float[np.ndarray, "S"], Float[np.ndarray, "S"]]:
+    """First locks and recoveries, nothing where there is nothing to measure."""
+    nothing = np.zeros(0)
+    if take.num_frames < FEWEST_FRAMES or not trials:
+        return nothing, nothing
+    rng = np.random.default_rng(seed)
+    again = recoveries(take, lambda part: make(part, hands), trials, rng=rng)
+    if name in GIVEN_FIRST:
+        return nothing, again
+    return first_locks(take, lambda part: make(part, hands), trials, rng=rng), again
+
+
+def number_or_none(value: float) -> float | None:
+    """What JSON can hold of a figure: it knows no NaN."""
+    return None if np.isnan(value) else float(value)

@@ -1,0 +1,158 @@
+"""Where a fit begins when no earlier pose is known: a hand put together from a few shapes, digit by digit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numba
+import numpy as np
+
+from gloves.fit import GloveFit
+from handsim.hand.model import join_qpos
+from handsim.hand.topology import NUM_QPOS
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
+# Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
+# knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
+# finger, opposed, opposed and bent, across the palm.
+_FINGER: Final = (
+    (0, 25, 35, 20),
+    (0, 0, 5, 5),
+    (0, 45, 60, 35),
+    (0, 75, 10, 10),
+    (0, 10, 95, 55),
+    (0, 80, 100, 55),
+)
+_THUMB: Final = (
+    (0, 25, 35, 20),
+    (25, -25, 0, 0),
+    (-20, -20, 10, 10),
+    (25, 20, 10, 10),
+    (20, 25, 45, 60),
+    (-20, 35, 50, 40),
+)
+_ROUNDS: Final = 3
+_STEADY: Final = 0.005  # [m]
+
+
+class StartingShapes(NamedTuple):
+    """Hand shapes with the wrist at the origin, and where they have their markers."""
+
+    angles: Float[np.ndarray, "K 20"]
+    markers: Float[np.ndarray, "K M 3"]
+    steadiness: Float[np.ndarray, "M"]
+    """How much each marker counts where a whole hand is laid: little if it differs between the shapes."""
+
+
+def starting_shapes(fit: GloveFit) -> StartingShapes:
+    """The shapes that a fit of this hand in its glove may start from."""
+    angles = np.deg2rad([[*thumb, *finger * 4] for thumb, finger in zip(_THUMB, _FINGER, strict=True)])
+    markers = fit.markers(join_qpos(angles))[0]
+    return StartingShapes(angles, markers, 1.0 / (_STEADY**2 + markers.var(axis=0).sum(axis=1)))
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def lay_shapes(shapes: Any, digits: Any, target: Any) -> Any:
+    """Poses to start from (K + 1, 27) for one frame's markers (M, 3), the most likely one first.
+
+    The first takes every digit from the shape that has it nearest; the others are whole shapes, those first
+    that can be laid on the markers best.
+    """
+    count = len(shapes.angles)
+    laid, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))
+    squares = np.empty(count)
+    for number in range(count):
+        laid[number, 7:] = shapes.angles[number]
+        squares[number] = lay_rigidly(shapes.markers[number], target, shapes.steadiness, laid[number])
+    for number in range(count):
+        better = 0
+        for other in range(count):
+            if squares[other] < squares[number] or (squares[other] == squares[number] and other < number):
+                better += 1
+        poses[1 + better] = laid[number]
+    markers = np.empty_like(target)
+    poses[0] = poses[1]
+    for _ in range(_ROUNDS):
+        _choose_digits(shapes, digits, target, poses[0], markers)
+        lay_rigidly(markers, target, shapes.steadiness, poses[0])
+    return poses
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _choose_digits(shapes: Any, digits: Any, target: Any, pose: Any, markers: Any) -> None:
+    """Take each digit from the shape whose markers are nearest, the wrist held."""
+    turn = np.empty((3, 3))
+    write_rotation(pose[3:7], turn)
+    squares = np.zeros((5, len(shapes.angles)))
+    for marker in range(len(target)):
+        if digits[marker] < 0 or np.isnan(target[marker, 0]):
+            continue
+        for i in range(3):
+            local = 0.0
+            for j in range(3):
+                local += turn[j, i] * (target[marker, j] - pose[j])
+            for number in range(len(shapes.angles)):
+                squares[digits[marker], number] += (shapes.markers[number, marker, i] - local) ** 2
+    for digit in range(5):
+        nearest = squares[digit].argmin()
+        pose[7 + 4 * digit : 11 + 4 * digit] = shapes.angles[nearest, 4 * digit : 4 * digit + 4]
+        for marker in range(len(target)):
+            if digits[marker] == digit:
+                markers[marker] = shapes.markers[nearest, marker]
+    for marker in range(len(target)):
+        if digits[marker] < 0:
+            markers[marker] = shapes.markers[0, marker]
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def lay_rigidly(source: Any, target: Any, weights: Any, pose: Any) -> Any:
+    """Position and orientation that bring points nearest to those there, and the weighted squares left.
+
+    Horn, Closed-form solution of absolute orientation using unit quaternions (1987).
+    """
+    total, size = 0.0, 0.0
+    centers, products = np.zeros((2, 3)), np.zeros((3, 3))
+    for point in range(len(source)):
+        if not np.isnan(target[point, 0]):
+            total += weights[point]
+            centers[0] += weights[point] * source[point]
+            centers[1] += weights[point] * target[point]
+    centers /= total
+    for point in range(len(source)):
+        if np.isnan(target[point, 0]):
+            continue
+        for i in range(3):
+            a = source[point, i] - centers[0, i]
+            size += weights[point] * (a * a + (target[point, i] - centers[1, i]) ** 2)
+            for j in range(3):
+                products[i, j] += weights[point] * a * (target[point, j] - centers[1, j])
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = products
+    form = np.array(
+        [
+            [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+            [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+            [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+            [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+        ]
+    )
+    values, vectors = np.linalg.eigh(form)
+    turn = np.empty((3, 3))
+    pose[3:7] = vectors[:, 3]
+    write_rotation(pose[3:7], turn)
+    for i in range(3):
+        pose[i] = centers[1, i]
+        for j in range(3):
+            pose[i] -= turn[i, j] * centers[0, j]
+    return size - 2.0 * values[3]
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def write_rotation(quaternion: Any, turn: Any) -> None:
+    """The matrix of a unit quaternion."""
+    w, x, y, z = quaternion
+    turn[0, 0], turn[0, 1], turn[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    turn[1, 0], turn[1, 1], turn[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    turn[2, 0], turn[2, 1], turn[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)

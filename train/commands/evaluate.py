@@ -1,0 +1,73 @@
+"""The command `handsim evaluate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from gloves.captures.collection import find_captures, read_markers
+from gloves.takes.take import load_take
+from handsim.errors import HandSimError
+from handsim.files.json_files import save_json
+from train.labelers.storage import labeler_for_glove
+from train.reports.figures_table import print_figures
+
+
+def evaluate(
+    captures: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    *,
+    glove: str = "dense19",
+    labeler: str | None = None,
+    occlude: int = 0,
+    ghosts: int = 0,
+    seed: int = 0,
+    json: Path | None = None,
+) -> None:
+    """Measure a labeler on labeled captures, corrupted as in the paper.
+
+    Args:
+        captures: Labeled .trc, .c3d or .csv files, folders searched for them, or the .truth.npz of takes.
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
+        occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).
+        ghosts: Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2).
+        seed: Seed of the corruption.
+        json: File for the figures.
+    """
+    from train.data.augmentation import Corruption
+    from train.evaluation.labeler_evaluation import evaluate_labeler, evaluate_takes
+
+    if occlude < 0 or ghosts < 0:
+        raise HandSimError(f"occlude is {occlude} and ghosts {ghosts}, expected 0 or more of each")
+    network = labeler_for_glove(glove, labeler)
+    if all(path.suffix == ".npz" for path in captures):
+        if occlude or ghosts:
+            raise HandSimError(
+                "a simulated take has its own gaps and ghosts: leave out --occlude and --ghosts"
+            )
+        report = evaluate_takes(network, [load_take(path) for path in captures])
+        title = f"{len(captures)} takes, {report.num_frames} frames of one hand"
+    else:
+        files = find_captures(captures)
+        markers = read_markers(files, network.marker_names)
+        corruption = Corruption(occlude, ghosts)
+        report = evaluate_labeler(network, markers, corruption, rng=np.random.default_rng(seed))
+        title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
+    by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
+    _print_report(report.figures, by_marker, title)
+    if json is not None:
+        drawn = {"glove": glove, "occlude": occlude, "ghosts": ghosts, "seed": seed}
+        # JSON knows no NaN, which stands where there was nothing to count.
+        figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
+        found = {"frames": report.num_frames, "figures": figures, "slot_accuracy_by_marker": by_marker}
+        save_json(json, {**drawn, **found})
+
+
+def _print_report(figures: dict[str, float], by_marker: dict[str, float], title: str) -> None:
+    print_figures({"share": figures}, title=title)
+    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
+    Console().print("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))

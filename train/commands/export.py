@@ -1,0 +1,28 @@
+"""The command `handsim export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from handsim.errors import HandSimError
+
+
+def export(labeler: Annotated[str, tyro.conf.Positional], out: Path) -> None:
+    """Write a trained set labeler as one .onnx file, which labels without torch.
+
+    Args:
+        labeler: A glove with a shipped labeler, or the folder of a trained one.
+        out: The .onnx file.
+    """
+    from train.labelers.onnx_labeler import export_onnx
+    from train.labelers.storage import load_network
+
+    if out.suffix.lower() != ".onnx":
+        raise HandSimError(f"cannot write '{out}', expected a name that ends in .onnx")
+    network, card = load_network(labeler)
+    export_onnx(network, card["marker_names"], out)
+    Console().print(f"{out}: {len(card['marker_names'])} markers", highlight=False, soft_wrap=True)

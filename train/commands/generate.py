@@ -1,0 +1,44 @@
+"""The command `handsim generate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import tyro
+from rich.console import Console
+
+from handsim.app.progress import progress_bar
+from train.data.shards import Dataset
+from train.reports.dataset_page import write_report
+from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation.twins import TwinConfig, simulate_twin
+
+_TAKE: Final = 1200  # frames of the continuous take that the report's gaps are from
+
+
+def generate(
+    out: Path, config: Annotated[DatasetConfig, tyro.conf.arg(name="")], workers: int | None = None
+) -> None:
+    """Make a training set and a page of plots of it; run it again to go on where it was stopped.
+
+    Args:
+        out: Folder for the shards, their manifest and report.html.
+        config: What to make.
+        workers: Processes; all cores when not given.
+    """
+    with progress_bar("frames") as (bar, task):
+        manifest = generate_dataset(
+            config,
+            out,
+            workers=workers,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    # Not in generate_dataset: the set is whole without its report, whose bytes hang on matplotlib's version.
+    with Console(stderr=True).status("drawing the report"):
+        take = simulate_twin(
+            TwinConfig(kind="hand-hand", num_frames=_TAKE, glove=config.glove, rig=config.rig)
+        )
+        report = write_report(Dataset(out), present=take.markers_present(), rate=take.rate)
+    Console().print(f"{manifest.num_frames} frames of {config.glove} in {out}")
+    Console().print(f"report in {report}", soft_wrap=True, markup=False)

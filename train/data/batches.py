@@ -1,0 +1,68 @@
+"""Batches for training: random rows, stretched and corrupted anew each time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from handsim.hand.topology import SIDES
+from train.config import TrainConfig
+from train.data.augmentation import Cloud, Corruption, corrupt
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+
+class Batch(NamedTuple):
+    """Clouds and the markers behind them."""
+
+    cloud: Cloud
+    markers: Float[np.ndarray, "B M 3"]
+    """Where all markers are [m], the lost ones too, in the clouds' frame: centered and not turned."""
+
+
+def paper_corruption(num_markers: int) -> Corruption:
+    """The paper's recipe for a layout: up to 5 draws of 19 markers, up to 3 of 13, up to two ghosts."""
+    return Corruption(occlude=round(num_markers / 4), ghosts=2)
+
+
+def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Generator) -> Batch:
+    """Random rows as corrupted clouds, centered; left hands are mirrored to right ones.
+
+    Args:
+        rows: Rows of a training set, see `train.data.shards.row_dtype`.
+        config: How many, and how to corrupt them.
+        rng: Source of all randomness.
+    """
+    chosen = rows[rng.integers(len(rows), size=config.batch)]
+    markers = chosen["markers"].astype(np.float64)
+    center = markers.mean(axis=1, keepdims=True)
+    stretch = _stretches(len(markers), config.anisotropy, rng)
+    stretch = _mirrors(chosen["hand"]) @ stretch
+    markers = (markers - center) @ stretch
+    jitter = config.jitter * rng.uniform()
+    if rng.random() < config.rig_share:
+        observed = (chosen["observed"].astype(np.float64) - center) @ stretch
+        ghosts = (chosen["ghosts"].astype(np.float64) - center) @ stretch
+        corruption = Corruption(occlude=0, ghosts=0, jitter=jitter)
+        return Batch(corrupt(observed, corruption, ghosts=ghosts, rng=rng), markers)
+    usual = paper_corruption(markers.shape[1]).occlude
+    occlude = usual if config.occlude is None else config.occlude
+    return Batch(corrupt(markers, Corruption(occlude, config.ghosts, jitter), rng=rng), markers)
+
+
+def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Symmetric matrices (B, 3, 3) that stretch along random orthogonal directions."""
+    axes, _ = np.linalg.qr(rng.standard_normal((count, 3, 3)))
+    factors = np.exp(anisotropy * rng.standard_normal((count, 1, 3)))
+    stretches: NDArray[np.float64] = (axes * factors) @ axes.transpose(0, 2, 1)
+    return stretches
+
+
+def _mirrors(hand: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Matrices (B, 3, 3) that mirror left hands; a person's two follow each other in the order of `SIDES`."""
+    mirrors = np.tile(np.eye(3), (len(hand), 1, 1))
+    mirrors[hand % len(SIDES) == SIDES.index("left"), 0, 0] = -1.0
+    return mirrors

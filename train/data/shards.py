@@ -1,0 +1,144 @@
+"""Training sets on disk: `.npy` shards of rows and hands, and a manifest that names and checks them.
+
+A row is clean: what the hand did and what the rig saw of it. Jitter, drops and a shuffled order are drawn
+when training (`train.data.augmentation`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from gloves.optics.ghosts import MAX_GHOSTS
+from handsim.errors import DatasetError
+from handsim.files.atomic import atomic_write
+from handsim.files.json_files import load_json, save_json
+from handsim.hand.records import unpack_hand
+from handsim.hand.shape import HandShape
+from handsim.hand.topology import NUM_QPOS
+
+if TYPE_CHECKING:
+    from jaxtyping import Shaped
+    from numpy.typing import NDArray
+
+SCHEMA: Final = 2
+MANIFEST: Final = "manifest.json"
+CONFIG: Final = "config.json"
+
+
+def row_dtype(num_markers: int) -> np.dtype[np.void]:
+    """One frame of one hand.
+
+    qpos, hand (its place in the shard), true markers [m], cameras with a free view of each (bits), where the
+    optical system puts them [m] (NaN where it loses them), ghosts [m].
+    """
+    return np.dtype(
+        [
+            ("qpos", "<f4", (NUM_QPOS,)),
+            ("hand", "<u4"),
+            ("markers", "<f4", (num_markers, 3)),
+            ("cameras", "<u4", (num_markers,)),
+            ("observed", "<f4", (num_markers, 3)),
+            ("ghosts", "<f4", (MAX_GHOSTS, 3)),
+        ]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a finished training set is made of."""
+
+    config: dict[str, Any]
+    """The settings that made it."""
+    marker_names: tuple[str, ...]
+    num_frames: int
+    min_cameras: int
+    """Cameras that must see a marker before it exists."""
+    files: dict[str, str]
+    """SHA-256 of every file, by name."""
+    units: str = "metres, radians, world frame"
+    schema: int = SCHEMA
+
+
+def rows_name(shard: int) -> str:
+    """File of a shard's rows."""
+    return f"rows-{shard:05d}.npy"
+
+
+def hands_name(shard: int) -> str:
+    """File of a shard's hands."""
+    return f"hands-{shard:05d}.npy"
+
+
+def save_array(path: Path, array: NDArray[Any]) -> None:
+    """Write an `.npy` file, whole or not at all."""
+    # By hand, because numpy.save tells a full disk as "8192 requested and 6690 written", without its errno.
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+        file.write(np.ascontiguousarray(array).tobytes())
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def save_manifest(out: Path, manifest: Manifest) -> None:
+    """Write the manifest, which makes the training set complete."""
+    save_json(out / MANIFEST, dataclasses.asdict(manifest))
+
+
+class Dataset:
+    """A finished training set, its rows memory-mapped.
+
+    Args:
+        path: The folder that `handsim generate` wrote.
+
+    Raises:
+        DatasetError: Not a training set, unfinished, of another schema, or damaged (the file is named).
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not (path / MANIFEST).is_file():
+            hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
+            raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
+        content = load_json(path / MANIFEST)
+        if content.get("schema") != SCHEMA:
+            raise DatasetError(f"{path} has schema {content.get('schema')}, expected {SCHEMA}")
+        try:
+            self.manifest = Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
+        except (TypeError, KeyError) as error:
+            raise DatasetError(f"{path / MANIFEST} is damaged: a field is missing or unknown") from error
+        for name, wanted in self.manifest.files.items():
+            file = path / name
+            if not file.is_file():
+                raise DatasetError(
+                    f"{file} is missing; delete {path / MANIFEST} and run handsim generate again"
+                )
+            if checksum(file) != wanted:
+                raise DatasetError(
+                    f"{file} is damaged (its checksum is not the manifest's); delete it together with "
+                    f"{MANIFEST} and run handsim generate again"
+                )
+        self.path = path
+        names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
+        self.shards = [np.load(path / name, mmap_mode="r", allow_pickle=False) for name in names]
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers in label order."""
+        return self.manifest.marker_names
+
+    def rows(self) -> Shaped[np.ndarray, "T"]:
+        """All rows in order, read into memory."""
+        return np.concatenate(self.shards)
+
+    def hands(self, shard: int) -> list[HandShape]:
+        """The hands of a shard, which its rows count from 0."""
+        return [unpack_hand(record) for record in np.load(self.path / hands_name(shard), allow_pickle=False)]

@@ -1,0 +1,146 @@
+"""Measure a labeler: known markers, corrupted as in the paper, labeled, and counted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gloves.optics.ghosts import GHOST_REACH
+from gloves.takes.take import Take
+from handsim.errors import CaptureError
+from train.data.augmentation import Corruption, corrupt
+from train.evaluation.metrics import LabelCounts
+from train.evaluation.reliability import error_without, expected_calibration_error
+from train.labelers.protocol import Labeler
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+    from numpy.typing import NDArray
+
+_CHUNK: Final = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """What an evaluation found."""
+
+    figures: dict[str, float]
+    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.reliability` the expected
+    calibration error and
+    the share of points labeled wrongly without the 2 % least sure (with them, it is 1 - point accuracy)."""
+    slot_accuracy_by_marker: Float[np.ndarray, "M"]
+    num_frames: int
+    confusion: Int[np.ndarray, "M+1 M+1"]
+    """Points by what they are (rows) and were called (columns): markers in label order, then ghost."""
+    confidences: Float[np.ndarray, "N"]
+    """How sure the label of each point was: all frames' points, in order."""
+    right: Bool[np.ndarray, "N"]
+    """Whether it was the right one."""
+
+
+def evaluate_labeler(
+    labeler: Labeler,
+    markers: Float[np.ndarray, "T M 3"],
+    corruption: Corruption,
+    *,
+    rng: np.random.Generator,
+) -> Report:
+    """Corrupt, label, count.
+
+    Args:
+        labeler: What to measure.
+        markers: True markers [m] in the labeler's order, NaN where missing.
+        corruption: What is drawn on top.
+        rng: Source of all randomness.
+    """
+    count = _Count(labeler)
+    for first in range(0, len(markers), _CHUNK):
+        cloud = corrupt(markers[first : first + _CHUNK], corruption, rng=rng)
+        count.add(
+            [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
+            [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
+        )
+    return count.report()
+
+
+def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
+    """Label every hand of every frame of simulated takes, told apart by the truth, and count.
+
+    Raises:
+        CaptureError: A take's glove has other markers than the labeler knows.
+    """
+    count = _Count(labeler)
+    for take in takes:
+        for hand in range(len(take.hands)):
+            names = take.hands[hand].fit.layout.names
+            if names != labeler.marker_names:
+                raise CaptureError(
+                    f"the take's glove has markers {', '.join(names)}, the labeler knows "
+                    f"{', '.join(labeler.marker_names)}"
+                )
+            clouds, truths = hand_clouds(take, hand)
+            for first in range(0, len(clouds), _CHUNK):
+                count.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
+    return count.report()
+
+
+def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:
+    """One hand's points of every frame [m], with the marker of each; -1 for a ghost.
+
+    A ghost belongs to the hand with the nearest marker, if that is no further than `GHOST_REACH`. Markers of
+    a body with three or more are the system's own business and left out, as are those of the other hand.
+    """
+    nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
+    mine = take.hand_labels[hand]
+    own = (take.labels >= mine.start) & (take.labels < mine.stop)
+    ghost = (take.labels < 0) & (nearest.argmin(axis=0) == hand) & (nearest[hand] <= GHOST_REACH)
+    truth = np.where(own, take.labels - mine.start, -1)
+    here = own | ghost
+    clouds = [points[chosen] for points, chosen in zip(take.points, here, strict=True)]
+    return clouds, [label[chosen] for label, chosen in zip(truth, here, strict=True)]
+
+
+def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "T N"]:
+    """Distance of every point from the nearest marker seen of one hand [m]; inf without any."""
+    markers = take.observed(label)
+    distance = np.full(take.labels.shape, np.inf)
+    for frame, points in enumerate(take.points):
+        there = np.isfinite(points[:, 0])
+        seen = markers[frame][np.isfinite(markers[frame, :, 0])]
+        if len(seen):
+            distance[frame, there] = cKDTree(seen).query(points[there])[0]
+    return distance
+
+
+class _Count:
+    """Labels clouds and keeps the score."""
+
+    def __init__(self, labeler: Labeler) -> None:
+        self.labeler = labeler
+        self.num_labels = len(labeler.marker_names)
+        classes = self.num_labels + 1
+        self.counts = LabelCounts(confusion=np.zeros((classes, classes), dtype=np.int64))
+        self.right_by_marker = np.zeros(self.num_labels)
+        self.confidences: list[NDArray[np.float64]] = [np.zeros(0)]
+        self.right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
+
+    def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
+        for labeling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):
+            self.right_by_marker += self.counts.add(labeling.labels, truth, self.num_labels)
+            self.confidences.append(labeling.confidence)
+            self.right.append(labeling.labels == truth)
+
+    def report(self) -> Report:
+        frames = self.counts.frames
+        confidences, right = np.concatenate(self.confidences), np.concatenate(self.right)
+        figures = {
+            **self.counts.figures(),
+            "calibration_error": expected_calibration_error(confidences, right),
+            "error_without_least_sure": error_without(confidences, right),
+        }
+        by_marker = self.right_by_marker / max(1, frames)
+        return Report(figures, by_marker, frames, self.counts.confusion, confidences, right)

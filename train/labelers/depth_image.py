@@ -1,0 +1,163 @@
+"""Clouds as sparse 52×52 depth images, the picture of the hand that the paper's network looks at.
+
+Han et al. 2018, section 3.1: an orthographic camera whose axis passes through the cloud's mean, zoomed so
+that every point keeps clear of a 10 % margin; the depth of a point is the brightness of its one pixel. A view
+frame has x to the right, y down and z away from the camera, all three in the same unit: half an image width.
+The images stretch depth to a fixed range; network outputs do not, so that distances in them are to scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from handsim.errors import HandSimError, choices
+from handsim.space.transforms import quaternion_matrix, random_quaternions
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Float32
+    from numpy.typing import NDArray
+
+IMAGE_SIZE = 52
+"""Width and height of a depth image [pixel]."""
+MARGIN = 0.1
+"""Empty border on each of the four sides [share of the image]."""
+NEAREST, FARTHEST = 0.1, 1.0
+"""Brightness of the nearest and of the farthest point; 0 is background."""
+SMALLEST_EXTENT = 0.01
+"""Clouds that reach less far from their mean are zoomed as if they did [m]; a lone point has no size."""
+FLAT = 1e-6
+"""Depth ranges below are no more than rounding, and their points get the middle brightness [m]."""
+NUM_CANDIDATES = 10
+"""Views among which `random10` chooses."""
+
+ViewPolicy = Literal["random", "random10"]
+
+
+@dataclass(frozen=True, slots=True)
+class ViewFrames:
+    """Where the cameras of a batch of depth images stood."""
+
+    rotations: Float[np.ndarray, "B 3 3"]
+    """From the input's frame into the camera's."""
+    centers: Float[np.ndarray, "B 3"]
+    """Mean of each cloud in the input's frame [m]."""
+    scales: Float[np.ndarray, "B"]
+    """View units in a meter [1/m], the same for x, y and z."""
+    nearest: Float[np.ndarray, "B"]
+    """Depth of each cloud's nearest point, of brightness 0.1, from the mean along the camera's axis [m]."""
+    depth_ranges: Float[np.ndarray, "B"]
+    """Depth between brightness 0.1 and 1.0 [m]; 0 where all points are equally deep."""
+
+    def normalize(self, positions: Float[np.ndarray, "B N 3"]) -> NDArray[np.float64]:
+        """Positions in the input's frame [m] as view units; NaN stays NaN."""
+        turned = (positions - self.centers[:, None]) @ self.rotations.swapaxes(1, 2)
+        normalized: NDArray[np.float64] = turned * self.scales[:, None, None]
+        return normalized
+
+    def restore(self, normalized: Float[np.ndarray, "B N 3"]) -> NDArray[np.float64]:
+        """Positions in the input's frame [m] of view units, such as the network puts out."""
+        turned = (normalized / self.scales[:, None, None]) @ self.rotations
+        positions: NDArray[np.float64] = turned + self.centers[:, None]
+        return positions
+
+
+def view_rotations(
+    points: Float[np.ndarray, "B N 3"],
+    present: Bool[np.ndarray, "B N"],
+    *,
+    policy: ViewPolicy,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Rotations (B, 3, 3) from the clouds' frame into the camera's.
+
+    Args:
+        points: Clouds [m]; what padding holds does not matter.
+        present: Which points are there.
+        policy: `random`, any view (training); `random10`, the one of ten, the same ten for all clouds, on
+            which the projected cloud spreads best (labeling): the smaller eigenvalue of its covariance is
+            largest. Of equals the larger eigenvalue counts, which is the order of determinants but tells
+            views of a straight line apart.
+        rng: Source of all randomness.
+
+    Raises:
+        HandSimError: The policy is unknown.
+    """
+    if policy not in get_args(ViewPolicy):
+        raise HandSimError(choices(policy, get_args(ViewPolicy), noun="view policy"))
+    batch = len(points)
+    if policy == "random":
+        return quaternion_matrix(random_quaternions(batch, rng=rng))
+    candidates = quaternion_matrix(random_quaternions(NUM_CANDIDATES, rng=rng))  # (V, 3, 3)
+    _, offsets = _center(points, present)
+    covariance = offsets.swapaxes(1, 2) @ offsets / np.maximum(present.sum(1), 1)[:, None, None]  # (B, 3, 3)
+    image_axes = candidates[:, :2]  # (V, 2, 3)
+    spreads = np.linalg.eigvalsh(image_axes @ covariance[:, None] @ image_axes.swapaxes(1, 2))  # ascending
+    rounding = 1e-12 * np.trace(covariance, axis1=1, axis2=2)[:, None]
+    smaller = np.where(spreads[..., 0] > rounding, spreads[..., 0], 0.0)
+    best = np.lexsort((spreads[..., 1], smaller), axis=-1)[:, -1]
+    return candidates[best]
+
+
+def depth_images(
+    points: Float[np.ndarray, "B N 3"],
+    present: Bool[np.ndarray, "B N"],
+    rotations: Float[np.ndarray, "B 3 3"],
+) -> tuple[Float32[np.ndarray, "B 52 52"], ViewFrames]:
+    """Clouds seen by orthographic cameras through their means.
+
+    The farther of two points in one pixel is lost. An empty cloud is an empty image.
+
+    Args:
+        points: Clouds [m]; what padding holds does not matter.
+        present: Which points are there.
+        rotations: From the clouds' frame into the camera's.
+
+    Returns:
+        Images (row, column), 0 for background and 0.1 (near) to 1.0 (far) for points; and the cameras.
+    """
+    frames = _view_frames(points, present, rotations)
+    safe = np.where(present[..., None], points, frames.centers[:, None])
+    view = frames.normalize(safe)  # (B, N, 3)
+    places = np.floor((view[..., :2] + 1.0) * (IMAGE_SIZE / 2)).astype(np.int64)
+    depth = view[..., 2] / frames.scales[:, None] - frames.nearest[:, None]
+    ranges = frames.depth_ranges[:, None]
+    share = np.where(ranges > 0, depth / np.where(ranges > 0, ranges, 1.0), 0.5).clip(0.0, 1.0)
+    brightness = NEAREST + (FARTHEST - NEAREST) * share
+    images = np.full((len(points), IMAGE_SIZE, IMAGE_SIZE), np.inf)
+    cloud, point = np.nonzero(present)
+    columns, rows = places[cloud, point].T
+    np.minimum.at(images, (cloud, rows, columns), brightness[cloud, point])
+    return np.where(np.isfinite(images), images, 0.0).astype(np.float32), frames
+
+
+def _view_frames(
+    points: NDArray[np.float64], present: NDArray[np.bool_], rotations: NDArray[np.float64]
+) -> ViewFrames:
+    """Cameras that see every present point."""
+    centers, offsets = _center(points, present)
+    turned = offsets @ rotations.swapaxes(1, 2)
+    reach = np.abs(turned[..., :2]).max(axis=(1, 2), initial=SMALLEST_EXTENT)
+    nearest = np.where(present, turned[..., 2], np.inf).min(axis=1, initial=np.inf)
+    farthest = np.where(present, turned[..., 2], -np.inf).max(axis=1, initial=-np.inf)
+    seen = present.any(axis=1)
+    nearest, farthest = np.where(seen, nearest, 0.0), np.where(seen, farthest, 0.0)
+    ranges = farthest - nearest
+    return ViewFrames(
+        rotations=rotations,
+        centers=centers,
+        scales=(1.0 - 2.0 * MARGIN) / reach,
+        nearest=nearest,
+        depth_ranges=np.where(ranges > FLAT, ranges, 0.0),
+    )
+
+
+def _center(
+    points: NDArray[np.float64], present: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means (B, 3) of the present points, and offsets (B, N, 3) from them, 0 for padding."""
+    known = np.where(present[..., None], points, 0.0)
+    centers = known.sum(axis=1) / np.maximum(present.sum(axis=1), 1)[:, None]
+    return centers, np.where(present[..., None], known - centers[:, None], 0.0)

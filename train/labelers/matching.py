@@ -1,0 +1,101 @@
+"""From scores to labels: one point a label, one label a point, with a way out for ghosts and occlusions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numba
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+GHOST = -1
+"""Label of a point that is no marker."""
+_WEIGHT: Final = 0.65
+"""What each reading counts: 0.5 if both said the same thing twice, 1 if they knew of different things."""
+_ROUNDS: Final = 20
+_NEVER: Final = 1e-30  # a probability whose logarithm is still a number
+_IMPOSSIBLE: Final = 1e6
+
+
+def match_scores(
+    point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
+) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
+    """Most likely one-to-one labeling of one cloud.
+
+    A point may stay a ghost and a label occluded, each at its own cost, so nothing is forced (the paper's
+    equation 1 with a reject option).
+
+    Args:
+        point_scores: Log-probability of each label, and last of ghost, for each point.
+        label_scores: Log-probability of each point, and last of occluded, for each label.
+
+    Returns:
+        Label of each point (`GHOST` where none), and its probability, see `pair_probabilities`.
+    """
+    probabilities = pair_probabilities(point_scores, label_scores)
+    labels = match_probabilities(probabilities)
+    return labels, probabilities[np.arange(len(labels)), labels]  # GHOST, -1, is the last column
+
+
+def pair_probabilities(
+    point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
+) -> Float[np.ndarray, "N+1 M+1"]:
+    """How likely each point has each label when no two may share one.
+
+    Both readings, each weighted, are brought together and balanced in turn until every point and every
+    label is spent once (Sinkhorn's iteration; ghosts and occluded labels are outside of it).
+
+    Args:
+        point_scores: Log-probability of each label, and last of ghost, for each point.
+        label_scores: Log-probability of each point, and last of occluded, for each label.
+
+    Returns:
+        Probabilities; the last column is "a ghost", the last row "occluded". Rows of points sum to 1.
+    """
+    probabilities: NDArray[np.float64] = _balance(
+        point_scores.astype(np.float64), label_scores.astype(np.float64), _WEIGHT, _ROUNDS
+    )
+    return probabilities
+
+
+def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:
+    """The one-to-one labeling with the greatest product of probabilities; `GHOST` where a point has none."""
+    count, num_labels = len(probabilities) - 1, probabilities.shape[1] - 1
+    costs = -np.log(np.maximum(probabilities, _NEVER))
+    # A pair settles a point and a label, which then is not occluded; each point has a way out of its own.
+    table = np.full((count, num_labels + count), _IMPOSSIBLE)
+    table[:, :num_labels] = 2.0 * costs[:count, :num_labels] - costs[count, :num_labels]
+    table.ravel()[num_labels :: num_labels + count + 1] = costs[:count, num_labels]
+    _, columns = linear_sum_assignment(table)
+    labels: NDArray[np.int64] = np.where(columns < num_labels, columns, GHOST)
+    return labels
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _balance(point_scores: Any, label_scores: Any, weight: float, rounds: int) -> Any:
+    count, num_labels = len(point_scores), len(label_scores)
+    plan = np.zeros((count + 1, num_labels + 1))
+    for i in range(count):
+        for j in range(num_labels):
+            plan[i, j] = np.exp(weight * (point_scores[i, j] + label_scores[j, i])) + _NEVER
+        plan[i, num_labels] = np.exp(2.0 * weight * point_scores[i, num_labels]) + _NEVER
+    for j in range(num_labels):
+        plan[count, j] = np.exp(2.0 * weight * label_scores[j, count]) + _NEVER
+    for _ in range(rounds):
+        for j in range(num_labels):
+            total = 0.0
+            for i in range(count + 1):
+                total += plan[i, j]
+            for i in range(count + 1):
+                plan[i, j] /= total
+        for i in range(count):
+            total = 0.0
+            for j in range(num_labels + 1):
+                total += plan[i, j]
+            for j in range(num_labels + 1):
+                plan[i, j] /= total
+    return plan

@@ -1,0 +1,108 @@
+"""The set labeler as one ONNX file: written with torch, run by onnxruntime without it."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.errors import HandSimError, WeightsError
+from handsim.files.atomic import atomic_write
+from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+    from torch import nn
+
+_NAMES: Final = "handsim.marker_names"  # key of the file's own words
+_INPUTS: Final = "points", "present"
+_OUTPUTS: Final = "point_scores", "label_scores"
+_OPSET: Final = 17
+_HINT: Final = "install it with: pip install 'handsim[onnx]'"
+
+
+class OnnxLabeler:
+    """The set labeler from an ONNX file, on one thread, as `handsim export` wrote it.
+
+    Args:
+        path: The .onnx file.
+
+    Raises:
+        HandSimError: onnxruntime is not installed.
+        WeightsError: The file is missing, damaged, or no labeler's.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise HandSimError(f"an .onnx labeler needs onnxruntime; {_HINT}") from error
+        if not path.is_file():
+            raise WeightsError(f"{path} is missing, expected an .onnx file that handsim export wrote")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1  # a frame is too small to share
+        options.log_severity_level = 4
+        options.add_session_config_entry("session.set_denormal_as_zero", "1")  # distance bumps underflow
+        try:
+            self._session = onnxruntime.InferenceSession(
+                path.read_bytes(), options, providers=["CPUExecutionProvider"]
+            )
+            names = json.loads(self._session.get_modelmeta().custom_metadata_map[_NAMES])
+        except Exception as error:  # onnxruntime's errors have no common class of their own
+            raise WeightsError(
+                f"{path} is damaged or no labeler's: expected what handsim export wrote"
+            ) from error
+        self.marker_names: tuple[str, ...] = tuple(names)
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
+        return label_in_batches(frames, self._label)
+
+    def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
+        scores = self._session.run(_OUTPUTS, dict(zip(_INPUTS, pad_clouds(clouds), strict=True)))
+        return label_by_scores(clouds, *scores)
+
+
+def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
+    """Write a trained set labeler as an ONNX file for clouds of any number and size.
+
+    Raises:
+        HandSimError: onnx is not installed, or the network is of another kind.
+    """
+    import torch
+
+    from train.labelers.set_network import SetLabeler
+
+    if not isinstance(network, SetLabeler):
+        raise HandSimError("only labelers of kind 'set' can be exported, this one is of kind 'cnn'")
+
+    try:
+        import onnx
+    except ImportError as error:
+        raise HandSimError(f"exporting needs onnx; {_HINT}") from error
+    example = torch.randn(2, 5, 3), torch.tensor([[True] * 5, [True] * 4 + [False]])
+    axes = {name: {0: "frames", 1: "points"} for name in _INPUTS}
+    axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
+    with atomic_write(path) as temporary, warnings.catch_warnings():
+        # The newer exporter brings a package more and fixes the sizes of what is expanded.
+        warnings.simplefilter("ignore")
+        torch.onnx.export(
+            network.eval(),
+            example,
+            str(temporary),
+            input_names=list(_INPUTS),
+            output_names=list(_OUTPUTS),
+            dynamic_axes=axes,
+            opset_version=_OPSET,
+            dynamo=False,
+        )
+        model = onnx.load(str(temporary))
+        onnx.helper.set_model_props(model, {_NAMES: json.dumps(list(marker_names))})
+        onnx.checker.check_model(model, full_check=True)
+        onnx.save(model, str(temporary))

@@ -1,0 +1,132 @@
+"""What every labeler promises: points of a frame in, a label and a confidence a point out. Free of torch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from handsim.errors import ArgumentError
+from train.labelers.matching import match_scores
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Float32, Int
+    from numpy.typing import NDArray
+
+MOST_POINTS: Final = 512
+FARTHEST: Final = 30.0
+"""Median span of clouds that are in meters, at most [m]; a hand in millimeters would span more."""
+_ENOUGH: Final = 5  # points that tell the unit; fewer may all be strays
+_BATCH: Final = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Labeling:
+    """Labels of one frame's points."""
+
+    labels: Int[np.ndarray, "N"]
+    """Place of each point's marker in the layout, -1 for a ghost; no marker twice."""
+    confidence: Float[np.ndarray, "N"]
+    """How sure each label is, 0 to 1."""
+
+
+class Labeler(Protocol):
+    """Names the points of a frame, each frame on its own."""
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers that it knows, in label order."""
+        ...
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points [m] of every frame; a frame may be empty.
+
+        Raises:
+            ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
+        """
+        ...
+
+
+def label_in_batches(
+    frames: Sequence[Float[np.ndarray, "N 3"]],
+    label: Callable[[list[NDArray[np.float64]]], list[Labeling]],
+) -> list[Labeling]:
+    """Check frames and have them labeled, those of like size together, so that padding stays small.
+
+    Args:
+        frames: Points of each frame [m].
+        label: Labels a batch of frames of which the last holds the most points, and at least one.
+
+    Returns:
+        Labelings in the order of the frames.
+
+    Raises:
+        ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
+    """
+    clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
+    check_unit(clouds)
+    order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
+    results = [Labeling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
+    for first in range(0, len(order), _BATCH):
+        chosen = order[first : first + _BATCH]
+        if len(clouds[chosen[-1]]):
+            labelings = label([clouds[number] for number in chosen])
+            for number, labeling in zip(chosen, labelings, strict=True):
+                results[number] = labeling
+    return results
+
+
+def pad_clouds(
+    clouds: Sequence[NDArray[np.float64]],
+) -> tuple[Float32[np.ndarray, "B N 3"], Bool[np.ndarray, "B N"]]:
+    """Clouds moved to their centers and padded to one length, and which points are there."""
+    longest = max(len(cloud) for cloud in clouds)
+    points = np.zeros((len(clouds), longest, 3), dtype=np.float32)
+    present = np.zeros((len(clouds), longest), dtype=bool)
+    for row, cloud in enumerate(clouds):
+        if len(cloud):
+            points[row, : len(cloud)] = cloud - cloud.mean(axis=0)  # before float32 cuts far-off places
+        present[row, : len(cloud)] = True
+    return points, present
+
+
+def label_by_scores(
+    clouds: Sequence[NDArray[np.float64]],
+    point_scores: Float[np.ndarray, "B N M+1"],
+    label_scores: Float[np.ndarray, "B M N+1"],
+) -> list[Labeling]:
+    """Match the scores of padded clouds, see `train.labelers.matching.match_scores`."""
+    longest = point_scores.shape[1]
+    labelings = []
+    for cloud, by_point, by_label in zip(clouds, point_scores, label_scores, strict=True):
+        count = len(cloud)
+        labelings.append(Labeling(*match_scores(by_point[:count], by_label[:, [*range(count), longest]])))
+    return labelings
+
+
+def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.float64]:
+    cloud = np.asarray(points, dtype=np.float64)
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise ArgumentError(f"frame {frame} has shape {cloud.shape}, expected (N, 3)")
+    if not np.isfinite(cloud).all():
+        raise ArgumentError(f"frame {frame} holds NaN or infinite points; leave missing points out")
+    if len(cloud) > MOST_POINTS:
+        raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MOST_POINTS}")
+    return cloud
+
+
+def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> None:
+    """Millimeters are told, not guessed at; the median, because strays of a real system lie anywhere.
+
+    Raises:
+        ArgumentError: Most frames span more than a room does.
+    """
+    spans = [
+        float((cloud.max(axis=0) - cloud.min(axis=0)).max()) for cloud in clouds if len(cloud) >= _ENOUGH
+    ]
+    if max(spans, default=0.0) > FARTHEST and (span := float(np.median(spans))) > FARTHEST:
+        raise ArgumentError(
+            f"the points of a frame span {span:.0f} m, expected a hand in meters; millimeters?"
+        )

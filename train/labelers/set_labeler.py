@@ -1,0 +1,49 @@
+"""The set labeler with weights, and what it learns from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from train.data.batches import Batch
+from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+from train.labelers.set_network import SetLabeler, labeling_loss
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+
+class TrainedSetLabeler:
+    """The set labeler with weights, ready to use.
+
+    Args:
+        network: Trained network.
+        marker_names: Markers in label order.
+    """
+
+    def __init__(self, network: SetLabeler, marker_names: tuple[str, ...]) -> None:
+        self.network = network.eval()
+        self.marker_names = marker_names
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
+        return label_in_batches(frames, self._label)
+
+    @torch.inference_mode()
+    def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
+        points, present = pad_clouds(clouds)
+        scores = self.network(torch.from_numpy(points), torch.from_numpy(present))
+        return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy())
+
+
+def set_loss(network: torch.nn.Module, batch: Batch, device: torch.device) -> torch.Tensor:
+    """Loss of one batch, see `train.labelers.set_network.labeling_loss`."""
+    cloud = batch.cloud
+    points = torch.from_numpy(cloud.points.astype(np.float32)).to(device)
+    present, truth = torch.from_numpy(cloud.present).to(device), torch.from_numpy(cloud.truth).to(device)
+    return labeling_loss(network(points, present), truth, present)

@@ -1,0 +1,127 @@
+"""The default labeler: gated messages between points, from nothing but the distances between them.
+
+The cloud enters as pairwise distances, so turning, moving or mirroring it changes nothing: one network labels
+left and right hands. Messages are weighted by sigmoid gates of distance and of both ends (no softmax over
+points, unlike self-attention), so they add up evidence and can count neighbors. Two readings are trained
+together: which label, or ghost, a point is; and which point, or none, a label has.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from train.config import SetLabelerConfig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+
+class LabelScores(NamedTuple):
+    """Log-probabilities of both readings."""
+
+    points: Float[Tensor, "B N M+1"]
+    """Each point: its label, or ghost (last)."""
+    labels: Float[Tensor, "B M N+1"]
+    """Each label: its point, or occluded (last)."""
+
+
+class SetLabeler(nn.Module):
+    """Scores of every point against every label, for clouds of any size."""
+
+    centers: Tensor
+
+    def __init__(self, config: SetLabelerConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, bumps = config.width, config.num_distances
+        self.register_buffer("centers", torch.linspace(0.0, config.reach, bumps), persistent=False)
+        self.embed = nn.Sequential(nn.Linear(bumps + 1, width), nn.SiLU(), nn.Linear(width, width))
+        self.rounds = nn.ModuleList(MessageRound(width, config.gates, bumps) for _ in range(config.depth))
+        self.norm = nn.LayerNorm(width)
+        self.to_scores = nn.Linear(width, config.num_labels + 1)
+        self.to_occluded = nn.Sequential(
+            nn.Linear(width, width), nn.SiLU(), nn.Linear(width, config.num_labels)
+        )
+
+    def forward(self, points: Float[Tensor, "B N 3"], present: Bool[Tensor, "B N"]) -> LabelScores:
+        """Score clouds [m], padded where not `present`."""
+        batch, count, _ = points.shape
+        distances = (points[:, :, None] - points[:, None]).square().sum(-1).add(1e-12).sqrt()  # (B, N, N)
+        spacing = self.config.reach / (self.config.num_distances - 1)
+        offsets = distances[:, None] - self.centers[:, None, None]
+        bumps = torch.exp(offsets.square() * (-0.5 / spacing**2))  # (B, K, N, N)
+        there = present[..., None].to(points.dtype)  # (B, N, 1)
+        profile = (bumps @ there[:, None])[..., 0].transpose(1, 2)  # (B, N, K)
+        about_one = there.sum(1, keepdim=True) / 20.0
+        features = self.embed(torch.cat([profile, about_one.expand(-1, count, 1)], dim=-1))  # (B, N, W)
+        bumps = bumps.reshape(batch, self.config.num_distances, count * count)
+        for message_round in self.rounds:
+            features = message_round(features, bumps, there)
+        features = self.norm(features)
+        scores = self.to_scores(features)
+        pooled = (features * there).sum(1) / 20.0
+        by_label = scores[..., :-1].masked_fill(~present[..., None], -1e4).transpose(1, 2)  # (B, M, N)
+        occluded = self.to_occluded(pooled)[..., None]
+        return LabelScores(
+            torch.log_softmax(scores, dim=-1),
+            torch.log_softmax(torch.cat([by_label, occluded], dim=-1), dim=-1),
+        )
+
+
+class MessageRound(nn.Module):
+    """One round: gather gated messages from all points, then think about them."""
+
+    def __init__(self, width: int, gates: int, bumps: int) -> None:
+        super().__init__()
+        self.gates = gates
+        self.norm = nn.LayerNorm(width)
+        self.values = nn.Linear(width, width)
+        self.ends = nn.Linear(width, 2 * gates)
+        self.distance_gate = nn.Linear(bumps, gates)
+        self.mix = nn.Linear(width, width)
+        self.think = nn.Sequential(
+            nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width)
+        )
+
+    def forward(
+        self,
+        features: Float[Tensor, "B N W"],
+        bumps: Float[Tensor, "B K N*N"],
+        there: Float[Tensor, "B N 1"],
+    ) -> Float[Tensor, "B N W"]:
+        """Features after one exchange; `there` is 0 for padding, which sends nothing."""
+        batch, count, width = features.shape
+        normed = self.norm(features)
+        receiver, sender = self.ends(normed).transpose(1, 2).chunk(2, dim=1)  # (B, G, N) each
+        # Gates before points: all that is as large as the pairs then lies in memory as bmm wants it.
+        near = torch.bmm(self.distance_gate.weight.expand(batch, -1, -1), bumps).view(batch, -1, count, count)
+        biased = receiver + self.distance_gate.bias[:, None]
+        gate = torch.sigmoid(near + biased[..., None] + sender[:, :, None])  # (B, G, N, N)
+        values = (self.values(normed) * there).view(batch, count, self.gates, -1).transpose(1, 2)
+        gathered = (gate @ values).transpose(1, 2).reshape(batch, count, width) / 5.0
+        features = features + self.mix(gathered)
+        thought: Tensor = self.think(features)
+        return features + thought
+
+
+def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor) -> Tensor:
+    """Cross-entropy of both readings.
+
+    Args:
+        scores: From `SetLabeler`.
+        truth: Label of each point (B, N), -1 for a ghost; what padding holds does not matter.
+        present: Which points are there (B, N).
+    """
+    num_labels = scores.points.shape[-1] - 1
+    of_point = torch.where(truth < 0, num_labels, truth)
+    point_loss = -scores.points.gather(-1, of_point[..., None])[..., 0][present].mean()
+    batch, count = truth.shape
+    of_label = truth.new_full((batch, num_labels + 1), count)
+    places = torch.arange(count).expand(batch, -1).to(truth.device)
+    known = torch.where(present, of_point, num_labels)
+    of_label = of_label.scatter(1, known, places)[:, :num_labels]
+    label_loss = -scores.labels.gather(-1, of_label[..., None]).mean()
+    return point_loss + label_loss

@@ -1,0 +1,109 @@
+"""Trained labelers as they are kept: safetensors for numbers, JSON for words, or one ONNX file."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from gloves.layout import load_layout
+from handsim.errors import WeightsError, choices
+from handsim.files.atomic import atomic_write
+from handsim.files.json_files import save_json
+from train.config import Kind, SetLabelerConfig
+from train.labelers.protocol import Labeler
+
+if TYPE_CHECKING:
+    from torch import nn
+
+WEIGHTS: Final = "labeler.safetensors"
+CARD: Final = "labeler.json"
+_SHIPPED: Final = Path(__file__).parents[1] / "weights"
+
+
+def shipped_labelers() -> tuple[str, ...]:
+    """Gloves whose trained labeler comes with the package."""
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.safetensors")))
+
+
+def load_labeler(name_or_path: str | Path) -> Labeler:
+    """The shipped labeler of a glove, one that `handsim train` left in a folder, or an exported .onnx file.
+
+    Only the first two need torch.
+
+    Raises:
+        WeightsError: Unknown, damaged, or not a labeler's weights.
+    """
+    if Path(name_or_path).suffix.lower() == ".onnx":
+        from train.labelers.onnx_labeler import OnnxLabeler
+
+        return OnnxLabeler(Path(name_or_path))
+    from train.labelers.kinds import labeler_of
+
+    network, card = load_network(name_or_path)
+    return labeler_of(network, tuple(card["marker_names"]))
+
+
+def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
+    """A trained network and its model card.
+
+    Raises:
+        WeightsError: Unknown, damaged, or not a labeler's weights.
+    """
+    if str(name_or_path) in shipped_labelers():
+        weights, card = _SHIPPED / f"{name_or_path}.safetensors", _SHIPPED / f"{name_or_path}.json"
+    else:
+        weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
+        if not weights.is_file() or not card.is_file():
+            unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler")
+            raise WeightsError(f"{unknown}, a folder that handsim train wrote, or an .onnx file")
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    from train.labelers.kinds import new_network
+
+    try:
+        content = json.loads(card.read_text(encoding="utf-8"))
+        names = tuple(content["marker_names"])
+        network = new_network(content.get("labeler", "set"), SetLabelerConfig(**content["network"]))
+        network.load_state_dict(load_file(weights))
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise WeightsError(f"{weights} is damaged or no labeler's: {str(error).splitlines()[0]}") from error
+    if len(names) != content["network"]["num_labels"]:
+        raise WeightsError(f"{card} names {len(names)} markers for {content['network']['num_labels']} labels")
+    return network, content
+
+
+def save_network(
+    folder: Path, kind: Kind, network: nn.Module, config: SetLabelerConfig, card: dict[str, Any]
+) -> None:
+    """Write weights and model card; `card` holds at least `marker_names`."""
+    from safetensors.torch import save_file
+
+    tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+    with atomic_write(folder / WEIGHTS) as temporary:
+        save_file(tensors, temporary)
+    save_json(folder / CARD, {"labeler": kind, "network": dataclasses.asdict(config), **card})
+
+
+def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
+    """The labeler asked for, or the glove's shipped one; checked against the glove's markers.
+
+    Raises:
+        LayoutError: The glove is unknown.
+        WeightsError: The labeler is unknown, damaged, or knows other markers.
+    """
+    layout = load_layout(glove)
+    if labeler is None and glove not in shipped_labelers():
+        raise WeightsError(
+            f"no labeler comes with glove '{glove}' (shipped: {', '.join(shipped_labelers())}); train one "
+            f"with handsim generate and handsim train, and give its folder as --labeler"
+        )
+    found = load_labeler(glove if labeler is None else labeler)
+    if found.marker_names != layout.names:
+        raise WeightsError(
+            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{glove}' has "
+            f"{', '.join(layout.names)}"
+        )
+    return found

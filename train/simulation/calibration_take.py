@@ -1,0 +1,126 @@
+"""The capture that a user makes to be calibrated, simulated with its truth: free motion, then touches."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from gloves.fit import GlovedHand, GloveFit
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import NUM_JOINTS
+from handsim.space.cameras import load_rig
+from poses.motion.minimum_jerk import MotionConfig
+from poses.motion.motions import angles_through, count_frames, sample_motion
+from poses.motion.rest_paths import can_be_left
+from poses.motion.wrist_paths import WristConfig, wrist_path
+from poses.shapes.library import gesture
+from poses.shapes.touch import FINGERS, touching_angles
+from poses.shapes.validity import make_valid
+from train.simulation.room import Room, RoomConfig
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_PLACES: Final = (0.22, -0.22)  # where each hand is [m], so that hands do not meet
+_VOLUME: Final = 0.1
+_MOST_DRAWS: Final = 20
+_STARTS: Final = ("pinch_pad", "pinch_tip")
+_JITTER: Final = np.deg2rad(8.0)
+_TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
+_FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationTakeConfig:
+    """What the user does and who looks on."""
+
+    free: float = 40.0
+    """Free motion [s]."""
+    rounds: int = 3
+    """How often the thumb goes to each of the other fingertips in turn."""
+    rig: str = "figure5"
+    """Camera rig: a shipped name or the path of a .toml file."""
+    turning: float = 0.7
+    """Standard deviation of the wrist's turns about each axis [rad]."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.free < np.inf:
+            raise ArgumentError(f"free is {self.free:g} s, expected a positive time")
+        if self.rounds < 0:
+            raise ArgumentError(f"rounds is {self.rounds}, expected 0 or more")
+
+
+def simulate_calibration(
+    hands: tuple[GloveFit, ...],
+    config: CalibrationTakeConfig | None = None,
+    *,
+    rng: np.random.Generator,
+) -> Take:
+    """What cameras see of a user who makes a calibration capture with one hand or both.
+
+    Args:
+        hands: One or two hands in their gloves.
+        config: What the user does.
+        rng: Source of all randomness.
+
+    Raises:
+        ArgumentError: There are no hands or more than two, or a hand cannot move or touch.
+    """
+    config = config or CalibrationTakeConfig()
+    if not 1 <= len(hands) <= len(_PLACES):
+        raise ArgumentError(f"{len(hands)} hands, expected one or two")
+    angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
+    frames = min(len(part) for part in angles)
+    moving = []
+    for fit, part, aside in zip(hands, angles, _PLACES, strict=False):
+        where = WristConfig(center=(aside, 0.0, 1.1), volume=_VOLUME, turning=config.turning)
+        position, quaternion = wrist_path(frames, _FREE.rate, where, rng=rng)
+        qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
+        moving.append(GlovedHand(fit, qpos))
+    settings = {"kind": "calibration", **dataclasses.asdict(config)}
+    room = Room(tuple(moving), None, load_rig(config.rig), RoomConfig(), rate=_FREE.rate)
+    return room.take(settings, rng=rng)
+
+
+def calibration_angles(
+    model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Hinge angles (T, 20) [rad]: rounds of touches, as far as the thumb reaches, then free motion.
+
+    Raises:
+        ArgumentError: This hand cannot move.
+    """
+    touches = [pose for _ in range(config.rounds) for pose in _round(model, rng)]
+    free = _free_motion(model, config.free, rng)
+    if not touches:
+        return free
+    poses = np.stack([*touches, free[0]])
+    return np.concatenate([poses[:1], angles_through(model, poses, _TOUCHING, rng=rng), free])
+
+
+def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Free motion from a pose that can be reached from everywhere."""
+    for _ in range(_MOST_DRAWS):
+        free = sample_motion(model, seconds, _FREE, rng=rng).qpos[: count_frames(seconds, _FREE), 7:]
+        if can_be_left(model, free[:1]).all():
+            return free
+    raise ArgumentError("this hand finds no way from its touches to a free motion")
+
+
+def _round(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+    """The thumb at each fingertip that it reaches, from a start that differs every time."""
+    poses = []
+    for finger in FINGERS:
+        pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
+        start = make_valid(model, (pinch + rng.normal(scale=_JITTER, size=NUM_JOINTS))[None])
+        with contextlib.suppress(ArgumentError):  # another finger, or the next round
+            touch = touching_angles(model, finger, start)
+            if can_be_left(model, touch[None]).all():
+                poses.append(touch)
+    return poses
