@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from machine import describe
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
 from handsim.hand.model import HandModel, join_qpos
@@ -64,7 +64,7 @@ def main() -> None:
         quaternion = random_quaternions(CHECKED, rng=rng)
         qpos = join_qpos(angles[:CHECKED], position=position, quaternion=quaternion)
         bones = model.forward_kinematics(qpos)
-        markers, _ = attach(layout, model).markers(model, bones)
+        markers, _ = attach_markers(layout, model).markers(model, bones)
         free = free_rays(markers, cameras, model.capsules.posed(bones), model.capsules.radii)
         data = mujoco.MjData(model.mj_model)
         for frame, values in enumerate(qpos):

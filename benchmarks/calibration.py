@@ -31,7 +31,7 @@ import numpy as np
 from machine import describe
 from people import right_hands
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take
@@ -77,7 +77,7 @@ def draw_user(
     grown = 1 if number % 4 < 2 else -1
     shape = draw_shape(sizes[index], 1.0 + OFF * grown, rng)
     model = HandModel(shape)
-    worn = slip(attach(layout, model), shape, SLIP, LIFT, rng=rng)
+    worn = slip(attach_markers(layout, model), shape, SLIP, LIFT, rng=rng)
     starts = (nominal_fit(layout, size, side) for size in (sizes[index], sizes[index - grown]))
     return GloveFit(model, worn).with_side(side), *starts
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from machine import describe
 
-from gloves.attach import wear
+from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.ghosts import sample_ghosts
 from gloves.optics.reconstruction import reconstruct

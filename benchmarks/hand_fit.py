@@ -19,7 +19,7 @@ import numpy as np
 from machine import describe
 from people import right_hands
 
-from gloves.attach import Attachment, attach
+from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.model import HandModel
@@ -41,7 +41,7 @@ class Person:
     def __init__(self, shape: HandShape, layout: MarkerLayout) -> None:
         self.shape, self.layout = shape, layout
         model = HandModel(shape)
-        self.glove = attach(layout, model)
+        self.glove = attach_markers(layout, model)
         self.bones = self.glove.bone_indices[:, 0]
         inverse = np.linalg.inv(model.rest_transforms)[self.bones]
         self.local = np.einsum("mij,mj->mi", inverse[:, :3, :3], self.glove.points) + inverse[:, :3, 3]

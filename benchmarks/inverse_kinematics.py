@@ -22,7 +22,7 @@ import numpy as np
 from machine import describe
 from scipy.optimize import least_squares
 
-from gloves.attach import Attachment, attach
+from gloves.attachment import Attachment, attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
@@ -194,7 +194,7 @@ def tell_cold_starts(layout: str, hands: int, noise: float, rng: np.random.Gener
     excess, times = [], []
     for number in range(hands):
         model = somebody(rng, number)
-        glove, count = attach(load_layout(layout), model), 400
+        glove, count = attach_markers(load_layout(layout), model), 400
         qpos = join_qpos(
             sample_valid_angles(model, count, rng=rng),
             position=rng.normal(size=(count, 3)),
@@ -249,7 +249,7 @@ def main() -> None:
     rng = np.random.default_rng(arguments.seed)
     model = HandModel.named("M")
     qpos = sample_motion(model, arguments.frames / 120.0, rng=rng).qpos
-    skin = attach(load_layout("dense19"), model)
+    skin = attach_markers(load_layout("dense19"), model)
     bones, weights = skin.bone_indices.copy(), np.zeros_like(skin.bone_weights)
     weights[np.arange(len(weights)), skin.bone_weights.argmax(axis=1)] = 1.0
     bound = dataclasses.replace(skin, bone_indices=bones, bone_weights=weights)

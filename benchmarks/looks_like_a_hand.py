@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gloves.fit import GlovedHand, fit_glove
+from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
@@ -139,7 +139,7 @@ def photograph(
 ) -> RenderedFrame:
     """A picture of the hand, or of what is behind it."""
     qpos = case.qpos[None] if shown else np.full((1, len(case.qpos)), np.nan)
-    hand = GlovedHand(fit_glove(load_layout("dense19"), case.model), qpos)
+    hand = GlovedHand(attach(load_layout("dense19"), case.model), qpos)
     nothing = np.empty((1, 0, 3)), np.empty((1, 0), dtype=np.int64), ()
     people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
     studio = Studio(ShownTake(60.0, np.zeros(1), (hand,), (), *nothing), people, [], ("rgb", "ids", "depth"))

@@ -18,7 +18,7 @@ import torch
 from machine import describe
 from people import right_hands
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import rigid_fit
@@ -58,7 +58,7 @@ def main() -> None:
     rng = np.random.default_rng(arguments.seed)
     layout, model = load_layout("dense19"), HandModel.named("M")
     qpos = join_qpos(sample_valid_angles(model, arguments.poses, rng=rng))
-    poses, _ = attach(layout, model).markers(model, model.forward_kinematics(qpos))
+    poses, _ = attach_markers(layout, model).markers(model, model.forward_kinematics(qpos))
     first, second = layout.names.index("BackHand1"), layout.names.index("IndexMCP")
 
     def size(markers: np.ndarray) -> float:

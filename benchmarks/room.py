@@ -21,7 +21,7 @@ import numba
 import numpy as np
 from machine import describe
 
-from gloves.attach import wear
+from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_mesh, hand_tree
 from gloves.optics.reconstruction import OpticsConfig, reconstruct

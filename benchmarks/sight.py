@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 from machine import describe
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh, hand_tree
 from gloves.optics.visibility import MAX_FACING, free_rays, visible_cameras
@@ -52,7 +52,7 @@ def make_scene(model: HandModel, poses: int, center: np.ndarray, rng: np.random.
         quaternion=random_quaternions(poses, rng=rng),
     )
     bones = model.forward_kinematics(qpos)
-    markers, normals = attach(load_layout("dense19"), model).markers(model, bones)
+    markers, normals = attach_markers(load_layout("dense19"), model).markers(model, bones)
     return Scene(model, qpos, model.skin(qpos), markers, normals, model.capsules.posed(bones))
 
 

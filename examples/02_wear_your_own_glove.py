@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout, MarkerPlace
 from gloves.optics.visibility import visible_cameras
 from handsim.hand.model import HandModel, join_qpos
@@ -32,7 +32,7 @@ def main() -> None:
     names = ("spread", "relaxed", "fist")
     qpos = join_qpos(np.stack([gesture(name) for name in names]), position=[0.0, 0.0, 1.1])
     bones = model.forward_kinematics(qpos)
-    markers, normals = attach(layout, model).markers(model, bones)  # (3, 8, 3) each
+    markers, normals = attach_markers(layout, model).markers(model, bones)  # (3, 8, 3) each
     seen = visible_cameras(
         markers, normals, named_rig("figure5"), model.capsules.posed(bones), model.capsules.radii
     )  # (3, 8, 16)

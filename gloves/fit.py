@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gloves.attach import Attachment, attach
+from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
@@ -84,15 +84,15 @@ class GlovedHand:
         return self.fit.layout
 
 
-def fit_glove(layout: MarkerLayout, model: HandModel) -> GloveFit:
+def attach(layout: MarkerLayout, model: HandModel) -> GloveFit:
     """Put a glove on a hand as designed.
 
     Raises:
         LayoutError: A marker finds no skin; the sentence names the marker.
     """
-    return GloveFit(model, attach(layout, model))
+    return GloveFit(model, attach_markers(layout, model))
 
 
 def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
     """A hand of one of the five sizes (XS to XL), its glove put on as designed."""
-    return fit_glove(layout, HandModel.named(size, side=side))
+    return attach(layout, HandModel.named(size, side=side))

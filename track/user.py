@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from gloves.attach import Attachment
+from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, stored_layout
 from handsim._checks import check_array

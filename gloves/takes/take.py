@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gloves.fit import GlovedHand, fit_glove
+from gloves.fit import GlovedHand, attach
 from gloves.layout import stored_layout
 from gloves.takes.archives import check_shapes, read_archive, write_archive
 from handsim.hand.model import HandModel
@@ -113,7 +113,7 @@ def load_take(path: Path) -> Take:
 def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
     stored = zip(header["layouts"], arrays["hands"], arrays["qpos"], strict=True)
     hands = tuple(
-        GlovedHand(fit_glove(stored_layout(layout), HandModel(unpack_hand(record))), qpos)
+        GlovedHand(attach(stored_layout(layout), HandModel(unpack_hand(record))), qpos)
         for layout, record, qpos in stored
     )
     body = header["body"] and HeldBody(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gloves.attach import Attachment
+from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import check_shapes, read_archive, write_archive

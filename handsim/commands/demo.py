@@ -273,7 +273,7 @@ def _telling_frame(chain: _Chain) -> int:
 
 
 def _fit(model: HandModel) -> Any:
-    return load("gloves.fit:fit_glove")(load("gloves.layout:load_layout")(GLOVE), model)
+    return load("gloves.fit:attach")(load("gloves.layout:load_layout")(GLOVE), model)
 
 
 def _figures_table(chain: _Chain) -> list[list[str]]:

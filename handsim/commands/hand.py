@@ -42,7 +42,7 @@ def hand(
     sites: tuple[Site, ...] = ()
     if glove is not None:
         layout = load("gloves.layout:load_layout")(glove)
-        sites = load("gloves.attach:attach")(layout, model).sites(model)
+        sites = load("gloves.attachment:attach_markers")(layout, model).sites(model)
     write_model(out, model, sites=sites)
     console = Console()
     console.print(

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from gloves.attach import Attachment, attach
+from gloves.attachment import Attachment, attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
@@ -22,7 +22,7 @@ def model() -> HandModel:
 
 @pytest.fixture(scope="session")
 def attachment(model: HandModel) -> Attachment:
-    return attach(load_layout("dense19"), model)
+    return attach_markers(load_layout("dense19"), model)
 
 
 MakeFrame = Callable[..., RenderedFrame]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from gloves.attach import Attachment
+from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS

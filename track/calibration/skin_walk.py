@@ -2,7 +2,7 @@
 
 The mesh is the hand's own, subdivided once more (Han et al. 2018, section 4.5), always a right hand's. A
 place is a triangle, three barycentric coordinates and a height along the normal between the corners' normals,
-as `gloves.attach` measures a marker's radius; so a place goes with the skin when the shape changes.
+as `gloves.attachment` measures a marker's radius; so a place goes with the skin when the shape changes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from scipy import sparse
 
-from gloves.attach import Attachment
+from gloves.attachment import Attachment
 from gloves.layout import MarkerLayout
 from handsim.hand.shape import HandShape, named_shape
 from handsim.hand.skin.subdivision import catmull_clark

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from gloves.attach import Attachment
+from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
@@ -66,7 +66,7 @@ class SideTeller:
 def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> NDArray[np.float64]:
     hand = HandModel.named(size)
     qpos = join_qpos(sample_valid_angles(hand, _POSES, rng=rng))
-    markers, _ = attach(layout, hand).markers(hand, hand.forward_kinematics(qpos))
+    markers, _ = attach_markers(layout, hand).markers(hand, hand.forward_kinematics(qpos))
     return markers
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONES, PALM
@@ -57,7 +57,7 @@ def flat_hand(layout: MarkerLayout) -> Flat:
         LayoutError: A marker finds no skin.
     """
     model = HandModel.named("M")
-    worn = attach(layout, model)
+    worn = attach_markers(layout, model)
     starts = model.rest_transforms[:, :3, 3]
     ends = starts + model.skeleton.lengths[:, None] * model.rest_transforms[:, :3, 0]
     bones = [(starts[number], ends[number]) for number in range(1, len(BONES))]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from gloves.attach import Attachment
+from gloves.attachment import Attachment
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
 from gloves.optics.mesh_sight import MeshTree, clear_of_body
 from gloves.optics.reconstruction import OpticsConfig, reconstruct

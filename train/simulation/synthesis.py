@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.attach import attach, wear
+from gloves.attachment import attach_markers, wear
 from gloves.layout import MarkerLayout, load_layout
 from gloves.optics.ghosts import GhostConfig
 from gloves.optics.reconstruction import OpticsConfig
@@ -108,7 +108,9 @@ def generate_dataset(
         raise DatasetError(
             f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
-    attach(layout, HandModel.named("M"))  # a glove that does not fit is told before anything is written
+    attach_markers(
+        layout, HandModel.named("M")
+    )  # a glove that does not fit is told before anything is written
     settings = {**dataclasses.asdict(config), "layout": dataclasses.asdict(layout)}
     if config.rig not in list_rigs():  # a file may change
         settings["cameras"] = {

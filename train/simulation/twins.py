@@ -12,7 +12,7 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from gloves.attach import wear
+from gloves.attachment import wear
 from gloves.captures.gaps import GapCounts
 from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout, load_layout

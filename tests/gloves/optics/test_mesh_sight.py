@@ -10,7 +10,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import MeshTree, clear_of_body, clear_of_mesh, hand_tree
 from gloves.optics.visibility import free_rays
@@ -43,7 +43,7 @@ def scene(request, rng):
         position=np.array([0.0, 0.0, 1.1]) + rng.uniform(-0.3, 0.3, (FRAMES, 3)),
         quaternion=random_quaternions(FRAMES, rng=rng),
     )
-    markers, _ = attach(load_layout("dense19"), model).markers(model, model.forward_kinematics(qpos))
+    markers, _ = attach_markers(load_layout("dense19"), model).markers(model, model.forward_kinematics(qpos))
     return model, qpos, model.skin(qpos), markers, named_rig("figure5").positions
 
 

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays, pack_cameras, unpack_cameras, visible_cameras
 from handsim.errors import ArgumentError
@@ -26,7 +26,7 @@ def scene(request, rng):
         quaternion=random_quaternions(60, rng=rng),
     )
     bones = model.forward_kinematics(qpos)
-    markers, normals = attach(load_layout("dense19"), model).markers(model, bones)
+    markers, normals = attach_markers(load_layout("dense19"), model).markers(model, bones)
     return model, qpos, markers, normals, model.capsules.posed(bones)
 
 

@@ -10,7 +10,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from gloves.fit import GlovedHand, fit_glove, nominal_fit
+from gloves.fit import GlovedHand, attach, nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.take import SCHEMA, SUFFIX, HeldBody, Take, load_take, save_take
 from handsim.errors import CaptureError
@@ -30,7 +30,7 @@ def take(rng) -> Take:
     layout = load_layout("dense19")
     model = HandModel(sample_shape(side="right", rng=rng))
     hands = (
-        GlovedHand(fit_glove(layout, model), rng.normal(size=(FRAMES, 27))),
+        GlovedHand(attach(layout, model), rng.normal(size=(FRAMES, 27))),
         GlovedHand(nominal_fit(layout, "XS", "left"), rng.normal(size=(FRAMES, 27))),
     )
     body = HeldBody("wand", tuple("abcdef"), np.tile(np.eye(4), (FRAMES, 1, 1)))

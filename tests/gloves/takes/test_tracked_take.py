@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GlovedHand
 from gloves.layout import load_layout
 from gloves.takes.archives import KINDS
@@ -38,7 +38,7 @@ def take(rng) -> TrackedTake:
     hands = []
     for side in ("left", "right"):
         shape = sample_shape(side=side, rng=rng)
-        hands.append(GloveFit(shape, attach(load_layout("dense19"), HandModel(shape))))
+        hands.append(GloveFit(shape, attach_markers(load_layout("dense19"), HandModel(shape))))
     status = rng.integers(len(STATUSES), size=(FRAMES, 2)).astype(np.int8)
     status[[0, 4]], status[5] = TRACKED, LOST
     qpos = rng.normal(size=(FRAMES, 2, 27))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.app.cli import main
 from handsim.hand.model import HandModel
@@ -30,7 +30,7 @@ def test_model_opens_and_moves_as_ours_does(side: str, tmp_path: Path, rng: np.r
     mujoco.mj_resetData(opened, data)
     mujoco.mj_kinematics(opened, data)
     sites = np.stack([data.site(name).xpos for name in layout.names])
-    np.testing.assert_allclose(sites, attach(layout, model).points, atol=1e-5)
+    np.testing.assert_allclose(sites, attach_markers(layout, model).points, atol=1e-5)
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj"])

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.jacobian import NUM_VELOCITIES, skinned_jacobian
 from handsim.hand.model import HandModel, join_qpos
@@ -29,7 +29,7 @@ def posed(request, rng):
 
 def test_skinned_points_move_as_the_jacobian_says(posed):
     model, qpos = posed
-    glove = attach(load_layout("dense19"), model)
+    glove = attach_markers(load_layout("dense19"), model)
     assert (glove.bone_weights[:, 1] > 0.05).any(), "the test needs points between bones"
     jacobian = skinned_jacobian(
         model, model.forward_kinematics(qpos), glove.points, glove.bone_indices, glove.bone_weights

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
@@ -39,7 +39,7 @@ def resting(hand: HandModel, frames: int, place: tuple[float, float, float] = (-
 
 
 def markers_of(hand: HandModel, motion: HandMotion) -> tuple[np.ndarray, np.ndarray]:
-    glove = attach(load_layout("dense19"), hand)
+    glove = attach_markers(load_layout("dense19"), hand)
     return glove.markers(hand, hand.forward_kinematics(motion.qpos))
 
 

@@ -10,7 +10,7 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gloves.fit import fit_glove
+from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import SIDES, Side
@@ -111,7 +111,7 @@ def hand(side: Side, tone: str, seed: int) -> tuple[Camera, list[Drawn]]:
     model = HandModel.named("M", side=side)
     look = sample_people(1, False, tones=TONES[tone], rng=rng)[0]
     qpos = join_qpos(gesture("relaxed")[None])
-    figure = HandFigure(fit_glove(load_layout("dense19"), model), look, first_marker=0)
+    figure = HandFigure(attach(load_layout("dense19"), model), look, first_marker=0)
     eye = rng.normal(size=3)
     place = np.array([0.07, 0.0, 0.0])
     camera = pinhole("some", (160, 120), 170.0).at(look_at(place + 0.45 * eye / np.linalg.norm(eye), place))

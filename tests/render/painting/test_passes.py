@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.attach import Attachment
+from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from gloves.fit import fit_glove
+from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from poses.shapes.validity import resting_angles, sample_valid_angles
@@ -26,7 +26,7 @@ SPREAD = 0.001
 @pytest.fixture(scope="module")
 def hand():
     model = HandModel.named("M")
-    return PoseSolver(fit_glove(load_layout("dense19"), model)), model
+    return PoseSolver(attach(load_layout("dense19"), model)), model
 
 
 def trusted(solver, qpos, missing):
@@ -119,7 +119,7 @@ def test_odds_decide_between_points_that_fit_as_well(hand):
 
 def test_ranges_hold_the_poses_of_the_hand(hand):
     solver, model = hand
-    ranges = digit_ranges(hand_arrays(fit_glove(load_layout("dense19"), model)))
+    ranges = digit_ranges(hand_arrays(attach(load_layout("dense19"), model)))
     angles = sample_valid_angles(model, 50, rng=np.random.default_rng(1))
     for qpos in join_qpos(angles):
         markers = solver.place(qpos)[MARKERS]

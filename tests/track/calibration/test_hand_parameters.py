@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
@@ -42,7 +42,7 @@ def test_people_differ_by_what_the_prior_says(rng):
 def test_points_follow_the_skeleton(rng):
     shape = sample_shape(rng=rng)
     model = HandModel(shape)
-    worn = attach(load_layout("dense19"), model)
+    worn = attach_markers(load_layout("dense19"), model)
     weights = place_weights(nearest_places(worn.points, shape))
     qpos = join_qpos(
         sample_valid_angles(model, 4, rng=rng),

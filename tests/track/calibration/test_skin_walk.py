@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import named_shape, sample_shape
@@ -43,7 +43,7 @@ def test_neighbors_share_an_edge():
 
 def test_a_glove_is_found_where_it_sits(rng):
     shape = sample_shape(rng=rng)
-    worn = attach(load_layout("dense19"), HandModel(shape))
+    worn = attach_markers(load_layout("dense19"), HandModel(shape))
     places = nearest_places(worn.points, shape)
     points, normals = points_of(places, shape)
     np.testing.assert_allclose(points, worn.points, atol=1e-9)
@@ -55,7 +55,7 @@ def test_a_glove_is_found_where_it_sits(rng):
 
 def test_slides_end_under_their_points(rng):
     shape = sample_shape(rng=rng)
-    worn = attach(load_layout("dense19"), HandModel(shape))
+    worn = attach_markers(load_layout("dense19"), HandModel(shape))
     moved = slip(worn, shape, 0.005, rng=rng)
     places = slide(nearest_places(worn.points, shape), moved.points, skin_of(shape))
     np.testing.assert_allclose(points_of(places, shape)[0], moved.points, atol=1e-9)
@@ -66,15 +66,15 @@ def test_slides_end_under_their_points(rng):
 
 def test_places_go_with_the_skin():
     small, large = named_shape("XS"), named_shape("XL")
-    worn = attach(load_layout("dense19"), HandModel(small))
+    worn = attach_markers(load_layout("dense19"), HandModel(small))
     places = nearest_places(worn.points, small)
-    there = attach(load_layout("dense19"), HandModel(large)).points
+    there = attach_markers(load_layout("dense19"), HandModel(large)).points
     assert np.linalg.norm(points_of(places, large)[0] - there, axis=1).max() < 0.003
 
 
 def test_weights_change_as_their_slopes_say(rng):
     shape = sample_shape(rng=rng)
-    places = nearest_places(attach(load_layout("dense19"), HandModel(shape)).points, shape)
+    places = nearest_places(attach_markers(load_layout("dense19"), HandModel(shape)).points, shape)
     slopes = weight_slopes(places, skin_of(shape).corners(places.faces))
     points, step = points_of(places, shape)[0], 1e-7
     for axis in np.eye(3):

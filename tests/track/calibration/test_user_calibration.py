@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import HandSimError
@@ -43,7 +43,7 @@ def somebody():
         radii=1.03 * mean.radii,
     )
     model = HandModel(shape)
-    worn = slip(attach(LAYOUT, model), shape, 0.005, rng=rng)
+    worn = slip(attach_markers(LAYOUT, model), shape, 0.005, rng=rng)
     angles = calibration_angles(model, CalibrationTakeConfig(free=12.0, rounds=1), rng=rng)
     angles = angles[::4]
     where = wrist_path(len(angles), RATE, WristConfig(), rng=rng)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from gloves.attach import wear
+from gloves.attachment import wear
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit, nominal_fit

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
@@ -19,7 +19,7 @@ from track.evaluation.hand_errors import hand_errors
 
 def worn(shape):
     model = HandModel(shape)
-    return GloveFit(model, attach(load_layout("dense19"), model))
+    return GloveFit(model, attach_markers(load_layout("dense19"), model))
 
 
 @pytest.mark.parametrize("side", SIDES)

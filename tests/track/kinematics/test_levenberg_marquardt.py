@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
@@ -42,7 +42,7 @@ def costs(model, glove, target, center, pull, tightness):
 @pytest.mark.parametrize("tightness", [0.0, 0.005**-2])
 def test_the_minimum_is_the_one_that_scipy_finds(tightness, rng):
     model = HandModel.named("M")
-    glove = attach(load_layout("dense19"), model)
+    glove = attach_markers(load_layout("dense19"), model)
     hand, work = hand_arrays(GloveFit(model, glove)), workspace(len(glove.points))
     truth = join_qpos(sample_valid_angles(model, 4, rng=rng), quaternion=random_quaternions(4, rng=rng))
     truth[:, 8] = model.skeleton.ranges[1, 1] + 0.1  # a limit that speaks
@@ -72,7 +72,7 @@ def test_the_minimum_is_the_one_that_scipy_finds(tightness, rng):
 
 def test_no_steps_leave_the_pose_alone(rng):
     model = HandModel.named("M")
-    glove = attach(load_layout("dense19"), model)
+    glove = attach_markers(load_layout("dense19"), model)
     pose = join_qpos(sample_valid_angles(model, 1, rng=rng))[0]
     before, pull = pose.copy(), np.zeros(26)
     hand, work = hand_arrays(GloveFit(model, glove)), workspace(19)

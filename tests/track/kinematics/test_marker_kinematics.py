@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim.hand.jacobian import skinned_jacobian
@@ -26,7 +26,7 @@ from track.kinematics.marker_kinematics import (
 def posed(request, rng):
     side, name = request.param
     model = HandModel(sample_shape(side=side, rng=rng))
-    glove = attach(load_layout(name), model)
+    glove = attach_markers(load_layout(name), model)
     angles = rng.uniform(*model.skeleton.ranges.T)
     hand, work = hand_arrays(GloveFit(model, glove)), workspace(len(glove.points))
     place_markers(hand, angles, work)

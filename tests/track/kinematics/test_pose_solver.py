@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
@@ -31,7 +31,7 @@ def gloved(side, rng, layout="dense19"):
             resting_angles(model)
         except ArgumentError:
             continue
-        return model, attach(load_layout(layout), model)
+        return model, attach_markers(load_layout(layout), model)
 
 
 def random_poses(model, count, rng):
@@ -85,7 +85,7 @@ def test_poses_come_back_from_nowhere(side, layout, rng):
 def test_a_fit_goes_where_its_markers_go(quaternion, shift, warm):
     rng = np.random.default_rng(7)
     model = HandModel.named("L", side="left")
-    glove = attach(load_layout("dense19"), model)
+    glove = attach_markers(load_layout("dense19"), model)
     qpos = random_poses(model, 3, rng)
     markers = markers_of(model, glove, qpos) + rng.normal(scale=0.001, size=(3, 19, 3))
     markers[:, 4] = np.nan

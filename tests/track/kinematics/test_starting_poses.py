@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
@@ -31,7 +31,7 @@ def test_rigid_fits_are_the_best_ones(rng):
 
 def test_every_digit_is_taken_from_the_nearest_shape(rng):
     model = HandModel.named("S", side="left")
-    glove = attach(load_layout("dense19"), model)
+    glove = attach_markers(load_layout("dense19"), model)
     shapes = starting_shapes(GloveFit(model, glove))
     digits = hand_arrays(GloveFit(model, glove)).digits
     low, high = model.skeleton.ranges.T

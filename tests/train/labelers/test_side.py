@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import quaternion_matrix, random_quaternions
@@ -22,7 +22,7 @@ def teller(request):
 def hands(layout, side, rng, count=60):
     hand = HandModel.named("M", side=side)
     qpos = join_qpos(sample_valid_angles(hand, count, rng=rng), quaternion=random_quaternions(count, rng=rng))
-    return attach(layout, hand).markers(hand, hand.forward_kinematics(qpos))[0]
+    return attach_markers(layout, hand).markers(hand, hand.forward_kinematics(qpos))[0]
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

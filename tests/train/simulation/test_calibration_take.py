@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gloves.attach import attach
+from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
@@ -26,7 +26,7 @@ def test_the_thumb_touches_every_finger(rng):
 
 def test_a_take_of_both_hands_has_its_truth(rng):
     hands = [HandModel.named("M", side=side) for side in ("right", "left")]
-    worn = tuple((hand, attach(load_layout("dense19"), hand)) for hand in hands)
+    worn = tuple((hand, attach_markers(load_layout("dense19"), hand)) for hand in hands)
     take = simulate_calibration(worn, CalibrationTakeConfig(free=0.5, rounds=0), rng=rng)
     assert [hand.shape.side for hand in take.hands] == ["right", "left"]
     assert take.settings["kind"] == "calibration"

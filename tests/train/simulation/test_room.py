@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.fit import GlovedHand, fit_glove
+from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
 from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.strays import StrayConfig
@@ -36,7 +36,7 @@ def gloved(side: str, aside: float) -> GlovedHand:
     rng = np.random.default_rng(1 if side == "right" else 2)
     qpos = sample_motion(model, FRAMES / RATE, rng=rng).qpos[:FRAMES].copy()
     qpos[:, :3] = 0.1 * (qpos[:, :3] - [0.0, 0.0, 1.1]) + [aside, 0.0, 1.1]
-    return GlovedHand(fit_glove(load_layout("dense19"), model), qpos)
+    return GlovedHand(attach(load_layout("dense19"), model), qpos)
 
 
 def prop(thing: RigidObject) -> Prop:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.attach import _crossings, _ray, attach, vary_places
+from gloves.attachment import _crossings, _ray, attach_markers, vary_places
 from gloves.layout import load_layout
 from handsim.errors import LayoutError
 from handsim.hand.mjcf import build_spec
@@ -23,7 +23,7 @@ from handsim.space.transforms import MIRROR
 def test_markers_sit_one_radius_above_the_skin(glove, rng):
     model = HandModel(sample_shape(EVERYBODY, rng=rng))
     layout = load_layout(glove)
-    attachment = attach(layout, model)
+    attachment = attach_markers(layout, model)
     skin = trimesh.Trimesh(model.surface.vertices, model.surface.faces, process=False)
     _, distance, _ = trimesh.proximity.closest_point_naive(skin, attachment.points)
     np.testing.assert_allclose(distance, layout.radius, atol=0.0004)
@@ -35,7 +35,7 @@ def test_markers_sit_one_radius_above_the_skin(glove, rng):
 def test_markers_stand_where_a_ray_through_every_triangle_leaves_the_skin(side, rng):
     layout = vary_places(load_layout("dense19"), along=0.1, around=0.3, rng=rng)
     model = HandModel(sample_shape(EVERYBODY, side=side, rng=rng))
-    attachment, skin = attach(layout, model), model.surface
+    attachment, skin = attach_markers(layout, model), model.surface
     corners = skin.vertices[skin.faces]
     edges1, edges2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     for number, marker in enumerate(layout.markers):
@@ -51,7 +51,7 @@ def test_markers_stand_where_a_ray_through_every_triangle_leaves_the_skin(side, 
 
 def test_markers_are_carried_as_the_skin_is(rng):
     model = HandModel(sample_shape(EVERYBODY, rng=rng))
-    glove = attach(load_layout("dense19"), model)
+    glove = attach_markers(load_layout("dense19"), model)
     low, high = model.skeleton.ranges.T
     bones = model.forward_kinematics(join_qpos(rng.uniform(low, high, size=(20, 20))))
     markers, normals = glove.markers(model, bones)
@@ -65,14 +65,14 @@ def test_markers_are_carried_as_the_skin_is(rng):
 def test_left_glove_is_the_mirror_image(rng):
     shape = sample_shape(side="right", rng=rng)
     layout = load_layout("dense19")
-    right = attach(layout, HandModel(shape))
-    left = attach(layout, HandModel(shape.with_side("left")))
+    right = attach_markers(layout, HandModel(shape))
+    left = attach_markers(layout, HandModel(shape.with_side("left")))
     np.testing.assert_allclose(left.points, right.points @ MIRROR, atol=1e-9)
 
 
 def test_markers_move_with_the_hand(rng):
     model = HandModel.named("M")
-    attachment = attach(load_layout("dense19"), model)
+    attachment = attach_markers(load_layout("dense19"), model)
     qpos = join_qpos(np.zeros((1, 20)), position=np.array([[0.1, 0.2, 0.3]]))
     markers, normals = attachment.markers(model, model.forward_kinematics(qpos))
     np.testing.assert_allclose(markers[0], attachment.points + [0.1, 0.2, 0.3], atol=1e-12)
@@ -81,7 +81,7 @@ def test_markers_move_with_the_hand(rng):
 
 def test_sites_stand_where_the_markers_do():
     model = HandModel.named("L", side="left")
-    attachment = attach(load_layout("dense19"), model)
+    attachment = attach_markers(load_layout("dense19"), model)
     compiled = build_spec(model.skeleton, model.capsules, sites=attachment.sites(model)).compile()
     data = mujoco.MjData(compiled)
     mujoco.mj_kinematics(compiled, data)
@@ -95,7 +95,7 @@ def test_a_marker_in_the_air_is_told():
     markers = list(layout.markers)
     markers[6] = dataclasses.replace(markers[6], along=1.3)
     with pytest.raises(LayoutError, match=r"marker 'IndexTip' finds no skin from index_distal at along 1\.3"):
-        attach(dataclasses.replace(layout, markers=tuple(markers)), HandModel.named("M"))
+        attach_markers(dataclasses.replace(layout, markers=tuple(markers)), HandModel.named("M"))
 
 
 def test_slipped_markers_keep_their_bones_and_names(rng):

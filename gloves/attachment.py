@@ -79,7 +79,7 @@ class Attachment:
         )
 
 
-def attach(layout: MarkerLayout, model: HandModel) -> Attachment:
+def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
     """Put a glove on a hand: from each place on its bone outwards to the skin.
 
     Raises:
@@ -138,10 +138,10 @@ def wear(
     """
     for _ in range(_MOST_FITTINGS):
         try:
-            return attach(vary_places(layout, along=along, around=around, rng=rng), model)
+            return attach_markers(vary_places(layout, along=along, around=around, rng=rng), model)
         except LayoutError:
             continue
-    return attach(layout, model)
+    return attach_markers(layout, model)
 
 
 def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
