@@ -1,5 +1,50 @@
-"""Markers on the hand, and what an optical system sees of them."""
+"""Markers on the hand, and what an optical system sees of them.
 
-from handsim import __version__  # the first import: a hidden sibling is told before it hurts
+A `MarkerLayout` (a TOML file) is put on a hand by `attach`; the result is a `GloveFit`. `read_capture` and
+`write_capture` read and write marker files (TRC, C3D, Motive CSV). A `Take` is a simulated capture with
+truth.
+"""
 
-__all__ = ["__version__"]
+from typing import TYPE_CHECKING
+
+from handsim import __version__  # the first import: it warns about a package of the same name
+from handsim._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from gloves.captures.capture import Capture
+    from gloves.captures.formats import read_capture, write_capture
+    from gloves.fit import GlovedHand, GloveFit, attach, nominal_fit
+    from gloves.layout import MarkerLayout, load_layout
+    from gloves.takes.take import Take, load_take
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "Capture": "gloves.captures.capture",
+        "GloveFit": "gloves.fit",
+        "GlovedHand": "gloves.fit",
+        "MarkerLayout": "gloves.layout",
+        "Take": "gloves.takes.take",
+        "attach": "gloves.fit",
+        "load_layout": "gloves.layout",
+        "load_take": "gloves.takes.take",
+        "nominal_fit": "gloves.fit",
+        "read_capture": "gloves.captures.formats",
+        "write_capture": "gloves.captures.formats",
+    },
+)
+
+__all__ = [
+    "Capture",
+    "GloveFit",
+    "GlovedHand",
+    "MarkerLayout",
+    "Take",
+    "__version__",
+    "attach",
+    "load_layout",
+    "load_take",
+    "nominal_fit",
+    "read_capture",
+    "write_capture",
+]

@@ -1,9 +1,47 @@
-"""The hand itself, and the types that the other packages share."""
+"""The hand itself, and the types that all packages share.
 
+A `HandShape` (lengths, breadths and girths in meters) becomes a `HandModel`: skeleton, capsules, skin and a
+compiled MuJoCo model with 26 degrees of freedom. Poses are MuJoCo's qpos, (T, 27): wrist position [m],
+wrist orientation (wxyz), twenty joint angles [rad]. A `CameraRig` is a set of cameras around the hands.
+"""
+
+from typing import TYPE_CHECKING
+
+from handsim._lazy import lazy_exports
 from handsim._siblings import ShadowedPackageWarning, warn_if_shadowed
 from handsim._version import __version__
 from handsim.errors import HandSimError
 
-__all__ = ["HandSimError", "ShadowedPackageWarning", "__version__"]
+if TYPE_CHECKING:
+    from handsim.hand.model import HandModel, join_qpos
+    from handsim.hand.motion import HandMotion
+    from handsim.hand.shape import HandShape, sample_shape
+    from handsim.space.cameras import CameraRig, load_rig
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "CameraRig": "handsim.space.cameras",
+        "HandModel": "handsim.hand.model",
+        "HandMotion": "handsim.hand.motion",
+        "HandShape": "handsim.hand.shape",
+        "join_qpos": "handsim.hand.model",
+        "load_rig": "handsim.space.cameras",
+        "sample_shape": "handsim.hand.shape",
+    },
+)
+
+__all__ = [
+    "CameraRig",
+    "HandModel",
+    "HandMotion",
+    "HandShape",
+    "HandSimError",
+    "ShadowedPackageWarning",
+    "__version__",
+    "join_qpos",
+    "load_rig",
+    "sample_shape",
+]
 
 warn_if_shadowed()

@@ -1,5 +1,29 @@
-"""Where valid hand poses and motions come from."""
+"""Where valid hand poses and motions come from.
 
-from handsim import __version__  # the first import: a hidden sibling is told before it hurts
+`sample_poses` draws random poses, `sample_motion` smooth motions through them. `validate` says which poses
+are within the joint ranges and do not penetrate the hand. `load_gestures` gives the named hand shapes. A
+sampler of your own is any callable that fulfills `PoseSampler`.
+"""
 
-__all__ = ["__version__"]
+from typing import TYPE_CHECKING
+
+from handsim import __version__  # the first import: it warns about a package of the same name
+from handsim._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from poses.motion.motions import sample_motion
+    from poses.shapes.library import load_gestures
+    from poses.shapes.sampling import PoseSampler, sample_poses, validate
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "PoseSampler": "poses.shapes.sampling",
+        "load_gestures": "poses.shapes.library",
+        "sample_motion": "poses.motion.motions",
+        "sample_poses": "poses.shapes.sampling",
+        "validate": "poses.shapes.sampling",
+    },
+)
+
+__all__ = ["PoseSampler", "__version__", "load_gestures", "sample_motion", "sample_poses", "validate"]

@@ -1,5 +1,28 @@
-"""Pictures of hands with ground truth; the only package with a GL context."""
+"""Pictures of hands with exact ground truth.
 
-from handsim import __version__  # the first import: a hidden sibling is told before it hurts
+`render_take` writes colors, depth, normals, ids and annotations of a whole take; `draw_frames` yields
+single `RenderedFrame`s in memory. A `RenderConfig` says what is drawn.
+"""
 
-__all__ = ["__version__"]
+from typing import TYPE_CHECKING
+
+from handsim import __version__  # the first import: it warns about a package of the same name
+from handsim._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from render.frames import RenderedFrame
+    from render.session import RenderConfig, draw_frames, render_take
+    from render.skin.look import SkinLook
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "RenderConfig": "render.session",
+        "RenderedFrame": "render.frames",
+        "SkinLook": "render.skin.look",
+        "draw_frames": "render.session",
+        "render_take": "render.session",
+    },
+)
+
+__all__ = ["RenderConfig", "RenderedFrame", "SkinLook", "__version__", "draw_frames", "render_take"]

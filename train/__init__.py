@@ -1,5 +1,56 @@
-"""From simulated captures to a labeler."""
+"""From simulated captures to a trained labeler.
 
-from handsim import __version__  # the first import: a hidden sibling is told before it hurts
+`generate_dataset` writes a training set, `train_labeler` trains a network on it, `load_labeler` reads a
+shipped or trained one, `evaluate_labeler` counts its errors. `simulate_take` simulates a capture with its
+truth.
+"""
 
-__all__ = ["__version__"]
+from typing import TYPE_CHECKING
+
+from handsim import __version__  # the first import: it warns about a package of the same name
+from handsim._lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from train.config import TrainConfig
+    from train.data.augmentation import Corruption, corrupt
+    from train.data.shards import Dataset
+    from train.evaluation.labeler_evaluation import evaluate_labeler
+    from train.labelers.protocol import Labeler
+    from train.labelers.storage import load_labeler
+    from train.loop import train_labeler
+    from train.simulation.synthesis import DatasetConfig, generate_dataset
+    from train.simulation.twins import TakeConfig, simulate_take
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "Corruption": "train.data.augmentation",
+        "Dataset": "train.data.shards",
+        "DatasetConfig": "train.simulation.synthesis",
+        "Labeler": "train.labelers.protocol",
+        "TakeConfig": "train.simulation.twins",
+        "TrainConfig": "train.config",
+        "corrupt": "train.data.augmentation",
+        "evaluate_labeler": "train.evaluation.labeler_evaluation",
+        "generate_dataset": "train.simulation.synthesis",
+        "load_labeler": "train.labelers.storage",
+        "simulate_take": "train.simulation.twins",
+        "train_labeler": "train.loop",
+    },
+)
+
+__all__ = [
+    "Corruption",
+    "Dataset",
+    "DatasetConfig",
+    "Labeler",
+    "TakeConfig",
+    "TrainConfig",
+    "__version__",
+    "corrupt",
+    "evaluate_labeler",
+    "generate_dataset",
+    "load_labeler",
+    "simulate_take",
+    "train_labeler",
+]

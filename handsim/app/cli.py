@@ -6,46 +6,14 @@ Exit codes: 0; 1 for what a user can set right, told in one line; 2 for usage; 1
 from __future__ import annotations
 
 import errno
-import importlib
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from handsim._version import __version__
+from handsim.app.command_table import COMMANDS, load
 from handsim.errors import HandSimError, choices
-
-# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy
-# loads for --help and no package below names one above in an import.
-COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "demo": (
-        "handsim.commands.demo:demo",
-        "Run the whole chain on a built-in example; ends with a page of pictures.",
-    ),
-    "hand": ("handsim.commands.hand:hand", "Write a hand as a MuJoCo model, and its skin as a mesh."),
-    "glove": ("render.commands.glove:GLOVE", "List, show, start and check marker layouts."),
-    "generate": ("train.commands.generate:generate", "Make a training set; goes on where it was stopped."),
-    "train": (
-        "train.commands.train:train",
-        "Train a labeler on a training set; goes on where it was stopped.",
-    ),
-    "label": ("train.commands.label:label", "Label every frame of a marker capture."),
-    "export": (
-        "train.commands.export:export",
-        "Write a trained labeler as an ONNX file, which needs no torch.",
-    ),
-    "evaluate": ("train.commands.evaluate:evaluate", "Measure a labeler on a labeled capture."),
-    "simulate": ("train.commands.simulate:simulate", "Simulate a capture of two hands, with its truth."),
-    "calibrate": ("track.commands.calibrate:calibrate", "Fit hands and gloves to a user, from a capture."),
-    "track": ("track.commands.track:track", "Follow hands through a marker capture or a live stream."),
-    "body": ("track.commands.body:body", "Write a rigid body's markers as a file, to track it with."),
-    "render": ("render.commands.render:render", "Draw the hands of a take, with the truth of each picture."),
-    "reproduce": (
-        "track.commands.reproduce:REPRODUCE",
-        "Print a table of the paper with our figures beside.",
-    ),
-    "doctor": ("handsim.commands.doctor:doctor", "Say what is missing on this machine, and how to get it."),
-}
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -138,12 +106,6 @@ def _call(target: str, *, prog: str, help_line: str, args: Sequence[str]) -> int
     else:
         result = tyro.cli(command, prog=prog, args=args)
     return result if isinstance(result, int) else 0
-
-
-def load(target: str) -> Any:
-    """What "module:name" stands for, imported now and not before."""
-    module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
 
 
 def _print_overview(commands: Mapping[str, tuple[str, str]]) -> None:

@@ -9,7 +9,7 @@ import mujoco
 import trimesh
 from rich.console import Console
 
-from handsim.app.cli import load
+from handsim.app.command_table import load
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.hand.mjcf import Site, build_spec

@@ -1,0 +1,38 @@
+"""The demo's step of this package: track a simulated capture of two hands."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from gloves.captures.capture import Capture
+from gloves.takes.tracked_take import save_tracked_take
+from handsim.app.demo import GLOVE, DemoRun
+from handsim.app.page import Section
+from track.capture_tracking import track
+from track.evaluation.take_evaluation import true_users
+from track.tracker import Tracker
+from train.labelers.storage import load_labeler
+from train.simulation.twins import TwinConfig, simulate_twin
+
+_FRAMES: Final = 120
+
+
+def track_take(run: DemoRun) -> Section:
+    """Track a simulated capture and say how far its joints are off."""
+    run.report("tracking a simulated capture")
+    take = simulate_twin(TwinConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
+    names = tuple(f"*{number}" for number in range(take.points.shape[1]))
+    tracked = track(Capture(names, take.points, take.rate), Tracker(true_users(take), load_labeler(GLOVE)))
+    save_tracked_take(run.tracked_take, tracked)
+    errors = []
+    for hand in take.hands:
+        model, found = hand.fit.model, tracked.motion(hand.side).qpos
+        joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, hand.qpos)]
+        errors.append(1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
+    return Section(
+        "Tracking",
+        f"A simulated capture of two hands, {_FRAMES} frames, is labeled and tracked. The mean error of the "
+        f"joints is {np.mean(errors):.2f} mm.",
+    )
