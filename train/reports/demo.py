@@ -118,7 +118,7 @@ def figures_section(run: DemoRun) -> Section:
     return Section(
         "Figures of this run",
         f"{run.num_frames} freshly generated frames (seed {run.seed}) of random people, none of whom is in "
-        f"the training set. Occluded: 0 to {_DROPS} draws of a marker to drop, 0 to {_GHOSTS} ghosts per frame.",
+        f"the training set. Occluded: 0 to {_DROPS} markers dropped and 0 to {_GHOSTS} ghosts per frame.",
         table=_table(stored["columns"]),
         notes=[
             f"generated {stored['generated_per_second']:,.0f} frames/s (start included), "

@@ -1,0 +1,194 @@
+"""The structure of the tree: rooms, one-way imports, one type per thing, the field's own words."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+import re
+import subprocess
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import grimp
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+MOST_MODULES, MOST_LEVELS, MOST_LINES = 14, 8, 400
+LOADERS = {"handsim/app/command_table.py", "handsim/_lazy.py"}
+
+# Identifiers of an earlier vocabulary that mean nothing else; docs/conventions.md has the words in use.
+OLD_WORDS = """
+slopes find_slopes misses find_misses lay_rigidly lay_shapes surprise forget_surprises hinge_belief
+HingeBelief adviser Adviser bringing_together detours new_names income name_new fit_names worth_of UserHand
+WornGlove ShownHand usual_hand elect search_digit DigitNamings digit_namings HandMemory ShapeError
+unseen_markers
+""".split()
+BRITISH = re.compile(
+    r"colour|centre|labell(ed|ing)|metres?\b|neighbour|rasteris|normalis|grey|behaviour|favour|recognis", re.I
+)
+
+
+# Words in files keep their spelling: files written before stay readable, units are read in both spellings.
+KEPT = re.compile(r"metres_per_unit|\"metres, radians|\"(milli|centi)?metres\": ")
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+@pytest.fixture(scope="module")
+def graph() -> grimp.ImportGraph:
+    return grimp.build_graph(*PACKAGES, cache_dir=None)
+
+
+def room_of(module: str) -> str:
+    """The room of a module: the child of its package, a file or a folder."""
+    return ".".join(module.split(".")[:2])
+
+
+def test_no_folder_holds_more_than_fourteen_modules():
+    counts = Counter(path.parent for path in SOURCES if path.name != "__init__.py")
+    assert {relative(folder): count for folder, count in counts.items() if count > MOST_MODULES} == {}
+
+
+def test_no_module_is_longer_than_four_hundred_lines():
+    lengths = {relative(path): len(path.read_text("utf-8").splitlines()) for path in SOURCES}
+    assert {name: lines for name, lines in lengths.items() if lines > MOST_LINES} == {}
+
+
+def test_every_folder_has_a_map():
+    """The docstring of a folder's `__init__` names every module in it."""
+    for folder in {path.parent for path in SOURCES}:
+        if folder.name in PACKAGES and folder.parent == ROOT:
+            continue
+        text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text("utf-8"))) or ""
+        names = {path.stem for path in folder.glob("*.py")} - {"__init__"}
+        missing = sorted(name for name in names if not re.search(rf"\b{name}\b", text))
+        assert missing == [], f"{relative(folder)}/__init__.py does not name {missing}"
+
+
+def test_no_circle_among_modules(graph):
+    seen: dict[str, int] = {}
+
+    def visit(module: str, trail: tuple[str, ...]) -> None:
+        assert seen.get(module) != 1, " -> ".join((*trail, module))
+        if module in seen:
+            return
+        seen[module] = 1
+        for imported in sorted(graph.find_modules_directly_imported_by(module)):
+            if imported not in PACKAGES:
+                visit(imported, (*trail, module))
+        seen[module] = 2
+
+    for module in sorted(graph.modules):
+        if module not in PACKAGES:  # a package's door imports its rooms for type checkers only
+            visit(module, ())
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_rooms_stand_on_few_levels(package, graph):
+    """The rooms of a package (its direct children) import each other one way, over at most eight levels."""
+    imports: dict[str, set[str]] = defaultdict(set)
+    for module in graph.modules:
+        if not module.startswith(f"{package}."):
+            continue
+        imports[room_of(module)] |= {
+            room_of(imported)
+            for imported in graph.find_modules_directly_imported_by(module)
+            if imported.startswith(f"{package}.") and room_of(imported) != room_of(module)
+        }
+    levels: dict[str, int] = {}
+
+    def level(room: str, trail: tuple[str, ...]) -> int:
+        assert room not in trail, f"rooms import each other: {' -> '.join((*trail, room))}"
+        if room not in levels:
+            levels[room] = 1 + max((level(below, (*trail, room)) for below in imports[room]), default=0)
+        return levels[room]
+
+    assert max(level(room, ()) for room in list(imports)) <= MOST_LEVELS
+
+
+def test_modules_are_named_by_strings_in_the_command_table_and_the_doors_alone():
+    modules = re.compile(rf"^({'|'.join(PACKAGES)})(\.\w+)+(:\w+)?$")
+    for path in SOURCES:
+        if relative(path) in LOADERS or (path.name == "__init__.py" and path.parent.parent == ROOT):
+            continue
+        strings = [
+            node.value
+            for node in ast.walk(ast.parse(path.read_text("utf-8")))
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and modules.match(node.value)
+        ]
+        assert strings == [], relative(path)
+
+
+def test_one_type_holds_a_model_and_an_attachment():
+    holders = []
+    for path, node in classes():
+        types = {ast.unparse(field.annotation) for field in node.body if isinstance(field, ast.AnnAssign)}
+        if {"HandModel", "Attachment"} <= types:
+            holders.append(f"{relative(path)}:{node.name}")
+    assert holders == ["gloves/fit.py:GloveFit"]
+
+
+def classes():
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                yield path, node
+
+
+def test_a_bad_argument_is_never_control_flow():
+    """A handler of `ArgumentError` adds words and raises again; it never goes on."""
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if (
+                isinstance(node, ast.ExceptHandler)
+                and node.type
+                and "ArgumentError" in ast.unparse(node.type)
+            ):
+                assert isinstance(node.body[-1], ast.Raise), f"{relative(path)}:{node.lineno}"
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("suppress"):
+                assert "ArgumentError" not in ast.unparse(node), f"{relative(path)}:{node.lineno}"
+
+
+def test_no_identifier_of_the_old_words():
+    names: dict[str, set[str]] = defaultdict(set)
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            for field in ("id", "attr", "name", "arg"):
+                value = getattr(node, field, None)
+                if isinstance(value, str):
+                    names[value].add(relative(path))
+    assert {word: sorted(names[word]) for word in OLD_WORDS if word in names} == {}
+
+
+def test_american_spelling():
+    listed = subprocess.run(
+        ["git", "ls-files", *PACKAGES, "docs", "examples", "benchmarks", "README.md", "CONTRIBUTING.md"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    found = []
+    for name in listed.stdout.splitlines():
+        path = ROOT / name
+        if path.suffix not in (".py", ".md", ".toml") or not path.is_file():
+            continue
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
+            if (match := BRITISH.search(line)) and not KEPT.search(line):
+                found.append(f"{name}:{number}: {match[0]}")
+    assert found == []
+
+
+def test_layers_of_the_contract_are_all_packages(graph):
+    """Every package is on a layer: nothing is imported from a package above."""
+    order = {"handsim": 0, "gloves": 1, "poses": 1, "render": 2, "train": 2, "track": 3}
+    for importer, imported in itertools.chain.from_iterable(
+        ((module, other) for other in graph.find_modules_directly_imported_by(module))
+        for module in graph.modules
+    ):
+        assert order[imported.split(".")[0]] <= order[importer.split(".")[0]], (
+            f"{importer} imports {imported}"
+        )

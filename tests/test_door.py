@@ -1,0 +1,123 @@
+"""The public names of the six packages: documented, typed, lazily imported, used by an example that runs."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
+BOOKKEEPING = {"__version__", "ShadowedPackageWarning"}
+UNIT = re.compile(r"\[(m|m\^2|rad|s|Hz|deg|px|pixels|mm|1/s)(?=[ ,;/\]])")
+NO_QUANTITY = {"HandSimError", "Labeler", "load_labeler"}
+"""Public names without a physical quantity of their own, or whose quantities are in the types they return."""
+
+
+def exported() -> list[tuple[str, str]]:
+    return [
+        (package, name)
+        for package in PACKAGES
+        for name in importlib.import_module(package).__all__
+        if name not in BOOKKEEPING
+    ]
+
+
+ROOMS = {
+    package: (f"{package}.",) if package != "handsim" else ("handsim.hand", "handsim.space")
+    for package in PACKAGES
+}
+
+
+def source_of(value: object) -> str:
+    """Docstring of a function; of a class its whole source: fields and methods have docstrings too."""
+    return inspect.getsource(value) if inspect.isclass(value) else inspect.getdoc(value) or ""
+
+
+@pytest.mark.parametrize(("package", "name"), exported(), ids=".".join)
+def test_name_is_documented_with_units_and_shapes(package, name):
+    value = getattr(importlib.import_module(package), name)
+    text = inspect.getdoc(value) or ""
+    assert text and not text.startswith(f"{name}("), "no docstring of its own"
+    source = inspect.getsource(value)
+    if re.search(r"\b(Float|Int|Bool)(32|64)?\[", source) or name not in NO_QUANTITY:
+        arrays = re.findall(r"(?:Float|Int|Bool)(?:32|64)?\[[^,\]]+, *\"([^\"]*)\"\]", source)
+        assert arrays or UNIT.search(source_of(value)) or "seed" in source, "neither shapes nor units"
+    if re.search(r"Float(32|64)?\[", source):
+        assert UNIT.search(source) or "share" in source or "probabilit" in source, "an array without a unit"
+
+
+@pytest.mark.parametrize(("package", "name"), exported(), ids=".".join)
+def test_name_is_typed(package, name):
+    value = getattr(importlib.import_module(package), name)
+    functions = [value]
+    if inspect.isclass(value):
+        functions = [
+            member
+            for key, member in vars(value).items()
+            if inspect.isfunction(member) and (not key.startswith("_") or key in ("__init__", "__call__"))
+            and member.__module__ == value.__module__
+        ]  # fmt: skip
+    for function in functions:
+        for parameter in list(inspect.signature(function).parameters.values()):
+            if parameter.name not in ("self", "cls"):
+                assert parameter.annotation is not parameter.empty, f"{function.__name__}: {parameter.name}"
+
+
+def examples() -> str:
+    blocks = [path.read_text("utf-8") for path in sorted((ROOT / "examples").glob("*.py"))]
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        blocks += re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.S)
+    return "\n".join(blocks)
+
+
+def test_every_name_has_an_example_that_runs():
+    """Examples and the Python blocks of README and docs are run by tests of their own."""
+    text = examples()
+    unused = [f"{package}.{name}" for package, name in exported() if not re.search(rf"\b{name}\b", text)]
+    assert unused == []
+
+
+def test_examples_and_pages_use_public_names_alone():
+    inner = re.findall(rf"^\s*(?:from|import) (?:{'|'.join(PACKAGES)})\.\S+.*", examples(), re.M)
+    assert inner == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_type_checkers_see_the_same_names(package):
+    """The imports under `if TYPE_CHECKING` are those of the lazy table."""
+    tree = ast.parse((ROOT / package / "__init__.py").read_text("utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    stated = {
+        alias.name: node.module
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    (table,) = (node for node in ast.walk(tree) if isinstance(node, ast.Dict))
+    assert ast.literal_eval(table) == stated
+    module = importlib.import_module(package)
+    assert set(stated) <= set(module.__all__) <= set(dir(module))
+
+
+def test_unknown_names_are_told():
+    with pytest.raises(AttributeError, match="module 'gloves' has no attribute 'nothing'"):
+        importlib.import_module("gloves").nothing  # noqa: B018
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_importing_a_package_imports_none_of_its_rooms(package):
+    code = f"import sys, {package}; print(sorted(m for m in sys.modules if m.startswith({ROOMS[package]})"
+    code += " or m in ('numpy', 'torch', 'mujoco', 'OpenGL')))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_door_is_small():
+    assert len(exported()) <= 55
