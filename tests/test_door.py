@@ -20,9 +20,9 @@ NO_QUANTITY = {"HandSimError", "Labeler", "load_labeler"}
 """Public names without a physical quantity of their own, or whose quantities are in the types they return."""
 
 
-def exported() -> list[tuple[str, str]]:
+def exported() -> list[object]:
     return [
-        (package, name)
+        pytest.param(package, name, id=f"{package}.{name}")
         for package in PACKAGES
         for name in importlib.import_module(package).__all__
         if name not in BOOKKEEPING
@@ -40,7 +40,7 @@ def source_of(value: object) -> str:
     return inspect.getsource(value) if inspect.isclass(value) else inspect.getdoc(value) or ""
 
 
-@pytest.mark.parametrize(("package", "name"), exported(), ids=".".join)
+@pytest.mark.parametrize(("package", "name"), exported())
 def test_name_is_documented_with_units_and_shapes(package, name):
     value = getattr(importlib.import_module(package), name)
     text = inspect.getdoc(value) or ""
@@ -53,7 +53,7 @@ def test_name_is_documented_with_units_and_shapes(package, name):
         assert UNIT.search(source) or "share" in source or "probabilit" in source, "an array without a unit"
 
 
-@pytest.mark.parametrize(("package", "name"), exported(), ids=".".join)
+@pytest.mark.parametrize(("package", "name"), exported())
 def test_name_is_typed(package, name):
     value = getattr(importlib.import_module(package), name)
     functions = [value]
@@ -80,7 +80,8 @@ def examples() -> str:
 def test_every_name_has_an_example_that_runs():
     """Examples and the Python blocks of README and docs are run by tests of their own."""
     text = examples()
-    unused = [f"{package}.{name}" for package, name in exported() if not re.search(rf"\b{name}\b", text)]
+    names = [one.values for one in exported()]
+    unused = [f"{package}.{name}" for package, name in names if not re.search(rf"\b{name}\b", text)]
     assert unused == []
 
 
