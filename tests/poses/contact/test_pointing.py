@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.space.objects import named_object
@@ -184,5 +184,5 @@ def test_hands_that_cannot_part_are_told(rng):
     controller = named_object("controller")
     held = sample_object_motion(right, controller, 30 / RATE, rng=rng)
     other = resting(left, len(held[0].qpos), tuple(held[0].qpos[0, :3]))
-    with pytest.raises(ArgumentError, match="however far one of them draws back"):
+    with pytest.raises(PoseError, match="however far one of them draws back"):
         keep_apart(right, left, controller, held, other, np.zeros((len(held[0].qpos), 3)))
