@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from handsim._checks import check_array
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import JOINTS
+from handsim.hand.topology import JOINTS, NUM_QPOS
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
 from poses.shapes.samplers import DEFAULT_MIX, PoseMix, sample_angles
@@ -32,6 +33,19 @@ def is_valid(
     inside = ((angles >= LOW - 1e-9) & (angles <= HIGH + 1e-9)).all(axis=1)
     free: NDArray[np.bool_] = model.penetration(join_qpos(angles)) <= max_penetration
     return inside & free
+
+
+def validate(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Bool[np.ndarray, "T"]:
+    """Which poses this hand can strike: in range, and at most 1 mm deep in itself (`MAX_PENETRATION`).
+
+    Args:
+        model: The hand.
+        qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad]; the wrist may be anywhere.
+
+    Raises:
+        ArgumentError: `qpos` is not (T, 27) or not finite.
+    """
+    return is_valid(model, check_array("qpos", qpos, (None, NUM_QPOS))[:, 7:])
 
 
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
