@@ -31,10 +31,10 @@ from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
+from handsim.kernels.integration import move
 from handsim.space.transforms import random_quaternions
 from poses.motion.motions import sample_motion
 from poses.shapes.validity import resting_angles, sample_valid_angles
-from track.kinematics.integration import move
 from track.kinematics.pose_solver import PoseSolver
 
 Solver = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]

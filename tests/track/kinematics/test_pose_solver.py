@@ -15,10 +15,10 @@ from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
+from handsim.kernels.integration import move
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.motion.motions import sample_motion
 from poses.shapes.validity import resting_angles, sample_valid_angles
-from track.kinematics.integration import move
 from track.kinematics.pose_solver import PoseSolver, Prediction, solve_poses
 
 INDEX = slice(11, 15)  # of qpos
