@@ -61,6 +61,13 @@ class RigidObject:
             ("shiny", (None, 7)),
         ):
             object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+            raise ArgumentError(f"faces has shape {faces.shape}, expected whole numbers (F, 3)")
+        if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
+            raise ArgumentError(
+                f"faces name vertices {faces.min()} to {faces.max()}, expected 0 to {len(self.vertices) - 1}"
+            )
         if not 0.0 < self.mass < np.inf:
             raise ArgumentError(f"{self.name}: the mass is {self.mass:g} kg, expected a positive number")
         if not self.parts:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from handsim._checks import check_number, check_span
 from handsim.hand.contact import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import rotation_quaternions
@@ -49,6 +50,13 @@ class TwoHandConfig:
     """Shortest and longest rest between two meetings [s]."""
     volume: float = 0.2
     """Half side of the cube in which the middle of the wrists travels [m], around 1.1 m above the floor."""
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "max_speed", "max_acceleration", "wrist_speed"):
+            check_number(name, getattr(self, name), 0.0, above=True)
+        check_number("volume", self.volume, 0.0)
+        check_span("approach", self.approach)
+        check_span("apart", self.apart)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
+from handsim._checks import check_number, check_span
 from handsim.errors import PoseError
 from handsim.hand.contact import overlap_between
 from handsim.hand.model import HandModel
@@ -50,7 +51,15 @@ class PointingConfig:
     speed: float = 0.6
     """Fastest way of the tip between places that keep still, retreat aside [m/s]; ways get longer for it."""
     turning: float = 3.0
-    """The same for the turn of the pen [rad/s]."""
+    """The same for the rotation of the pen [rad/s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "turning"):
+            check_number(name, getattr(self, name), 0.0, above=True)
+        for name in ("retreat", "tilt"):
+            check_number(name, getattr(self, name), 0.0)
+        for name in ("distance", "stay", "way"):
+            check_span(name, getattr(self, name))
 
 
 def pointing_path(
