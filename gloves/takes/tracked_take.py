@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 KIND: Final = "tracked take"
 SCHEMA: Final = 1
 STATUSES: Final = ("lost", "coasting", "found", "tracked")
-"""Names of the status numbers, as files hold them ("found": initialized); only what is lost has no pose."""
+"""Names of the status numbers as files hold them ("found": initialized); only a lost hand has no pose."""
 LOST, COASTING, INITIALIZED, TRACKED = range(4)
 
 
@@ -41,8 +41,9 @@ class MarkedBody:
 
     def __post_init__(self) -> None:
         if self.positions.shape != (len(self.marker_names), 3):
+            expected = f"({len(self.marker_names)}, 3)"
             raise ArgumentError(
-                f"{self.name}: markers have shape {self.positions.shape}, expected ({len(self.marker_names)}, 3)"
+                f"{self.name}: positions has shape {self.positions.shape}, expected {expected}"
             )
 
 

@@ -20,14 +20,8 @@ from handsim.hand.motion import HandMotion
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import random_quaternions, rotation_quaternions
 from poses.contact.interactions import INTERACTIONS, check_names
-from poses.contact.meetings import (
-    Passage,
-    TwoHandConfig,
-    draw_poses,
-    join_passages,
-    play_meeting,
-    way_between,
-)
+from poses.contact.meetings import draw_poses, play_meeting
+from poses.contact.passages import Passage, TwoHandConfig, join_passages, way_between
 from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
 from poses.motion.wrist_paths import along
 

@@ -25,7 +25,8 @@ from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.hand.shape import ADULTS, sample_shape
 from handsim.space.cameras import ROOM_CENTER, check_outside_volume, load_rig
 from handsim.space.objects import named_object
-from poses.contact.pointing import keep_apart, point_pen, pointing_path
+from poses.contact.keeping_apart import keep_apart, point_pen
+from poses.contact.pointing import pointing_path
 from poses.contact.two_hands import TwoHandConfig, sample_two_hand_motion
 from poses.grasps.object_motion import sample_object_motion
 from poses.motion.scripts import scripted_motion

@@ -16,7 +16,8 @@ from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.space.objects import named_object
-from poses.contact.pointing import PointingConfig, keep_apart, point_pen, pointing_path
+from poses.contact.keeping_apart import keep_apart, point_pen
+from poses.contact.pointing import PointingConfig, pointing_path
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.grasp_scene import object_penetration, wrist_poses
 from poses.grasps.object_motion import sample_object_motion
