@@ -25,16 +25,16 @@ from scipy.optimize import least_squares
 from gloves.attachment import Attachment, attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
+from handsim.kernels.integration import move
 from handsim.space.transforms import random_quaternions
 from poses.motion.motions import sample_motion
 from poses.shapes.validity import resting_angles, sample_valid_angles
-from track.kinematics.integration import move
 from track.kinematics.pose_solver import PoseSolver
 
 Solver = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
@@ -184,7 +184,7 @@ def somebody(rng: np.random.Generator, number: int) -> HandModel:
         model = HandModel(sample_shape(side=SIDES[number % 2], rng=rng))
         try:
             resting_angles(model)
-        except ArgumentError:
+        except PoseError:
             continue
         return model
 

@@ -23,7 +23,8 @@ from machine import describe
 
 from gloves.attachment import wear
 from gloves.layout import load_layout
-from gloves.optics.mesh_sight import clear_of_mesh, hand_tree
+from gloves.optics.mesh_sight import clear_of_mesh
+from gloves.optics.mesh_tree import hand_tree
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import facing_cameras, visible_cameras
 from handsim.hand.model import join_qpos

@@ -20,7 +20,8 @@ from machine import describe
 
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
-from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh, hand_tree
+from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
+from gloves.optics.mesh_tree import hand_tree
 from gloves.optics.visibility import MAX_FACING, free_rays, visible_cameras
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.layout import MarkerLayout, MarkerPlace
-from handsim.errors import LayoutError
+from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.mjcf import Site
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import HandSurface, vertex_normals
@@ -24,7 +24,11 @@ _MOST_FITTINGS: Final = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attachment:
-    """Markers of one glove on one hand: rest places and the weights of the skin under them."""
+    """Markers of one glove on one hand: rest positions and the weights of the skin under them.
+
+    Raises:
+        ArgumentError: An array does not fit the layout, or holds what it cannot.
+    """
 
     layout: MarkerLayout
     points: Float[np.ndarray, "M 3"]
@@ -35,6 +39,24 @@ class Attachment:
     """The bones that carry each marker."""
     bone_weights: Float[np.ndarray, "M 4"]
     """Their shares, summing to one."""
+
+    def __post_init__(self) -> None:
+        count = self.layout.num_markers
+        for name, width in (("points", 3), ("normals", 3), ("bone_indices", 4), ("bone_weights", 4)):
+            array = getattr(self, name)
+            if array.shape != (count, width):
+                raise ArgumentError(
+                    f"{name} has shape {array.shape}, expected ({count}, {width}) for this layout"
+                )
+        if not np.isfinite(self.points).all() or not np.isfinite(self.normals).all():
+            raise ArgumentError("points or normals hold NaN or infinite values, expected finite numbers")
+        bones, shares = self.bone_indices, self.bone_weights
+        if bones.dtype.kind != "i" or bones.min() < 0 or bones.max() >= len(BONE_NAMES):
+            raise ArgumentError(
+                f"bone_indices holds {bones.min()} to {bones.max()}, expected 0 to {len(BONE_NAMES) - 1}"
+            )
+        if not (shares.min() >= 0.0 and shares.max() <= 1.0 + 1e-9):
+            raise ArgumentError(f"bone_weights holds {shares.min():g} to {shares.max():g}, expected 0 to 1")
 
     @property
     def main_bones(self) -> Int[np.ndarray, "M"]:

@@ -10,9 +10,10 @@ import numpy as np
 
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout
+from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
-from handsim.hand.topology import Side
+from handsim.hand.topology import NUM_QPOS, Side
 from handsim.space.transforms import MIRROR
 
 if TYPE_CHECKING:
@@ -62,11 +63,19 @@ class GloveFit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GlovedHand:
-    """A hand in its glove, in motion."""
+    """A hand in its glove, in motion.
+
+    Raises:
+        ArgumentError: `qpos` is not (T, 27).
+    """
 
     fit: GloveFit
     qpos: Float[np.ndarray, "T 27"]
-    """Wrist position [m], wrist orientation (wxyz), hinge angles [rad]; NaN in frames without a pose."""
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN in frames without a pose."""
+
+    def __post_init__(self) -> None:
+        if self.qpos.ndim != 2 or self.qpos.shape[1] != NUM_QPOS:
+            raise ArgumentError(f"qpos has shape {self.qpos.shape}, expected (T, {NUM_QPOS})")
 
     @property
     def side(self) -> Side:

@@ -1,4 +1,4 @@
-"""Checks at the public edges: each raises one sentence that says what was wanted and what came."""
+"""Checks at the public edges: each raises one sentence that says what was given and what was expected."""
 
 from __future__ import annotations
 
@@ -13,14 +13,41 @@ if TYPE_CHECKING:
 
 
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-    """`array` as finite float64 whose last dimensions are `shape` (None: any length)."""
+    """`array` as finite float64 whose last dimensions are `shape` (None: any length).
+
+    Raises:
+        ArgumentError: It has another shape, or holds NaN or infinite values.
+    """
     values = np.asarray(array, dtype=np.float64)
     tail = values.shape[values.ndim - len(shape) :] if values.ndim >= len(shape) else ()
     if len(tail) != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, tail, strict=True)
+        expected is not None and expected != got for expected, got in zip(shape, tail, strict=True)
     ):
-        wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        raise ArgumentError(f"{name} has shape {values.shape}, expected (..., {wanted})")
+        dimensions = ", ".join("any" if length is None else str(length) for length in shape)
+        raise ArgumentError(f"{name} has shape {values.shape}, expected (..., {dimensions})")
     if not np.isfinite(values).all():
         raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
     return values
+
+
+def check_number(name: str, value: float, low: float, high: float = np.inf, *, above: bool = False) -> None:
+    """Refuse a number outside `low` to `high`, NaN or infinity; with `above`, `low` itself too.
+
+    Raises:
+        ArgumentError: It is.
+    """
+    inside = low <= value <= high and value < np.inf and not (above and value == low)
+    if not inside:
+        least = f"a number above {low:g}" if above else f"a number of at least {low:g}"
+        expected = least if high == np.inf else f"a number from {low:g} to {high:g}"
+        raise ArgumentError(f"{name} is {value:g}, expected {expected}")
+
+
+def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:
+    """Refuse a pair of numbers unless the first is at least `low` and the second, finite, no smaller.
+
+    Raises:
+        ArgumentError: The pair is another.
+    """
+    if len(span) != 2 or not low <= span[0] <= span[1] < np.inf:
+        raise ArgumentError(f"{name} is {span}, expected two numbers from {low:g} upwards, the smaller first")

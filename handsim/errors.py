@@ -1,7 +1,7 @@
-"""What a user can get wrong, each told in one sentence.
+"""The errors that handsim raises on purpose: one class for each kind of mistake.
 
-Every message names what was given, what was wanted and, where there is a list, the valid names.
-The command line prints the message alone and exits with code 1.
+Every message is one sentence with what was given, what was expected and, where there is a list, the valid
+names. The command line prints the message alone and exits with code 1.
 """
 
 from __future__ import annotations
@@ -15,22 +15,38 @@ class HandSimError(Exception):
 
 
 class ArgumentError(HandSimError):
-    """A hand, a pose or an array that is not what it should be."""
+    """An argument of the wrong shape, range or name: a mistake in the call, which handsim never catches."""
 
 
-class LayoutError(HandSimError):
-    """A marker layout that cannot be worn."""
+class PoseError(HandSimError):
+    """A pose, grasp, touch or path that a hand cannot reach."""
 
 
-class CaptureError(HandSimError):
-    """A marker file that cannot be read or written."""
+class FileError(HandSimError):
+    """A file that cannot be read, used or written, or content that no such file may hold."""
 
 
-class DatasetError(HandSimError):
+class LayoutError(FileError):
+    """A marker layout that cannot be read, or whose markers cannot be worn on a hand."""
+
+
+class RigError(FileError):
+    """A camera rig that cannot be read, or whose cameras cannot be set up as stated."""
+
+
+class ObjectError(FileError):
+    """A mesh file that is not an object which a hand can hold."""
+
+
+class CaptureError(FileError):
+    """A marker file or a take that cannot be read or written."""
+
+
+class DatasetError(FileError):
     """A training set that is damaged, unfinished or made for something else."""
 
 
-class WeightsError(HandSimError):
+class WeightsError(FileError):
     """A labeler's weights that are damaged or belong to another layout."""
 
 

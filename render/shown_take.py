@@ -98,7 +98,7 @@ def show_tracked(take: TrackedTake) -> ShownTake:
         for place, hand in enumerate(take.hands)
     )
     bodies = tuple(
-        _body(body.name, body.places, _transforms(take.body_poses[:, place]))
+        _body(body.name, body.positions, _transforms(take.body_poses[:, place]))
         for place, body in enumerate(take.bodies)
     )
     labels = take.labels.astype(np.int64)

@@ -14,7 +14,7 @@ from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, stored_layout
 from handsim._checks import check_array
-from handsim.errors import HandSimError
+from handsim.errors import FileError, HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
@@ -33,7 +33,7 @@ _DAMAGE: Final = (
 )
 
 
-class UserError(HandSimError):
+class UserError(FileError):
     """A user's file that cannot be read or written."""
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.optics.mirrors import cameras_by_mirror, reflect
+from handsim._checks import check_number, check_span
 from handsim.space.cameras import CameraRig
 
 if TYPE_CHECKING:
@@ -36,6 +37,13 @@ class GhostConfig:
     """Mean number of stray reflections a frame, Poisson distributed."""
     stray_margin: float = 0.3
     """Strays lie in the markers' box grown by this share."""
+
+    def __post_init__(self) -> None:
+        for name in ("mirror_rate", "reflectance"):
+            check_number(name, getattr(self, name), 0.0, 1.0)
+        for name in ("mirror_radius", "stray_rate", "stray_margin"):
+            check_number(name, getattr(self, name), 0.0)
+        check_span("mirror_distance", self.mirror_distance)
 
 
 def sample_ghosts(

@@ -1,71 +1,19 @@
-"""Lines of sight past moving triangle meshes: a bounding-volume tree, refitted in every frame, compiled."""
+"""Lines of sight past moving triangle meshes, compiled: one search of the mesh's tree for each line."""
 
 from __future__ import annotations
 
-import functools
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
 
+from gloves.optics.mesh_tree import MeshTree, refit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
-from handsim.hand.shape import named_shape
-from handsim.hand.skin.surface import build_surface
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float
     from numpy.typing import NDArray
-
-_LEAF: Final = 4
-_PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes are no special case
-
-
-class MeshTree:
-    """Boxes in boxes around a mesh's triangles.
-
-    The surface-area heuristic cuts the mesh as it is given here; later frames only move the boxes. What
-    counts is the faces, so one tree serves all meshes that share them (`hand_tree` all hands).
-
-    Nodes stand in depth-first order, a left child right after its parent, and `skip` is the node that follows
-    once a branch is left out: a search needs no stack, and a refit is one pass backwards.
-
-    Args:
-        vertices: Rest positions [m].
-        faces: Triangles of either winding.
-
-    Raises:
-        ArgumentError: There is no triangle, an array has another shape, or a face names no vertex.
-    """
-
-    def __init__(self, vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> None:
-        self.vertices: NDArray[np.float64] = np.ascontiguousarray(
-            check_array("vertices", vertices, (None, 3))
-        )
-        faces = np.asarray(faces)
-        if self.vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-            raise ArgumentError(
-                f"vertices {self.vertices.shape} and faces {faces.shape} are no (V, 3) and (F, 3) of a mesh"
-            )
-        if faces.min() < 0 or faces.max() >= len(self.vertices):
-            raise ArgumentError(
-                f"faces name vertices {faces.min()} to {faces.max()}, expected 0 to {len(self.vertices) - 1}"
-            )
-        corners = self.vertices[faces]
-        order, self.first, self.skip = _build(corners.min(axis=1), corners.max(axis=1))
-        self.faces: NDArray[np.int32] = np.ascontiguousarray(faces[order], dtype=np.int32)
-        """Triangles, those of leaf n from `first[n]` to `first[n + 1]`; other nodes own none."""
-        self.spots, self.spots_start = _leaf_vertices(self.faces, self.first)
-        self.boxes: NDArray[np.float64] = np.empty((len(self.skip), 6))
-        """Low and high corner of each node [m] around the vertices given here."""
-        _refit(self.vertices, self.skip, self.spots, self.spots_start, self.boxes)
-
-
-@functools.cache
-def hand_tree() -> MeshTree:
-    """The tree of every hand's skin: size, side and pose change only where its vertices are."""
-    surface = build_surface(named_shape("M"))
-    return MeshTree(surface.vertices, surface.faces)
 
 
 def clear_of_mesh(
@@ -150,110 +98,6 @@ def _check_lines(
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _build(low: Any, high: Any) -> Any:
-    """Order of the triangles, first triangle of every node (one more at the end), and `skip`."""
-    count = len(low)
-    centers = low + high
-    order = np.arange(count)
-    first = np.zeros(2 * count + 1, dtype=np.int32)
-    skip = np.zeros(2 * count, dtype=np.int32)
-    stack = [(0, count, -1)]  # begin, end, the left sibling
-    nodes = 0
-    while len(stack) > 0:
-        begin, end, left = stack.pop()
-        if left >= 0:
-            skip[left] = nodes
-        first[nodes] = begin
-        if end - begin > _LEAF:
-            middle = begin + _split(order[begin:end], low, high, centers)
-            stack.append((middle, end, nodes + 1))
-            stack.append((begin, middle, -1))
-        nodes += 1
-    first[nodes] = count
-    skip[0] = nodes
-    for node in range(nodes):  # a right child is left out together with its parent
-        if first[node + 1] == first[node]:
-            right = skip[node + 1]
-            skip[right] = skip[node]
-    return order, first[: nodes + 1], skip[:nodes]
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
-    """Sorts `order` and says where to cut it: least sum of triangles x box area, leaves full."""
-    count = len(order)
-    least, cut = np.inf, _LEAF
-    best = order.copy()
-    after = np.empty(count)
-    for axis in range(3):
-        sequence = order[np.argsort(centers[order, axis], kind="mergesort")]
-        for backwards in (True, False):
-            box_low, box_high = np.full(3, np.inf), np.full(3, -np.inf)
-            for step in range(count):
-                place = count - 1 - step if backwards else step
-                for i in range(3):
-                    box_low[i] = min(box_low[i], low[sequence[place], i])
-                    box_high[i] = max(box_high[i], high[sequence[place], i])
-                x, y, z = box_high - box_low
-                area = x * y + y * z + z * x
-                if backwards:
-                    after[place] = area
-                elif (step + 1) % _LEAF == 0 and step + 1 < count:
-                    cost = area * (step + 1) + after[step + 1] * (count - step - 1)
-                    if cost < least:
-                        least, cut = cost, step + 1
-                        best[:] = sequence
-    order[:] = best
-    return cut
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _leaf_vertices(faces: Any, first: Any) -> Any:
-    """The vertices of every node's own triangles, each once, and where each node's list starts."""
-    nodes = len(first) - 1
-    spots = np.empty(faces.size, dtype=np.int32)
-    start = np.zeros(nodes + 1, dtype=np.int32)
-    found = 0
-    for node in range(nodes):
-        start[node] = found
-        for face in range(first[node], first[node + 1]):
-            for corner in range(3):
-                vertex, known = faces[face, corner], False
-                for other in range(start[node], found):
-                    known = known or spots[other] == vertex
-                if not known:
-                    spots[found] = vertex
-                    found += 1
-    start[nodes] = found
-    return spots[:found].copy(), start
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
-    """Moves every box to where its triangles are; spelled out, because loops over axes take longer."""
-    for back in range(len(skip)):
-        node = len(skip) - 1 - back
-        if start[node] == start[node + 1]:
-            left = node + 1
-            right = skip[left]
-            for i in range(3):
-                a, b = boxes[left, i], boxes[right, i]
-                boxes[node, i] = a if a < b else b
-                a, b = boxes[left, 3 + i], boxes[right, 3 + i]
-                boxes[node, 3 + i] = a if a > b else b
-            continue
-        lx, ly, lz, hx, hy, hz = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
-        for spot in range(start[node], start[node + 1]):
-            v = spots[spot]
-            x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
-            lx, hx = (x if x < lx else lx), (x if x > hx else hx)
-            ly, hy = (y if y < ly else ly), (y if y > hy else hy)
-            lz, hz = (z if z < lz else lz), (z if z > hz else hz)
-        boxes[node, 0], boxes[node, 1], boxes[node, 2] = lx - _PAD, ly - _PAD, lz - _PAD
-        boxes[node, 3], boxes[node, 4], boxes[node, 5] = hx + _PAD, hy + _PAD, hz + _PAD
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _meets(start: Any, end: Any, vertices: Any, nodes: Any, boxes: Any) -> bool:
     """Whether the line from start to end meets a triangle."""
     faces, first, skip = nodes
@@ -313,7 +157,7 @@ def _clear_lines(vertices: Any, lines: Any, nodes: Any, spots: Any, boxes: Any) 
     for t in range(wanted.shape[0]):
         mesh, cameras = vertices[min(t, len(vertices) - 1)], ends[min(t, len(ends) - 1)]
         if len(spots[0]) > 0:
-            _refit(mesh, nodes[2], spots[0], spots[1], boxes)
+            refit(mesh, nodes[2], spots[0], spots[1], boxes)
         for p in range(wanted.shape[1]):
             for c in range(wanted.shape[2]):
                 start = starts[t, p, min(c, starts.shape[2] - 1)]

@@ -13,6 +13,7 @@ import numpy as np
 from gloves.fit import GlovedHand, attach
 from gloves.layout import stored_layout
 from gloves.takes.archives import check_shapes, read_archive, write_archive
+from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
 from handsim.hand.topology import NUM_QPOS
@@ -32,14 +33,22 @@ class HeldBody:
     name: str
     marker_names: tuple[str, ...]
     T_world_body: Float[np.ndarray, "T 4 4"]
+    """The body's frame seen from the world [m]."""
+
+    def __post_init__(self) -> None:
+        if self.T_world_body.ndim != 3 or self.T_world_body.shape[1:] != (4, 4):
+            raise ArgumentError(f"T_world_body has shape {self.T_world_body.shape}, expected (T, 4, 4)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Take:
-    """Points of every frame with IDs and truth.
+    """Points of every frame with IDs and truth: T frames, N columns.
 
     A label counts through the markers of the hands, in their order, then those of the body; -1 is a ghost or
     no point at all. An unbroken stretch of a column is one ID.
+
+    Raises:
+        ArgumentError: The arrays do not fit together, a label names no marker, or the rate is not positive.
     """
 
     rate: float
@@ -53,6 +62,12 @@ class Take:
     body: HeldBody | None
     settings: dict[str, Any]
     """What made it, as JSON."""
+
+    def __post_init__(self) -> None:
+        try:
+            _check(self)
+        except ValueError as error:
+            raise ArgumentError(f"not a take: {error}") from error
 
     @property
     def num_frames(self) -> int:
@@ -128,12 +143,13 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
         body=body,
         settings=header["settings"],
     )
-    _check(take)
     return take
 
 
 def _check(take: Take) -> None:
-    """Whether the parts of a take fit together."""
+    """Whether the parts of a take fit together; a `ValueError` says what does not."""
+    if take.points.ndim != 3:
+        raise ValueError(f"points have shape {take.points.shape}, expected (T, N, 3)")
     frames, columns = take.points.shape[:2]
     shapes = [
         (take.points, (frames, columns, 3)),
@@ -146,4 +162,4 @@ def _check(take: Take) -> None:
     known = sum(hand.fit.layout.num_markers for hand in take.hands)
     known += 0 if take.body is None else len(take.body.marker_names)
     if not 0.0 < take.rate < np.inf or (take.labels < -1).any() or (take.labels >= known).any():
-        raise ValueError("the rate is none, or a label names no marker")
+        raise ValueError("the rate is not positive, or a label names no marker")

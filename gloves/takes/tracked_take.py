@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, choices
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, bridge_gaps
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
-from handsim.hand.topology import NUM_BONES, NUM_QPOS, Side
+from handsim.hand.topology import NUM_QPOS, Side
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 KIND: Final = "tracked take"
 SCHEMA: Final = 1
 STATUSES: Final = ("lost", "coasting", "found", "tracked")
-"""What a status number means; only what is lost has no pose."""
-LOST, COASTING, FOUND, TRACKED = range(4)
+"""Names of the status numbers as files hold them ("found": initialized); only a lost hand has no pose."""
+LOST, COASTING, INITIALIZED, TRACKED = range(4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,8 +36,15 @@ class MarkedBody:
 
     name: str
     marker_names: tuple[str, ...]
-    places: Float[np.ndarray, "Q 3"]
+    positions: Float[np.ndarray, "Q 3"]
     """Its markers in its own frame [m]."""
+
+    def __post_init__(self) -> None:
+        if self.positions.shape != (len(self.marker_names), 3):
+            expected = f"({len(self.marker_names)}, 3)"
+            raise ArgumentError(
+                f"{self.name}: positions has shape {self.positions.shape}, expected {expected}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +92,7 @@ class TrackedTake:
         try:
             _check(self)
         except ValueError as error:
-            raise ArgumentError(f"no tracked take: {error}") from error
+            raise ArgumentError(f"not a tracked take: {error}") from error
 
     @property
     def num_frames(self) -> int:
@@ -146,7 +153,7 @@ def save_tracked_take(path: Path, take: TrackedTake) -> None:
     arrays["hands"] = np.array([pack_hand(hand.shape) for hand in take.hands], dtype=HAND_DTYPE)
     for name in _WORN:
         arrays[f"attachment_{name}"] = np.stack([getattr(hand.attachment, name) for hand in take.hands])
-    arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.places for body in take.bodies)])
+    arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.positions for body in take.bodies)])
     write_archive(path, KIND, SCHEMA, header, arrays)
 
 
@@ -185,7 +192,6 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTak
     worn = zip(*(arrays[f"attachment_{name}"] for name in _WORN), strict=True)
     for record, layout, parts in zip(arrays["hands"], header["layouts"], worn, strict=True):
         attachment = Attachment(stored_layout(layout), *parts)
-        _check_worn(attachment)
         hands.append(GloveFit(HandModel(unpack_hand(record)), attachment))
     names = [(stored["name"], tuple(stored["marker_names"])) for stored in header["bodies"]]
     places = np.split(arrays["body_places"], np.cumsum([len(markers) for _, markers in names], dtype=int))
@@ -200,18 +206,6 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTak
         settings=header["settings"],
         **{name: arrays[name] for name in _ARRAYS},
     )
-
-
-def _check_worn(worn: Attachment) -> None:
-    """Whether a stored attachment fits its layout."""
-    count = worn.layout.num_markers
-    check_shapes((getattr(worn, name), (count, 3 if name in _WORN[:2] else 4)) for name in _WORN)
-    if not np.isfinite(worn.points).all() or not np.isfinite(worn.normals).all():
-        raise ValueError("a marker has no place")
-    if worn.bone_indices.dtype.kind != "i" or not _within(worn.bone_indices, 0, NUM_BONES - 1):
-        raise ValueError("a marker is on no bone")
-    if not _within(worn.bone_weights, 0.0, 1.0):
-        raise ValueError("a marker's weights are no shares")
 
 
 def _check(take: TrackedTake) -> None:
@@ -237,7 +231,6 @@ def _check(take: TrackedTake) -> None:
             (take.body_poses, (frames, bodies, 7)),
             (take.body_status, (frames, bodies)),
             (take.body_rms, (frames, bodies)),
-            *((body.places, (len(body.marker_names), 3)) for body in take.bodies),
         ]
     )
     if not 0.0 < take.rate < np.inf or not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():

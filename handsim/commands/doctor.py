@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from handsim._siblings import SIBLINGS, shadowed_siblings
+from handsim.app.system_packages import EGL_PACKAGES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
 _PROBE_SECONDS: Final = 120.0
 # Run in processes of their own: a broken driver takes its process with it, and torch and GL stay out of ours.
 _DRAW: Final = """

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim._checks import check_array
+from handsim._checks import check_array, check_number
 from handsim.errors import ArgumentError, choices
 from handsim.hand.topology import DIGITS, SIDES, Side
 
@@ -154,6 +154,11 @@ class Population:
     """Spread of each finger's base angles [deg]; three times this for the thumb."""
     girth_spread: float = 0.06
     """Log spread of a digit's girth."""
+
+    def __post_init__(self) -> None:
+        check_number("children", self.children, 0.0, 1.0)
+        for name in ("digit_spread", "bone_spread", "knuckle_spread", "angle_spread", "girth_spread"):
+            check_number(name, getattr(self, name), 0.0)
 
 
 ADULTS: Final = Population()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim._checks import check_array
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, RigError, choices
 from handsim.space.rig_file import read_rig_file
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ class CameraRig:
     Messages count cameras from 1, in the order given.
 
     Raises:
-        ArgumentError: Too few or too many cameras, two at one place, a pose that is not one or lies beyond
+        RigError: Too few or too many cameras, two at one place, a pose that is not one or lies beyond
             50 m,
             or a field of view or resolution that no camera has.
     """
@@ -53,18 +53,16 @@ class CameraRig:
         poses = check_array("T_world_camera", self.T_world_camera, (None, 4, 4))
         object.__setattr__(self, "T_world_camera", poses)
         if not FEWEST_CAMERAS <= len(poses) <= MAX_CAMERAS:
-            raise ArgumentError(
+            raise RigError(
                 f"rig '{self.name}' has {len(poses)} cameras, expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
             )
         degrees = np.rad2deg(self.field_of_view)
         if not 1.0 <= degrees <= _WIDEST:
-            raise ArgumentError(
+            raise RigError(
                 f"rig '{self.name}': field_of_view is {degrees:g} degrees, expected 1 to {_WIDEST:g}"
             )
         if not 16 <= self.resolution <= 65536:
-            raise ArgumentError(
-                f"rig '{self.name}': resolution is {self.resolution} pixels, expected 16 to 65536"
-            )
+            raise RigError(f"rig '{self.name}': resolution is {self.resolution} pixels, expected 16 to 65536")
         for number, pose in enumerate(poses, 1):
             _check_pose(f"camera {number} of rig '{self.name}'", pose)
         _check_apart(self.name, self.positions)
@@ -130,14 +128,14 @@ def load_rig(name_or_path: str | Path) -> CameraRig:
     """A rig by its name, or anybody's by the path of its `.toml` file (docs/rigs.md says what stands in it).
 
     Raises:
-        ArgumentError: No such rig or file, or the file does not describe one; the sentence names the file.
+        RigError: No such rig or file, or the file does not describe one; the sentence names the file.
     """
     if str(name_or_path) in list_rigs():
         return named_rig(str(name_or_path))
     path = Path(name_or_path)
     if path.suffix.lower() != ".toml":
         unknown = choices(str(name_or_path), list_rigs(), noun="camera rig")
-        raise ArgumentError(f"{unknown}, or the path of a .toml file")
+        raise RigError(f"{unknown}, or the path of a .toml file")
     return _read(path)
 
 
@@ -149,19 +147,15 @@ def _read(path: Path) -> CameraRig:
             for number, camera in enumerate(table.cameras, 1)
         ]
         if not poses:
-            raise ArgumentError(
-                f"rig '{table.name}' has 0 cameras, expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
-            )
+            raise RigError(f"rig '{table.name}' has 0 cameras, expected {FEWEST_CAMERAS} to {MAX_CAMERAS}")
         return CameraRig(table.name, np.stack(poses), np.deg2rad(table.field_of_view), table.resolution)
-    except ArgumentError as error:
-        raise ArgumentError(f"{path}: {error}") from error
+    except RigError as error:
+        raise RigError(f"{path}: {error}") from error
 
 
 def _aimed(number: int, position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
     if np.linalg.norm(target - position) < _APART:
-        raise ArgumentError(
-            f"camera {number} looks at the place it stands at; expected a target in front of it"
-        )
+        raise RigError(f"camera {number} looks at the place it stands at; expected a target in front of it")
     return look_at(position, target)
 
 
@@ -221,12 +215,10 @@ def _check_pose(owner: str, pose: NDArray[np.float64]) -> None:
         or np.linalg.det(turn) < 0.0
         or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])
     ):
-        raise ArgumentError(
-            f"{owner}: T_world_camera is not a rotation and a position, expected a rigid pose"
-        )
+        raise RigError(f"{owner}: T_world_camera is not a rotation and a position, expected a rigid pose")
     distance = np.linalg.norm(pose[:3, 3])
     if distance > _FARTHEST:
-        raise ArgumentError(
+        raise RigError(
             f"{owner} stands {distance:.4g} m from the origin, expected at most {_FARTHEST:g} m; "
             "are these millimeters? Positions are in meters"
         )
@@ -237,6 +229,6 @@ def _check_apart(name: str, positions: NDArray[np.float64]) -> None:
     gaps[np.tril_indices(len(gaps))] = np.inf
     first, second = np.unravel_index(gaps.argmin(), gaps.shape)
     if gaps[first, second] < _APART:
-        raise ArgumentError(
+        raise RigError(
             f"cameras {first + 1} and {second + 1} of rig '{name}' stand at one place, expected places apart"
         )

@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from handsim._checks import check_array
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, ObjectError, choices
 from handsim.space import solids as object_solids
 from handsim.space.solids import Part
 
@@ -61,6 +61,13 @@ class RigidObject:
             ("shiny", (None, 7)),
         ):
             object.__setattr__(self, name, check_array(name, getattr(self, name), shape))
+        faces = np.asarray(self.faces)
+        if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+            raise ArgumentError(f"faces has shape {faces.shape}, expected whole numbers (F, 3)")
+        if faces.size and not 0 <= faces.min() <= faces.max() < len(self.vertices):
+            raise ArgumentError(
+                f"faces name vertices {faces.min()} to {faces.max()}, expected 0 to {len(self.vertices) - 1}"
+            )
         if not 0.0 < self.mass < np.inf:
             raise ArgumentError(f"{self.name}: the mass is {self.mass:g} kg, expected a positive number")
         if not self.parts:
@@ -95,24 +102,24 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
         mass: Its mass [kg].
 
     Raises:
-        ArgumentError: The file cannot be read, or is not a closed surface of a size that a hand can hold.
+        ObjectError: The file cannot be read, or is not a closed surface of a size that a hand can hold.
     """
     path = Path(path)
     mesh = _read_mesh(path)
     if not len(mesh.faces):
-        raise ArgumentError(f"{path}: the mesh is empty, expected a closed surface of triangles")
+        raise ObjectError(f"{path}: the mesh is empty, expected a closed surface of triangles")
     if not np.isfinite(mesh.vertices).all():
-        raise ArgumentError(f"{path}: the mesh has vertices that are NaN or infinite, expected finite meters")
+        raise ObjectError(f"{path}: the mesh has vertices that are NaN or infinite, expected finite meters")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if size > _LARGEST:
-        raise ArgumentError(
+        raise ObjectError(
             f"{path}: the mesh is {size:.3g} m large, expected at most 1 m; is it in millimeters?"
         )
     if size < _SMALLEST:
-        raise ArgumentError(f"{path}: the mesh is {size:.3g} m large, expected at least 2 mm, in meters")
+        raise ObjectError(f"{path}: the mesh is {size:.3g} m large, expected at least 2 mm, in meters")
     if not mesh.is_watertight:
-        raise ArgumentError(f"{path}: the mesh is not watertight; close its holes, so that it has an inside")
+        raise ObjectError(f"{path}: the mesh is not watertight; close its holes, so that it has an inside")
     if mesh.volume < 0.0:
         mesh.invert()
     return RigidObject(
@@ -130,13 +137,13 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
 
 def _read_mesh(path: Path) -> Any:
     if path.suffix.lower() not in MESH_SUFFIXES:
-        raise ArgumentError(f"{path}: expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}")
+        raise ObjectError(f"{path}: expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}")
     if not path.is_file():
-        raise ArgumentError(f"{path}: no such file")
+        raise ObjectError(f"{path}: no such file")
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # readers of damaged files fail in many ways
-        raise ArgumentError(f"{path}: not a readable {path.suffix} mesh ({error})") from error
+        raise ObjectError(f"{path}: not a readable {path.suffix} mesh ({error})") from error
     return mesh
 
 

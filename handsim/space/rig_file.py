@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import HandSimError, RigError
 from handsim.files.atomic import read_toml
 from handsim.files.toml_values import check_keys, number_of, numbers, shown, tables_of
 
@@ -34,23 +34,23 @@ def read_rig_file(path: Path) -> RigTable:
     """Read a rig's file.
 
     Raises:
-        ArgumentError: It cannot be read, is damaged, or a key is missing, unknown or of another kind.
+        RigError: It cannot be read, is damaged, or a key is missing, unknown or of another kind.
     """
-    table = read_toml(path, error=ArgumentError)
+    table = read_toml(path, error=RigError)
     try:
         return _parse(table)
     except HandSimError as error:
-        raise ArgumentError(f"{path}: {error}") from error
+        raise RigError(f"{path}: {error}") from error
 
 
 def _parse(table: Mapping[str, object]) -> RigTable:
     check_keys(table, "the file", _RIG_KEYS, optional=("description", "resolution", "camera"))
     name, tables = table["name"], tables_of(table, "camera")
     if not isinstance(name, str) or not name or not name.isprintable():
-        raise ArgumentError(f"name is {shown(name)}, expected printable text in quotes")
+        raise RigError(f"name is {shown(name)}, expected printable text in quotes")
     resolution = table.get("resolution", 1280)
     if isinstance(resolution, bool) or not isinstance(resolution, int):
-        raise ArgumentError(f"resolution is {shown(resolution)}, expected a whole number of pixels")
+        raise RigError(f"resolution is {shown(resolution)}, expected a whole number of pixels")
     angle = number_of(table, "field_of_view")
     cameras = [_parse_camera(entry, f"camera {number}") for number, entry in enumerate(tables, 1)]
     return RigTable(name, angle, resolution, cameras)
@@ -71,4 +71,4 @@ def _parse_camera(
         )
         return position, target
     given = " and ".join(table) or "nothing"
-    raise ArgumentError(f"{owner} has {given}, expected position and target, or T_world_camera alone")
+    raise RigError(f"{owner} has {given}, expected position and target, or T_world_camera alone")

@@ -85,7 +85,7 @@ def close_fingers(
     all_of_other = np.ones((3, len(other.capsules.radii)), dtype=bool)
     for press, joints in _STAGES:
         for digit in _ORDER:
-            parts = _digit(model, digit)
+            parts = digit_parts(model, digit)
             rest = [k for k in range(len(model.capsules.bones)) if k not in parts.capsules]
             place = slice(4 * digit, 4 * digit + 4)
             goal = angles[:, place].copy()
@@ -122,7 +122,7 @@ def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarra
     return -smooth_above(-values, window)
 
 
-def _digit(model: HandModel, digit: int) -> Digit:
+def digit_parts(model: HandModel, digit: int) -> Digit:
     capsules, skeleton = model.capsules, model.skeleton
     first = 1 + 3 * digit
     places = np.array([int(np.flatnonzero(capsules.bones == first + number)[0]) for number in range(3)])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numba
 import numpy as np
 
+from handsim.kernels.chain import pose_digit_axes
 from handsim.kernels.segments import segment_distance_squared
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def search_closing(ways: Any, parts: Any, obstacles: Any) -> Any:
     """Share of its way that a digit can go before it meets something, in every frame."""
     share = np.ones(len(ways.start))
     near = np.empty(len(obstacles.radii), dtype=np.int64)
-    angles, bones, scratch = np.empty(4), np.empty((3, 2, 3)), np.empty((7, 3))
+    angles, bones, scratch = np.empty(4), np.empty((3, 2, 3)), np.empty((4, 3))
     for frame in range(len(ways.start)):
         wrist = ways.rotations[frame], ways.positions[frame]
         count = _within_reach(wrist, parts, obstacles, frame, near)
@@ -126,7 +127,7 @@ def search_closing(ways: Any, parts: Any, obstacles: Any) -> Any:
                 angles[hinge] = ways.start[frame, hinge] + tried * (
                     ways.goal[frame, hinge] - ways.start[frame, hinge]
                 )
-            _bend(wrist, angles, parts, bones, scratch)
+            pose_digit_axes(wrist, angles, parts, bones, scratch)
             if _blocked(bones, parts, obstacles, frame, near[:count]):
                 high = min(tried, 1.0 - 1e-9)
             else:
@@ -169,55 +170,7 @@ def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> b
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
     """Capsule axes (T, 3, 2, 3) of a digit at hinge angles (T, 4); wrists are rotations and positions."""
-    posed, scratch = np.empty((len(angles), 3, 2, 3)), np.empty((7, 3))
+    posed, scratch = np.empty((len(angles), 3, 2, 3)), np.empty((4, 3))
     for frame in range(len(angles)):
-        _bend((wrists[0][frame], wrists[1][frame]), angles[frame], parts, posed[frame], scratch)
+        pose_digit_axes((wrists[0][frame], wrists[1][frame]), angles[frame], parts, posed[frame], scratch)
     return posed
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _bend(wrist: Any, angles: Any, parts: Any, posed: Any, scratch: Any) -> None:
-    """Capsule axes `posed` (3, 2, 3) of a digit: the forward kinematics of `HandModel`, for one digit."""
-    frame, turned, origin = scratch[:3], scratch[3:6], scratch[6]
-    frame[:] = wrist[0]
-    origin[:] = wrist[1]
-    hinge = 0
-    for bone in range(3):
-        for row in range(3):
-            for column in range(3):
-                origin[row] += frame[row, column] * parts.offsets[bone, column]
-        _multiply(frame, parts.rotations[bone], turned)
-        for _ in range(2 if bone == 0 else 1):
-            _turn(frame, parts.axes[hinge], angles[hinge], turned)
-            hinge += 1
-        for end in range(2):
-            for row in range(3):
-                posed[bone, end, row] = origin[row]
-                for column in range(3):
-                    posed[bone, end, row] += frame[row, column] * parts.ends[bone, end, column]
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _multiply(frame: Any, rotation: Any, scratch: Any) -> None:
-    scratch[:] = frame
-    for row in range(3):
-        for column in range(3):
-            frame[row, column] = (
-                scratch[row, 0] * rotation[0, column]
-                + scratch[row, 1] * rotation[1, column]
-                + scratch[row, 2] * rotation[2, column]
-            )
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _turn(frame: Any, axis: Any, angle: Any, scratch: Any) -> None:
-    """Turn a frame about an axis of its own (Rodrigues' formula on its rows)."""
-    scratch[:] = frame
-    sine, cosine = np.sin(angle), np.cos(angle)
-    x, y, z = axis[0], axis[1], axis[2]
-    for row in range(3):
-        a, b, c = scratch[row, 0], scratch[row, 1], scratch[row, 2]
-        along = (1.0 - cosine) * (a * x + b * y + c * z)
-        frame[row, 0] = cosine * a + sine * (b * z - c * y) + along * x
-        frame[row, 1] = cosine * b + sine * (c * x - a * z) + along * y
-        frame[row, 2] = cosine * c + sine * (a * y - b * x) + along * z

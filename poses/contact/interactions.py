@@ -90,7 +90,7 @@ def at_beats(keys: Float[np.ndarray, "K *n"], beats: Float[np.ndarray, "T"]) -> 
 
 
 def check_names(names: tuple[str, ...]) -> None:
-    """Raise a `ArgumentError` that lists the valid names when one is unknown, or when there is none."""
+    """Raise an `ArgumentError` that lists the valid names when one is unknown, or when there is none."""
     if not names:
         raise ArgumentError(f"no interactions were named; valid names: {', '.join(INTERACTIONS)}")
     for name in names:

@@ -13,21 +13,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.contact import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import random_quaternions, rotation_quaternions
 from poses.contact.interactions import INTERACTIONS, check_names
-from poses.contact.meetings import (
-    Passage,
-    TwoHandConfig,
-    draw_poses,
-    join_passages,
-    play_meeting,
-    way_between,
-)
+from poses.contact.meetings import draw_poses, play_meeting
+from poses.contact.passages import Passage, TwoHandConfig, join_passages, way_between
 from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
 from poses.motion.wrist_paths import along
 
@@ -86,9 +80,9 @@ def sample_two_hand_motion(
         rng: Source of all randomness.
 
     Raises:
-        ArgumentError: The duration is not positive, an interaction is unknown, the hands are not a right and
-            a
-            left one, or no valid way to bring them together was found.
+        ArgumentError: The duration is not positive, an interaction is unknown, or the hands are not a right
+            and a left one.
+        PoseError: No valid path that brings them together was found.
     """
     config = config or TwoHandConfig()
     names = INTERACTIONS if interactions is None else tuple(interactions)
@@ -120,8 +114,8 @@ def sample_two_hand_poses(
         qpos of the right hand and of the left one.
 
     Raises:
-        ArgumentError: The count is not positive, the hands are not a right and a left one, or no valid poses
-            were found.
+        ArgumentError: The count is not positive, or the hands are not a right and a left one.
+        PoseError: No valid poses were found.
     """
     _check_sides(right, left)
     if count < 1:
@@ -143,7 +137,7 @@ def sample_two_hand_poses(
             volume = TwoHandConfig().volume
             places = ROOM_CENTER + rng.uniform(-volume, volume, size=(count, 3))
             return _in_world(whole, places, Rotation.from_quat(random_quaternions(count, rng=rng)))
-    raise ArgumentError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
+    raise PoseError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
 
 
 def _next_passages(
@@ -167,7 +161,7 @@ def _next_passages(
             way = way_between(right, left, last, meeting.at([0]), config, rng=rng)
             if way is not None:
                 return [way, meeting]
-    raise ArgumentError(f"no valid way was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
+    raise PoseError(f"no valid way was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
 
 
 def _travel(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import mujoco
 import numpy as np
 
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, NUM_JOINTS
 from handsim.space.objects import RigidObject
@@ -60,7 +60,8 @@ def settle_hold(
         hold: One of `hold_names`; any of them when not given.
 
     Raises:
-        ArgumentError: The thing is not held so, or this hand does not get hold of it in forty tries.
+        ArgumentError: The object has no hold of this name.
+        PoseError: This hand does not get hold of it in forty tries.
     """
     names = hold_names(obj) if hold is None else (hold,)
     scene = grasp_scene(model, obj)
@@ -71,7 +72,7 @@ def settle_hold(
         if isinstance(settled, Hold):
             return settled
         why = settled
-    raise ArgumentError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
+    raise PoseError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
 
 
 def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldStyle:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, NUM_JOINTS
 from handsim.space.objects import RigidObject
@@ -56,12 +56,12 @@ def sample_held_poses(
         Hinge angles [rad], and `T_wrist_object`.
 
     Raises:
-        ArgumentError: The hold is not valid, such as one of another hand.
+        PoseError: The hold is not valid, such as one of another hand.
     """
     scene, style = grasp_scene(model, obj), hold_style(model, obj, hold.name)
     start = Held(hold.angles[None], hold.T_wrist_object[None])
     if not is_held_valid(scene, start)[0]:
-        raise ArgumentError(f"the hold '{hold.name}' is not valid for this hand and the {obj.name}")
+        raise PoseError(f"the hold '{hold.name}' is not valid for this hand and the {obj.name}")
     angles = np.clip(hold.angles + _deviations(style, count, rng), LOW, HIGH)
     poses = np.tile(hold.T_wrist_object, (count, 1, 1))
     shift, turn = (scale * rng.standard_normal((count, 3)).clip(-2.0, 2.0) for scale in _WOBBLE)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.space.objects import RigidObject
@@ -68,7 +68,8 @@ def sample_object_motion(
         rng: Source of all randomness.
 
     Raises:
-        ArgumentError: The duration is not positive, or this hand does not get hold of the thing.
+        ArgumentError: The duration is not positive.
+        PoseError: This hand does not get hold of the object, or finds no valid path out of a hold.
     """
     config = config or MotionConfig()
     if not 0.0 < duration < np.inf:
@@ -116,9 +117,7 @@ class _Player:
             for part in (*ways, self._way(start, self._home(current))):
                 if is_held_valid(self.scene, part).all():
                     return self._rested(part), current
-        raise ArgumentError(
-            f"no valid way out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries"
-        )
+        raise PoseError(f"no valid way out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries")
 
     def _home(self, number: int) -> Held:
         return Held(self.holds[number].angles[None], self.holds[number].T_wrist_object[None])

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from handsim._checks import check_number, check_span
+
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
@@ -34,7 +36,15 @@ class MotionConfig:
     volume: float = 0.3
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
     wrist_time: tuple[float, float] = (0.6, 2.0)
-    """Shortest and longest time between two places of the wrist [s]."""
+    """Shortest and longest time between two positions of the wrist [s]."""
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "max_speed", "max_acceleration"):
+            check_number(name, getattr(self, name), 0.0, above=True)
+        for name in ("hold", "volume"):
+            check_number(name, getattr(self, name), 0.0)
+        for name in ("durations", "wrist_time"):
+            check_span(name, getattr(self, name))
 
 
 def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:

@@ -43,9 +43,8 @@ def sample_motion(
         rng: Source of all randomness.
 
     Raises:
-        ArgumentError: The duration is not positive or less than a step, this hand has no room for its
-            fingers,
-            or no way leads out of a pose.
+        ArgumentError: The duration is not positive or less than a step.
+        PoseError: This hand has no room for its fingers, or no path leads out of a pose.
     """
     config = config or MotionConfig()
     frames = count_frames(duration, config)
@@ -77,8 +76,8 @@ def motion_through(
         rng: Source of all randomness.
 
     Raises:
-        ArgumentError: There are less than two poses, one is not valid on this hand, or no way leads out of
-            one.
+        ArgumentError: There are fewer than two poses, or one is not valid on this hand.
+        PoseError: No path leads out of one.
     """
     config = config or MotionConfig()
     poses = check_array("poses", poses, (None, NUM_JOINTS))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion
 from handsim.hand.topology import NUM_JOINTS
@@ -62,8 +62,8 @@ def scripted_motion(
         rng: Source of all randomness.
 
     Raises:
-        ArgumentError: There is no such script, the duration is not positive or less than a step, or this hand
-            cannot do what the script asks for.
+        ArgumentError: There is no such script, or the duration is not positive or less than a step.
+        PoseError: This hand cannot do what the script asks for.
     """
     if script not in _scripts():
         raise ArgumentError(choices(script, _scripts(), noun="script"))
@@ -90,8 +90,8 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
     Touches that this hand's thumb cannot reach and poses that it finds no valid way out of are left out.
 
     Raises:
-        ArgumentError: There is no such script, it has no poses of its own, or this hand can strike none of
-            them.
+        ArgumentError: There is no such script, or it has no poses of its own.
+        PoseError: This hand can strike fewer than two of them.
     """
     if script not in _scripts() or script == FREE:
         raise ArgumentError(choices(script, [name for name in _scripts() if name != FREE], noun="script"))
@@ -104,14 +104,14 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
         poses = make_valid(model, np.stack([gesture(name) for name in entry["gestures"]]))
     poses = poses[np.flatnonzero(can_be_left(model, poses))]
     if len(poses) < 2:
-        raise ArgumentError(f"this hand can strike {len(poses)} poses of '{script}', expected at least 2")
+        raise PoseError(f"this hand can strike {len(poses)} poses of '{script}', expected at least 2")
     return poses
 
 
 def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
     found: list[NDArray[np.float64]] = []
     for finger in fingers:
-        with contextlib.suppress(ArgumentError):  # another finger will do
+        with contextlib.suppress(PoseError):  # another finger will do
             found.append(touching_angles(model, finger))
     touches: NDArray[np.float64] = np.array(found).reshape(-1, NUM_JOINTS)
     return touches

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from handsim._checks import check_array, check_number, check_span
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
 from poses.motion.minimum_jerk import MotionConfig, minimum_jerk
@@ -32,7 +33,13 @@ class WristConfig:
     turning: float = 0.5
     """Standard deviation of the turns about each axis, from fingers ahead and palm down [rad]."""
     times: tuple[float, float] = (0.6, 2.0)
-    """Shortest and longest time from place to place [s]."""
+    """Shortest and longest time between two positions [s]."""
+
+    def __post_init__(self) -> None:
+        check_array("center", self.center, (3,))
+        check_number("volume", self.volume, 0.0)
+        check_number("turning", self.turning, 0.0)
+        check_span("times", self.times)
 
 
 def free_wrist_path(

@@ -77,6 +77,11 @@ def gestures_of(library: str) -> Float[np.ndarray, "G 20"]:
     return np.stack(list(_library(library).values()))
 
 
+def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
+    """Joint angles [rad] of every named gesture of all libraries, in the order of `topology.JOINTS`."""
+    return {name: angles.copy() for library in LIBRARIES for name, angles in _library(library).items()}
+
+
 def all_gestures() -> Float[np.ndarray, "G 20"]:
     """Hinge angles [rad] of the gestures that random poses are blended from: the library "gestures".
 

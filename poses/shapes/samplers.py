@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.special import ndtr
 
+from handsim._checks import check_number
 from poses.shapes.couplings import HIGH, LOW, apply_couplings, finger_view
 from poses.shapes.library import all_gestures
 
@@ -45,6 +46,16 @@ class PoseMix:
     """Correlated finger curls: neighbors move together, any finger may leave the others."""
     anywhere: float = 0.05
     """Uniform within the ranges."""
+
+    def __post_init__(self) -> None:
+        for name in ("gestures", "curls", "anywhere"):
+            check_number(name, getattr(self, name), 0.0)
+        check_number(
+            "the sum of gestures, curls and anywhere",
+            self.gestures + self.curls + self.anywhere,
+            0.0,
+            above=True,
+        )
 
 
 DEFAULT_MIX: Final = PoseMix()

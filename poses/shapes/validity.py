@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError
+from handsim._checks import check_array
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import JOINTS
+from handsim.hand.topology import JOINTS, NUM_QPOS
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
 from poses.shapes.samplers import DEFAULT_MIX, PoseMix, sample_angles
@@ -34,18 +35,31 @@ def is_valid(
     return inside & free
 
 
+def validate(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Bool[np.ndarray, "T"]:
+    """Which poses this hand can strike: in range, and at most 1 mm deep in itself (`MAX_PENETRATION`).
+
+    Args:
+        model: The hand.
+        qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad]; the wrist may be anywhere.
+
+    Raises:
+        ArgumentError: `qpos` is not (T, 27) or not finite.
+    """
+    return is_valid(model, check_array("qpos", qpos, (None, NUM_QPOS))[:, 7:])
+
+
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     """A valid relaxed pose of this hand, its fingers fanned just as far as its girth asks for.
 
     Raises:
-        ArgumentError: No fan makes room for these fingers.
+        PoseError: No fan makes room for these fingers.
     """
     fans = np.arange(0.0, 13.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN
     valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
     if not valid.any():
-        raise ArgumentError("this hand's fingers overlap at rest: its girths are too large for its breadth")
+        raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
     resting: NDArray[np.float64] = tries[valid.argmax()]
     return resting
 

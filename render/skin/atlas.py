@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from handsim.hand.skin.cage import WRIST, cage_topology
+from handsim.hand.skin.cage_topology import WRIST, cage_topology
 from handsim.hand.skin.subdivision import catmull_clark, subdivided_loop
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ import numpy as np
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
+from handsim.kernels.integration import move, velocity_of
 from track.association.digit_hypotheses import DigitTrust, digit_ranges
 from track.association.point_matching import worth_of
-from track.kinematics.integration import move, velocity_of
 from track.kinematics.joint_prior import HingeBelief, foresee, rest, resting_covariance
 from track.kinematics.marker_prediction import Expectation
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver

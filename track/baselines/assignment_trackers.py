@@ -14,9 +14,9 @@ from scipy.optimize import linear_sum_assignment
 
 from gloves.fit import GloveFit
 from handsim.errors import ArgumentError
+from handsim.kernels.integration import move, velocity_of
 from track.baselines.plain_hand import MOST_RMS, PlainHand
 from track.baselines.proposals import name_by_proximity
-from track.kinematics.integration import move, velocity_of
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 
 if TYPE_CHECKING:

@@ -21,6 +21,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.skin.surface import build_surface
 from handsim.hand.topology import NUM_BONES
+from handsim.kernels.integration import move
 from track.calibration.contacts import PRESS, Contacts, Meeting, meet, trust
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
@@ -41,7 +42,6 @@ from track.calibration.skin_walk import (
     slide,
     weight_slopes,
 )
-from track.kinematics.integration import move
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -14,7 +14,7 @@ from scipy.spatial.distance import cdist
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from gloves.fit import GloveFit
-from gloves.takes.tracked_take import FOUND, TRACKED, TrackedTake
+from gloves.takes.tracked_take import INITIALIZED, TRACKED, TrackedTake
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError
 from handsim.hand.topology import Side
@@ -103,7 +103,7 @@ def _round(
 
 def _sure(take: TrackedTake, side: Side) -> Bool[np.ndarray, "T"]:
     """Frames whose labels can be relied on."""
-    sure: Bool[np.ndarray, "T"] = np.isin(take.status[:, take.hand(side)], (TRACKED, FOUND))
+    sure: Bool[np.ndarray, "T"] = np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))
     return sure
 
 

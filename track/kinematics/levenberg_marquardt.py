@@ -8,7 +8,7 @@ import numba
 import numpy as np
 
 from handsim.hand.topology import NUM_JOINTS
-from track.kinematics.integration import turn_by
+from handsim.kernels.rotations import rotate_quaternion
 from track.kinematics.marker_kinematics import FAST, NUM_UNKNOWNS, gather, place_markers
 
 MARKER_NOISE: Final = 0.001  # [m] one standard deviation, which everything else is weighed against
@@ -172,7 +172,7 @@ def move_wrist(qpos: Any, step: Any, moved: Any) -> None:
     moved[0] = qpos[0] + a + 2.0 * (w * i + y * k - z * j)
     moved[1] = qpos[1] + b + 2.0 * (w * j + z * i - x * k)
     moved[2] = qpos[2] + c + 2.0 * (w * k + x * j - y * i)
-    turn_by(qpos[3:7], step[NUM_JOINTS + 3 : NUM_JOINTS + 6], moved[3:7])
+    rotate_quaternion(qpos[3:7], step[NUM_JOINTS + 3 : NUM_JOINTS + 6], moved[3:7])
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

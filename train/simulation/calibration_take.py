@@ -11,7 +11,7 @@ import numpy as np
 
 from gloves.fit import GlovedHand, GloveFit
 from gloves.takes.take import Take
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS
 from handsim.space.cameras import load_rig
@@ -70,7 +70,8 @@ def simulate_calibration(
         rng: Source of all randomness.
 
     Raises:
-        ArgumentError: There are no hands or more than two, or a hand cannot move or touch.
+        ArgumentError: There are no hands or more than two.
+        PoseError: A hand cannot move or touch.
     """
     config = config or CalibrationTakeConfig()
     if not 1 <= len(hands) <= len(_PLACES):
@@ -94,7 +95,7 @@ def calibration_angles(
     """Hinge angles (T, 20) [rad]: rounds of touches, as far as the thumb reaches, then free motion.
 
     Raises:
-        ArgumentError: This hand cannot move.
+        PoseError: This hand cannot move.
     """
     touches = [pose for _ in range(config.rounds) for pose in _round(model, rng)]
     free = _free_motion(model, config.free, rng)
@@ -110,7 +111,7 @@ def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> 
         free = sample_motion(model, seconds, _FREE, rng=rng).qpos[: count_frames(seconds, _FREE), 7:]
         if can_be_left(model, free[:1]).all():
             return free
-    raise ArgumentError("this hand finds no way from its touches to a free motion")
+    raise PoseError("this hand finds no way from its touches to a free motion")
 
 
 def _round(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
@@ -119,7 +120,7 @@ def _round(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float6
     for finger in FINGERS:
         pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
         start = make_valid(model, (pinch + rng.normal(scale=_JITTER, size=NUM_JOINTS))[None])
-        with contextlib.suppress(ArgumentError):  # another finger, or the next round
+        with contextlib.suppress(PoseError):  # another finger, or the next round
             touch = touching_angles(model, finger, start)
             if can_be_left(model, touch[None]).all():
                 poses.append(touch)

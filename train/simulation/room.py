@@ -10,7 +10,8 @@ import numpy as np
 
 from gloves.fit import GlovedHand
 from gloves.optics.identities import number_runs, pack_columns
-from gloves.optics.mesh_sight import MeshTree, clear_of_body, clear_of_mesh, hand_tree
+from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
+from gloves.optics.mesh_tree import MeshTree, hand_tree
 from gloves.optics.mirrors import cameras_by_mirror, reflect
 from gloves.optics.reconstruction import OpticsConfig, Reconstruction, reconstruct
 from gloves.optics.strays import StrayConfig, sample_strays

@@ -11,7 +11,8 @@ import numpy as np
 
 from gloves.attachment import Attachment
 from gloves.optics.ghosts import GHOST_REACH, GhostConfig, keep_some, sample_ghosts
-from gloves.optics.mesh_sight import MeshTree, clear_of_body
+from gloves.optics.mesh_sight import clear_of_body
+from gloves.optics.mesh_tree import MeshTree
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.visibility import pack_cameras, visible_cameras
 from handsim.errors import ArgumentError

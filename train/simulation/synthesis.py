@@ -17,7 +17,7 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.optics.ghosts import GhostConfig
 from gloves.optics.reconstruction import OpticsConfig
 from handsim.app.workers import in_processes
-from handsim.errors import ArgumentError, DatasetError
+from handsim.errors import DatasetError, PoseError
 from handsim.files.json_files import claim, load_json
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
@@ -174,7 +174,7 @@ def sample_hands(population: Population, *, rng: np.random.Generator) -> tuple[H
         models = tuple(HandModel(dataclasses.replace(shape, side=side)) for side in SIDES)
         try:
             resting_angles(models[0])
-        except ArgumentError:
+        except PoseError:
             continue
         return models
 
@@ -231,6 +231,6 @@ def draw_scene(
             return together(right, left, -(-count // 2), rng=rng)
         if kind == 2:
             return holding(hand, count, config.volume, rng=rng)
-    except ArgumentError:
+    except PoseError:
         pass  # not everybody's hands get hold of everything
     return alone(hand, count, config.poses, config.volume, rng=rng)

@@ -19,13 +19,14 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.strays import StrayConfig
 from gloves.takes.take import Take
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.model import HandModel
 from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.hand.shape import ADULTS, sample_shape
 from handsim.space.cameras import ROOM_CENTER, check_outside_volume, load_rig
 from handsim.space.objects import named_object
-from poses.contact.pointing import keep_apart, point_pen, pointing_path
+from poses.contact.keeping_apart import keep_apart, point_pen
+from poses.contact.pointing import pointing_path
 from poses.contact.two_hands import TwoHandConfig, sample_two_hand_motion
 from poses.grasps.object_motion import sample_object_motion
 from poses.motion.scripts import scripted_motion
@@ -116,7 +117,8 @@ def simulate_twin(config: TwinConfig) -> Take:
 
     Raises:
         LayoutError: The glove is unknown or does not fit.
-        ArgumentError: The rig is unknown, damaged or stands in the hands' way.
+        RigError: The rig is unknown or damaged.
+        ArgumentError: The rig stands in the hands' way.
     """
     twin = TWINS[config.kind]
     key = list(TWINS).index(config.kind), twin.draw
@@ -136,7 +138,7 @@ def _cast(
     for _ in range(_MOST_PEOPLE - 1):
         try:
             return _play(kind, _couple(rng), layout, frames, rng)
-        except ArgumentError:  # these hands do not get hold of the pen
+        except PoseError:  # these hands do not get hold of the pen
             continue
     return _play(kind, _couple(rng), layout, frames, rng)
 

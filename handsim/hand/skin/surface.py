@@ -9,18 +9,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from scipy import sparse
 
-from handsim.hand.skin.cage import (
+from handsim.hand.skin.cage import CageScales, cage_vertices, digit_frames, first_scales, ring_girths
+from handsim.hand.skin.cage_topology import (
     KNUCKLES,
     METACARPUS,
-    CageScales,
     CageTopology,
     cage_topology,
-    cage_vertices,
-    digit_frames,
     dorsal,
-    first_scales,
     palmar,
-    ring_girths,
 )
 from handsim.hand.skin.subdivision import catmull_clark, subdivided_loop
 from handsim.hand.skin.weights import cage_weights, strongest_weights

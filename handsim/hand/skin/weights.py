@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.hand.skin.cage import (
+from handsim.hand.skin.cage_topology import (
     CARPUS,
     KNUCKLES,
     METACARPUS,

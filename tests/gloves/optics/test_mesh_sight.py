@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
-from gloves.optics.mesh_sight import MeshTree, clear_of_body, clear_of_mesh, hand_tree
+from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
+from gloves.optics.mesh_tree import MeshTree, hand_tree
 from gloves.optics.visibility import free_rays
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos

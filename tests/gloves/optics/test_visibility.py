@@ -9,7 +9,7 @@ import pytest
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays, pack_cameras, unpack_cameras, visible_cameras
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.space.cameras import CameraRig, named_rig
@@ -78,7 +78,7 @@ def test_packing_round_trip(rng):
 
 
 def test_bad_rigs_are_told():
-    with pytest.raises(ArgumentError, match="rig 'lonely' has 1 cameras, expected 2 to 32"):
+    with pytest.raises(RigError, match="rig 'lonely' has 1 cameras, expected 2 to 32"):
         CameraRig("lonely", np.eye(4)[None], 1.0)
     with pytest.raises(ArgumentError, match="unknown camera rig 'figure6'"):
         named_rig("figure6")

@@ -9,8 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from gloves.attachment import attach_markers
-from gloves.fit import GlovedHand
+from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
 from gloves.takes.archives import KINDS
 from gloves.takes.take import SUFFIX, Take, load_take, save_take
@@ -19,7 +18,6 @@ from gloves.takes.tracked_take import (
     SCHEMA,
     STATUSES,
     TRACKED,
-    GloveFit,
     MarkedBody,
     TrackedTake,
     load_tracked_take,
@@ -38,7 +36,7 @@ def take(rng) -> TrackedTake:
     hands = []
     for side in ("left", "right"):
         shape = sample_shape(side=side, rng=rng)
-        hands.append(GloveFit(shape, attach_markers(load_layout("dense19"), HandModel(shape))))
+        hands.append(attach(load_layout("dense19"), HandModel(shape)))
     status = rng.integers(len(STATUSES), size=(FRAMES, 2)).astype(np.int8)
     status[[0, 4]], status[5] = TRACKED, LOST
     qpos = rng.normal(size=(FRAMES, 2, 27))
@@ -98,7 +96,7 @@ def test_what_is_saved_is_what_is_read(take, tmp_path):
             (body.name, body.marker_names) for body in original.bodies
         ]
         for body in again.bodies:
-            np.testing.assert_array_equal(body.places, PEN.places)
+            np.testing.assert_array_equal(body.positions, PEN.positions)
         assert [path.name for path in tmp_path.glob(".*")] == []
 
 
@@ -155,7 +153,7 @@ def test_what_does_not_fit_together_is_no_take(take):
         {"confidence": take.confidence[:, 1:]},
         {"bodies": ()},
     ):
-        with pytest.raises(ArgumentError, match="no tracked take: "):
+        with pytest.raises(ArgumentError, match="not a tracked take: "):
             dataclasses.replace(take, **change)
 
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population, sample_shape
 from handsim.space.cameras import (
@@ -153,11 +153,11 @@ def test_error_sentences(tmp_path):
     actual = {}
     for name, text in MISTAKES.items():
         (tmp_path / "rig.toml").write_text(text)
-        with pytest.raises(ArgumentError) as told:
+        with pytest.raises(RigError) as told:
             load_rig(tmp_path / "rig.toml")
         actual[name] = str(told.value).replace(str(tmp_path), "")
     for name in ("figure6", "rigs/mine.json", "missing.toml"):
-        with pytest.raises(ArgumentError) as told:
+        with pytest.raises(RigError) as told:
             load_rig(name)
         actual[name] = str(told.value)
     path = GOLDEN / "rig_errors.json"
@@ -168,7 +168,7 @@ def test_error_sentences(tmp_path):
 
 def test_binary_files_are_told(tmp_path):
     (tmp_path / "rig.toml").write_bytes(b"\xff\xfe\x00name")
-    with pytest.raises(ArgumentError, match="not UTF-8 text"):
+    with pytest.raises(RigError, match="not UTF-8 text"):
         load_rig(tmp_path / "rig.toml")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, ObjectError
 from handsim.hand.motion import BodyMotion
 from handsim.space.objects import MARKER_RADIUS, RigidObject, load_object, named_object, object_names
 
@@ -152,7 +152,7 @@ def test_bad_meshes_are_told_in_a_sentence(tmp_path):
         "box.step": "expected a mesh file that ends in .stl, .obj, .ply, .glb",
         "missing.stl": "no such file",
     }.items():
-        with pytest.raises(ArgumentError, match=message) as caught:
+        with pytest.raises(ObjectError, match=message) as caught:
             load_object(tmp_path / name)
         assert "\n" not in str(caught.value)
 

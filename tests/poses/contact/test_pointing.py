@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.space.objects import named_object
-from poses.contact.pointing import PointingConfig, keep_apart, point_pen, pointing_path
+from poses.contact.keeping_apart import keep_apart, point_pen
+from poses.contact.pointing import PointingConfig, pointing_path
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.grasp_scene import object_penetration, wrist_poses
 from poses.grasps.object_motion import sample_object_motion
@@ -184,5 +185,5 @@ def test_hands_that_cannot_part_are_told(rng):
     controller = named_object("controller")
     held = sample_object_motion(right, controller, 30 / RATE, rng=rng)
     other = resting(left, len(held[0].qpos), tuple(held[0].qpos[0, :3]))
-    with pytest.raises(ArgumentError, match="however far one of them draws back"):
+    with pytest.raises(PoseError, match="however far one of them draws back"):
         keep_apart(right, left, controller, held, other, np.zeros((len(held[0].qpos), 3)))

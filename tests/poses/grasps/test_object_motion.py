@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape, shape_from_measures
 from handsim.hand.topology import DIGITS, bones_of
@@ -238,12 +238,12 @@ def test_bad_requests_are_told(held, rng):
     inside = hold.T_wrist_object.copy()
     inside[:3, 3] = (0.05, 0.0, 0.0)
     bad = Hold(hold.name, hold.angles, inside, hold.contacts)
-    with pytest.raises(ArgumentError, match="the hold 'tripod' is not valid for this hand and the pen"):
+    with pytest.raises(PoseError, match="the hold 'tripod' is not valid for this hand and the pen"):
         sample_held_poses(model, pen, bad, 1, rng=rng)
 
 
 def test_what_no_hand_can_hold_is_told(tmp_path, rng):
     trimesh.creation.icosphere(subdivisions=2, radius=0.4).export(tmp_path / "globe.stl")
     globe = load_object(tmp_path / "globe.stl", mass=5.0)
-    with pytest.raises(ArgumentError, match=r"this hand does not get hold of the globe.stl in \d+ tries"):
+    with pytest.raises(PoseError, match=r"this hand does not get hold of the globe.stl in \d+ tries"):
         settle_hold(HandModel.named("XS"), globe, rng=rng)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.hand.shape import sample_shape
@@ -72,7 +72,7 @@ def _people(count: int, seed: int) -> list[HandModel]:
     rng, people = np.random.default_rng(seed), []
     while len(people) < count:
         model = HandModel(sample_shape(side=SIDES[len(people) % 2], rng=rng))
-        with contextlib.suppress(ArgumentError):
+        with contextlib.suppress(PoseError):
             resting_angles(model)
             people.append(model)
     return people

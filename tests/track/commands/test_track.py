@@ -134,7 +134,7 @@ def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
     )
     take, first = load_tracked_take(out), truth.hand_labels[-1].stop
     assert [body.name for body in take.bodies] == ["controller", "mug"]
-    np.testing.assert_allclose(take.bodies[0].places, named_object("controller").markers, atol=1e-12)
+    np.testing.assert_allclose(take.bodies[0].positions, named_object("controller").markers, atol=1e-12)
     mine = truth.labels >= first
     assert np.mean(take.labels[mine] - 19 == truth.labels[mine] - first) > 0.99
     columns = read_capture(labeled)

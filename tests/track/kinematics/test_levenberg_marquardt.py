@@ -11,9 +11,9 @@ from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
+from handsim.kernels.integration import move
 from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
-from track.kinematics.integration import move
 from track.kinematics.levenberg_marquardt import MARKER_NOISE, descend, move_wrist
 from track.kinematics.marker_kinematics import hand_arrays, workspace
 

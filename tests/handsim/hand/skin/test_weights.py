@@ -1,7 +1,7 @@
 import numpy as np
 from numpy.testing import assert_allclose
 
-from handsim.hand.skin.cage import cage_topology
+from handsim.hand.skin.cage_topology import cage_topology
 from handsim.hand.skin.weights import cage_weights, strongest_weights
 from handsim.hand.topology import NUM_BONES
 

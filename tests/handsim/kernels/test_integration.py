@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from handsim.hand.model import HandModel
+from handsim.kernels.integration import move, velocity_of
 from handsim.space.transforms import random_quaternions
-from track.kinematics.integration import move, velocity_of
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,63 @@
+"""Blobs in the pictures of single cameras, compiled: noise, blobs that merge, and the rays through them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def draw_blobs(
+    sources: Any, seen: Any, T_world_camera: Any, camera: Any, rng: Any, centers: Any, radii: Any
+) -> None:
+    """Noisy blob centers [px] and radii; radius 0 where there is no blob."""
+    focal, noise, loss, radius = camera[0], camera[1], camera[2], camera[3]
+    for c in range(len(T_world_camera)):
+        pose = T_world_camera[c]
+        for s in range(len(sources)):
+            radii[c, s] = 0.0
+            if not seen[s, c] or np.isnan(sources[s, 0]) or (loss > 0.0 and rng.random() < loss):
+                continue
+            x, y, z = sources[s, 0] - pose[0, 3], sources[s, 1] - pose[1, 3], sources[s, 2] - pose[2, 3]
+            depth = pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z
+            if depth <= 1e-6:
+                continue
+            right = pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z
+            down = pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z
+            radii[c, s] = focal * radius / depth
+            centers[c, s, 0] = focal * right / depth + noise * rng.standard_normal()
+            centers[c, s, 1] = focal * down / depth + noise * rng.standard_normal()
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def cast_rays(
+    seen: Any, T_world_camera: Any, camera: Any, centers: Any, radii: Any, directions: Any, usable: Any
+) -> None:
+    """Unit rays of every source's blob in every camera, after blobs that touch have become one."""
+    focal, roundness = camera[0], camera[4]
+    count = seen.shape[0]
+    for c in range(len(T_world_camera)):
+        pose = T_world_camera[c]
+        for s in range(count):
+            usable[s, c] = radii[c, s] > 0.0
+            if not usable[s, c]:
+                continue
+            u, v, members = centers[c, s, 0], centers[c, s, 1], 1
+            for o in range(count):
+                if o == s or radii[c, o] == 0.0:
+                    continue
+                du, dv = centers[c, o, 0] - centers[c, s, 0], centers[c, o, 1] - centers[c, s, 1]
+                reach = radii[c, o] + radii[c, s]
+                squared = du * du + dv * dv
+                if squared >= reach * reach:
+                    continue
+                if squared > (roundness * reach) ** 2:
+                    usable[s, c] = False
+                    break
+                u, v, members = u + centers[c, o, 0], v + centers[c, o, 1], members + 1
+            u, v = u / (members * focal), v / (members * focal)
+            length = np.sqrt(u * u + v * v + 1.0)
+            for i in range(3):
+                directions[s, c, i] = (pose[i, 0] * u + pose[i, 1] * v + pose[i, 2]) / length

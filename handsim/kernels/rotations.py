@@ -1,0 +1,129 @@
+"""Rotations, compiled: axis and angle, quaternions (wxyz, MuJoCo's order) and 3x3 matrices.
+
+Everything is written out in scalars and into arrays of the caller, so that a kernel's inner loop makes no
+array.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float, y: float, z: float) -> None:
+    """Write the rotation matrix of a unit quaternion.
+
+    Args:
+        matrix: Matrix (3, 3) or transform (4, 4); its upper left 3x3 block is overwritten.
+        w: Real part.
+        x: First imaginary part.
+        y: Second imaginary part.
+        z: Third imaginary part.
+    """
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    matrix[1, 0], matrix[1, 1], matrix[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def write_axis_angle_matrix(
+    matrix: Float[np.ndarray, "_ _"], axis: Float[np.ndarray, "3"], angle: float
+) -> None:
+    """Write the rotation matrix about a unit axis by an angle [rad], by way of its quaternion.
+
+    Args:
+        matrix: Matrix (3, 3) or transform (4, 4); its upper left 3x3 block is overwritten.
+        axis: Unit vector (3,).
+        angle: [rad].
+    """
+    sine, cosine = np.sin(0.5 * angle), np.cos(0.5 * angle)
+    write_quaternion_matrix(matrix, cosine, sine * axis[0], sine * axis[1], sine * axis[2])
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def multiply_rotations(
+    first: Float[np.ndarray, "_ _"], second: Float[np.ndarray, "_ _"], product: Float[np.ndarray, "_ _"]
+) -> None:
+    """Write `first @ second` of two rotations, of which the upper left 3x3 blocks are used.
+
+    Args:
+        first: Rotation (3, 3) or transform (4, 4).
+        second: Rotation (3, 3) or transform (4, 4); not the same array as `product`.
+        product: Where the product goes (3, 3) or (4, 4); may be `first`.
+    """
+    for i in range(3):
+        x, y, z = first[i, 0], first[i, 1], first[i, 2]
+        for j in range(3):
+            product[i, j] = x * second[0, j] + y * second[1, j] + z * second[2, j]
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def rotate_about_axis(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float) -> None:
+    """Rotate a frame in place about an axis of its own (Rodrigues' formula on its rows).
+
+    Args:
+        rotation: Orientation (3, 3) of the frame, overwritten.
+        axis: Unit vector (3,) in the frame's own coordinates.
+        angle: [rad].
+    """
+    sine, cosine = np.sin(angle), np.cos(angle)
+    x, y, z = axis[0], axis[1], axis[2]
+    for row in range(3):
+        a, b, c = rotation[row, 0], rotation[row, 1], rotation[row, 2]
+        along = (1.0 - cosine) * (a * x + b * y + c * z)
+        rotation[row, 0] = cosine * a + sine * (b * z - c * y) + along * x
+        rotation[row, 1] = cosine * b + sine * (c * x - a * z) + along * y
+        rotation[row, 2] = cosine * c + sine * (a * y - b * x) + along * z
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def quaternion_product(
+    w: float, x: float, y: float, z: float, e: float, a: float, b: float, c: float
+) -> tuple[float, float, float, float]:
+    """Product (wxyz) of the quaternions (w, x, y, z) and (e, a, b, c)."""
+    return (
+        w * e - x * a - y * b - z * c,
+        w * a + x * e + y * c - z * b,
+        w * b - x * c + y * e + z * a,
+        w * c + x * b - y * a + z * e,
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def rotate_quaternion(
+    before: Float[np.ndarray, "4"], vector: Float[np.ndarray, "3"], after: Float[np.ndarray, "4"]
+) -> None:
+    """Rotate an orientation by a rotation vector in its own frame.
+
+    Args:
+        before: Unit quaternion (4,) wxyz.
+        vector: Rotation vector (3,) [rad].
+        after: Where the new unit quaternion (4,) goes; may be `before`.
+    """
+    a, b, c = vector[0], vector[1], vector[2]
+    angle = np.sqrt(a * a + b * b + c * c)
+    share = 0.5 if angle < 1e-8 else np.sin(0.5 * angle) / angle
+    after[0], after[1], after[2], after[3] = quaternion_product(
+        before[0], before[1], before[2], before[3], np.cos(0.5 * angle), share * a, share * b, share * c
+    )
+    scale = 1.0 / np.sqrt(after[0] ** 2 + after[1] ** 2 + after[2] ** 2 + after[3] ** 2)
+    for n in range(4):
+        after[n] *= scale
