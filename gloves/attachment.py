@@ -1,4 +1,4 @@
-"""A layout put on a hand: every marker finds its place on the skin and the bones that carry it."""
+"""A layout put on a hand: the position of every marker on the skin, and the bones that carry it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Attachment:
     points: Float[np.ndarray, "M 3"]
     """Marker centers at zero angles, in the wrist frame [m]: one radius above the skin."""
     normals: Float[np.ndarray, "M 3"]
-    """Directions in which the markers look away from the skin, at zero angles."""
+    """Outward unit directions of the skin under the markers, at zero angles."""
     bone_indices: Int[np.ndarray, "M 4"]
     """The bones that carry each marker."""
     bone_weights: Float[np.ndarray, "M 4"]
@@ -67,13 +67,13 @@ class Attachment:
     def centers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
     ) -> Float[np.ndarray, "T M 3"]:
-        """Marker centers [m] in the world, for poses of the same hand."""
+        """Marker centers [m] in the world, for bones from `forward_kinematics` of the same hand."""
         return self._carried(model, T_world_bone, self.points, 1.0)
 
     def markers(
         self, model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
     ) -> tuple[Float[np.ndarray, "T M 3"], Float[np.ndarray, "T M 3"]]:
-        """Marker centers [m] and outward directions in the world, for poses of the same hand."""
+        """Marker centers [m] and outward unit directions in the world, for bones of the same hand."""
         normals = self._carried(model, T_world_bone, self.normals, 0.0)
         normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
         return self.centers(model, T_world_bone), normals
@@ -81,7 +81,7 @@ class Attachment:
     def _carried(
         self, model: HandModel, T_world_bone: NDArray[np.float64], rest: NDArray[np.float64], last: float
     ) -> NDArray[np.float64]:
-        """Points (`last` 1) or directions (0) at the markers, blended over the bones: one product a frame."""
+        """Points (`last` 1) or directions (0) at the markers, blended over the bones in one product."""
         inverse = np.linalg.inv(model.rest_transforms)
         local = np.einsum("lij,mj->mli", inverse, np.insert(rest, 3, last, axis=1))
         weights = np.zeros(local.shape[:2])
@@ -96,25 +96,25 @@ class Attachment:
         inverse = np.linalg.inv(model.rest_transforms)[bones]
         local = np.einsum("mij,mj->mi", inverse[:, :3, :3], self.points) + inverse[:, :3, 3]
         return tuple(
-            Site(name, int(bone), place, self.layout.radius)
-            for name, bone, place in zip(self.layout.names, bones, local, strict=True)
+            Site(name, int(bone), position, self.layout.radius)
+            for name, bone, position in zip(self.layout.names, bones, local, strict=True)
         )
 
 
 def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
-    """Put a glove on a hand: from each place on its bone outwards to the skin.
+    """Put a glove on a hand: from each marker's point on its bone outwards to the skin.
 
     Raises:
-        LayoutError: A marker's ray finds no skin; the sentence names the marker.
+        LayoutError: A marker's ray meets no skin; the message names the marker.
     """
     surface = model.surface
     rays = np.array([_ray(marker, model) for marker in layout.markers])
     origins, directions = rays[:, 0], rays[:, 1]
-    markers, faces, bary, distances = _first_ways_out(origins, directions, surface)
+    markers, faces, bary, distances = _first_exits(origins, directions, surface)
     if len(markers) < layout.num_markers:
         marker = layout.markers[int(np.setdiff1d(np.arange(layout.num_markers), markers)[0])]
         raise LayoutError(
-            f"marker '{marker.name}' finds no skin from {marker.bone} at along {marker.along:g}, "
+            f"marker '{marker.name}' meets no skin from {marker.bone} at along {marker.along:g}, "
             f"across {marker.across:g}; move it onto the hand"
         )
     corners = surface.faces[faces]
@@ -125,10 +125,10 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
     return Attachment(layout, points, normals, indices, shares)
 
 
-def vary_places(
+def vary_layout(
     layout: MarkerLayout, *, along: float, around: float, rng: np.random.Generator
 ) -> MarkerLayout:
-    """The same glove put on less carefully.
+    """The same glove with its markers moved at random, as if put on less carefully.
 
     Args:
         layout: The glove as designed.
@@ -138,12 +138,12 @@ def vary_places(
     """
 
     def moved(marker: MarkerPlace) -> MarkerPlace:
-        slip, turn, side = np.clip(rng.standard_normal(3), -2.0, 2.0)
+        slip, roll, side = np.clip(rng.standard_normal(3), -2.0, 2.0)
         palm = marker.bone == BONE_NAMES[PALM]
         return dataclasses.replace(
             marker,
             along=float(np.clip(marker.along + (0.5 if palm else 1.0) * along * slip, -0.3, 1.3)),
-            around=float(np.clip(marker.around + (0.0 if palm else around) * turn, -np.pi, np.pi)),
+            around=float(np.clip(marker.around + (0.0 if palm else around) * roll, -np.pi, np.pi)),
             across=float(marker.across + 0.5 * along * side) if palm else 0.0,
         )
 
@@ -153,35 +153,37 @@ def vary_places(
 def wear(
     layout: MarkerLayout, model: HandModel, *, along: float, around: float, rng: np.random.Generator
 ) -> Attachment:
-    """The glove put on with its markers slipped a little (`vary_places`), again while one is off the hand.
+    """The glove put on with its markers slipped a little (`vary_layout`).
+
+    It is drawn again if a marker is off the hand; after twenty draws it is put on as designed.
 
     Raises:
-        LayoutError: A marker finds no skin however it slips.
+        LayoutError: A marker meets no skin even as designed.
     """
     for _ in range(_MOST_FITTINGS):
         try:
-            return attach_markers(vary_places(layout, along=along, around=around, rng=rng), model)
+            return attach_markers(vary_layout(layout, along=along, around=around, rng=rng), model)
         except LayoutError:
             continue
     return attach_markers(layout, model)
 
 
 def _ray(marker: MarkerPlace, model: HandModel) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where a marker's ray starts on its bone's axis and where it goes, at zero angles in the wrist frame."""
+    """Origin [m] and direction of a marker's ray from its bone, at zero angles in the wrist frame."""
     bone = BONE_NAMES.index(marker.bone)
     T_wrist_bone = model.rest_transforms[bone]
     sideways = 1.0 if model.shape.side == "right" else -1.0  # thumb side
     local = np.array([marker.along * model.skeleton.lengths[bone], 0.0, 0.0])
     if bone == PALM:
         local[1] = sideways * marker.across * model.shape.breadth
-    turn = np.array([0.0, sideways * np.sin(marker.around), np.cos(marker.around)])
-    return T_wrist_bone[:3, :3] @ local + T_wrist_bone[:3, 3], T_wrist_bone[:3, :3] @ turn
+    direction = np.array([0.0, sideways * np.sin(marker.around), np.cos(marker.around)])
+    return T_wrist_bone[:3, :3] @ local + T_wrist_bone[:3, 3], T_wrist_bone[:3, :3] @ direction
 
 
-def _first_ways_out(
+def _first_exits(
     origins: NDArray[np.float64], directions: NDArray[np.float64], surface: HandSurface
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """First ways out of the skin along rays: rays that find one, faces, barycentric weights, distances."""
+    """First exits from the skin along rays: rays that have one, faces, barycentric weights, distances [m]."""
     vertices, faces = surface.vertices, surface.faces
     first, second, third = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
     edges1, edges2 = second - first, third - first
@@ -208,7 +210,7 @@ def _crossings(
     edges1: NDArray[np.float64],
     edges2: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Where rays meet triangles, a pair a row: barycentric weights, distance, and whether on the way out.
+    """Intersections of rays and triangles, by pairs: barycentric weights, distance, whether on the way out.
 
     Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997).
     """
@@ -232,16 +234,16 @@ def _dot(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.
 
 def _normals_at(corners: NDArray[np.int64], surface: HandSurface) -> NDArray[np.float64]:
     """Skin normals of a few vertices (M, 3, 3), from the faces around them alone."""
-    wanted = np.zeros(len(surface.vertices), dtype=np.bool_)
-    wanted[corners] = True
-    around = surface.faces[wanted[surface.faces].any(axis=1)]
+    needed = np.zeros(len(surface.vertices), dtype=np.bool_)
+    needed[corners] = True
+    around = surface.faces[needed[surface.faces].any(axis=1)]
     return vertex_normals(surface.vertices, around)[corners]
 
 
 def _blend_weights(
     surface: HandSurface, corners: NDArray[np.int64], bary: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Skin weights between three vertices each, cut to the strongest four."""
+    """Skin weights interpolated between three vertices each, cut to the strongest four."""
     full = np.zeros((len(corners), len(BONE_NAMES)))
     rows = np.arange(len(corners))[:, None]
     for corner in range(3):

@@ -1,4 +1,4 @@
-"""A hand in its glove: the one type for a user's hand, a simulated one, a tracked one and a drawn one."""
+"""A hand in its glove: the type shared by users' hands, simulated, tracked and drawn ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ class GloveFit:
     """One hand and the glove on it."""
 
     model: HandModel
+    """The hand."""
     attachment: Attachment
+    """The glove's markers on this hand."""
 
     @property
     def side(self) -> Side:
@@ -54,6 +56,9 @@ class GloveFit:
         self, qpos: Float[np.ndarray, "T 27"]
     ) -> tuple[Float[np.ndarray, "T M 3"], Float[np.ndarray, "T M 3"]]:
         """Marker centers [m] and outward unit directions in the world, for poses of this hand.
+
+        Args:
+            qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad].
 
         Raises:
             ArgumentError: `qpos` is not (T, 27) or not finite.
@@ -96,12 +101,16 @@ class GlovedHand:
 def attach(layout: MarkerLayout, model: HandModel) -> GloveFit:
     """Put a glove on a hand as designed.
 
+    Args:
+        layout: The glove's markers.
+        model: The hand.
+
     Raises:
-        LayoutError: A marker finds no skin; the sentence names the marker.
+        LayoutError: A marker meets no skin; the message names the marker.
     """
     return GloveFit(model, attach_markers(layout, model))
 
 
 def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
-    """A hand of one of the five sizes (XS to XL), its glove put on as designed."""
+    """A hand of one of the five sizes (XS to XL), with its glove put on as designed."""
     return attach(layout, HandModel.named(size, side=side))

@@ -1,6 +1,6 @@
-"""Where a glove carries its markers: one place a marker on a bone's skin, read from a TOML file.
+"""Marker layouts: the place of each marker on a bone's skin, read from a TOML file.
 
-A layout says nothing about one hand's size: places are fractions of the bone they sit on, so that the same
+A layout does not depend on the size of a hand: places are fractions of the bone they are on, so that the same
 glove fits every hand. Angles are degrees in the file and radians in memory, the marker radius millimeters in
 the file and meters in memory.
 """
@@ -36,7 +36,7 @@ name = "my_glove"
 description = "Five finger tips and three markers on the back of the hand"
 radius_mm = 3.2  # of every marker, 0.5 to 15
 
-# One [[marker]] table a marker, 5 to 60 of them; labels count in this order.
+# One [[marker]] table per marker, 5 to 60 of them; labels count in this order.
 #   name    your own; no two alike
 #   bone    one of: BONES
 #   along   0 = the bone's near end, 1 = its far end; -0.3 to 1.3
@@ -52,7 +52,7 @@ class MarkerPlace:
     """One marker on the skin over one bone.
 
     Raises:
-        LayoutError: The bone is unknown, or a number is no number or far off the bone.
+        LayoutError: The bone is unknown, or a number is NaN or far off the bone.
     """
 
     name: str
@@ -94,7 +94,7 @@ class MarkerLayout:
     """A marker glove: 5 to 60 markers of one radius, in the order that labels count in.
 
     Raises:
-        LayoutError: Too few or too many markers, two of one name, or a radius that is no marker's.
+        LayoutError: Too few or too many markers, two of one name, or a radius outside 0.5 to 15 mm.
     """
 
     name: str
@@ -110,8 +110,8 @@ class MarkerLayout:
             raise LayoutError(
                 f"a layout needs {FEWEST_MARKERS} to {MOST_MARKERS} markers, got {self.num_markers}"
             )
-        for place, name in enumerate(self.names):
-            if name in self.names[:place]:
+        for index, name in enumerate(self.names):
+            if name in self.names[:index]:
                 raise LayoutError(f"two markers are named '{name}'; every marker needs a name of its own")
         low, high = _RADIUS_RANGE
         if not low <= self.radius <= high:
@@ -136,10 +136,10 @@ def list_layouts() -> tuple[str, ...]:
 
 
 def load_layout(name_or_path: str | Path) -> MarkerLayout:
-    """A shipped layout by its name, or anybody's by the path of its `.toml` file.
+    """A shipped layout by its name, or your own by the path of its `.toml` file.
 
     Raises:
-        LayoutError: No such layout or file, or the file does not describe one; the sentence names the file.
+        LayoutError: No such layout or file, or the file does not describe one; the message names the file.
     """
     path = Path(name_or_path)
     if str(name_or_path) in list_layouts():
@@ -174,24 +174,24 @@ def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:
     """A layout from what `dataclasses.asdict` made of it, as takes and training sets keep it.
 
     Raises:
-        LayoutError: The values are no layout's.
-        KeyError, TypeError: Keys are missing, or others are there.
+        LayoutError: The values do not make a layout.
+        KeyError, TypeError: Keys are missing or unknown.
     """
-    markers = tuple(MarkerPlace(**place) for place in stored["markers"])
+    markers = tuple(MarkerPlace(**marker) for marker in stored["markers"])
     return MarkerLayout(**{**stored, "markers": markers})
 
 
 def starter_layout() -> str:
-    """A commented layout file to begin one's own glove with; it loads as it is."""
-    places = [(f"{digit.capitalize()}Tip", f"{digit}_distal", 0.45, 0.0) for digit in DIGITS]
-    places += [
+    """A commented layout file to start your own glove from; it loads as it is."""
+    rows = [(f"{digit.capitalize()}Tip", f"{digit}_distal", 0.45, 0.0) for digit in DIGITS]
+    rows += [
         ("BackHand1", "palm", 0.55, -0.17),
         ("BackHand2", "palm", 0.2, -0.13),
         ("BackHand3", "palm", 0.42, 0.27),
     ]
     bones = textwrap.fill(", ".join(BONE_NAMES), 85, subsequent_indent="#           ")
     lines = [_STARTER.replace("BONES", bones)]
-    for name, bone, along, across in places:
+    for name, bone, along, across in rows:
         lines += _marker_lines(MarkerPlace(name, bone, along, 0.0, across))
     return "\n".join(lines) + "\n"
 

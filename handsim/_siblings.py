@@ -1,7 +1,7 @@
-"""Watches over the five generic import names that handsim shares with the whole world.
+"""A warning when one of the five generic import names leads to another file or package than ours.
 
-`train`, `render` and their like are names that anybody may give to a script. When one of them leads
-elsewhere, Python fails deep inside handsim with a sentence that helps nobody, so this warning comes first.
+A user may well call a script `train.py` or `render.py`. Python then fails deep inside handsim with a message
+that does not name the cause, so this warning comes first.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ _HOME: Final = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
 class ShadowedPackageWarning(UserWarning):
-    """Another file or package answers to an import name that handsim needs."""
+    """Another file or package has an import name that handsim needs."""
 
 
 def shadowed_siblings(home: str = _HOME) -> dict[str, str]:
     """Where each sibling leads that does not lie in `home`, the folder that holds `handsim`."""
     strangers = {}
     for name in SIBLINGS:
-        place = _place(name)
-        if place is not None and not _same(place, os.path.join(home, name)):
-            strangers[name] = place
+        location = _location(name)
+        if location is not None and not _same(location, os.path.join(home, name)):
+            strangers[name] = location
     return strangers
 
 
 def warn_if_shadowed() -> None:
-    """Warn once for each sibling that leads elsewhere; naming only, nothing is imported."""
-    for name, place in shadowed_siblings().items():
+    """Warn once for each sibling that leads elsewhere; nothing is imported."""
+    for name, location in shadowed_siblings().items():
         warnings.warn(
-            f"handsim needs its own package '{name}', but `import {name}` finds {place}; rename that, "
+            f"handsim needs its own package '{name}', but `import {name}` finds {location}; rename that, "
             "or keep it off the path (python -P leaves out the script's folder)",
             ShadowedPackageWarning,
             stacklevel=3,
         )
 
 
-def _place(name: str) -> str | None:
+def _location(name: str) -> str | None:
     """Folder of a package or file of a module, without importing it; None when there is none."""
     try:
         spec = importlib.util.find_spec(name)

@@ -50,27 +50,27 @@ class Parameters:
         processor = data[start + 3]
         groups: dict[int, str] = {}
         found: list[tuple[int, str, bytes]] = []
-        place = start + 4
+        at = start + 4
         try:
-            while place + 2 <= len(data):
-                name_length = abs(int.from_bytes(data[place : place + 1], "little", signed=True))
-                group = int.from_bytes(data[place + 1 : place + 2], "little", signed=True)
+            while at + 2 <= len(data):
+                name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
+                group = int.from_bytes(data[at + 1 : at + 2], "little", signed=True)
                 if name_length == 0:
                     break
-                offset_place = place + 2 + name_length
-                name = data[place + 2 : offset_place].decode("ascii").upper().strip()
+                offset_at = at + 2 + name_length
+                name = data[at + 2 : offset_at].decode("ascii").upper().strip()
                 order: Literal["little", "big"] = "big" if processor == _SGI else "little"
-                offset = int.from_bytes(data[offset_place : offset_place + 2], order)
+                offset = int.from_bytes(data[offset_at : offset_at + 2], order)
                 if group < 0:
                     groups[-group] = name
                 else:
-                    record = data[offset_place + 2 : offset_place + 2 + _LONGEST_RECORD]
+                    record = data[offset_at + 2 : offset_at + 2 + _LONGEST_RECORD]
                     found.append((group, name, record))
                 if offset == 0:
                     break
-                if offset_place + offset > len(data):
+                if offset_at + offset > len(data):
                     raise ValueError(name)
-                place = offset_place + offset
+                at = offset_at + offset
             values = {
                 (groups.get(group, ""), name): _read_values(raw, processor) for group, name, raw in found
             }
@@ -94,7 +94,7 @@ class Parameters:
         return float(default)
 
     def words(self, group: str, name: str) -> list[int]:
-        """A parameter as unsigned 16-bit words; empty if it is absent or no such words."""
+        """A parameter as unsigned 16-bit words; empty if it is absent or holds other values."""
         values = self.values.get((group, name), [])
         numbers = [value for value in values if isinstance(value, float) and math.isfinite(value)]
         return [int(value) & 0xFFFF for value in numbers]
@@ -119,7 +119,7 @@ def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
         raise ValueError("not a parameter")
     if kind == _CHARACTER:
         width = dimensions[0] if dimensions else 1
-        return [_text(body[place : place + width]) for place in range(0, count, width)] if count else []
+        return [_text(body[at : at + width]) for at in range(0, count, width)] if count else []
     if kind == _BYTE:
         return [float(value) for value in body]
     if kind == _INTEGER:

@@ -1,4 +1,4 @@
-"""What the text formats share: lines, units of length, and a table of numbers with holes."""
+"""Parsing shared by the text formats: lines, units of length, and a table of numbers with holes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _BLANK: Final = math.nan
 
 
 def meters_per(unit: str) -> float:
-    """How many meters a file's unit of length is, whatever its case.
+    """Meters per unit of length of a file, in any case.
 
     Raises:
         CaptureError: It is not millimeters, centimeters or meters.
@@ -40,7 +40,7 @@ def meters_per(unit: str) -> float:
 
 
 def positive_rate(text: str, *, name: str) -> float:
-    """The frames a second that a header states.
+    """The frame rate [Hz] that a header states.
 
     Raises:
         CaptureError: It is not a positive number.
@@ -50,7 +50,7 @@ def positive_rate(text: str, *, name: str) -> float:
     except ValueError:
         rate = math.nan
     if not 0.0 < rate < math.inf:
-        raise CaptureError(f"{name} is '{text.strip()}', expected a positive number of frames a second")
+        raise CaptureError(f"{name} is '{text.strip()}', expected a positive number of frames per second")
     return rate
 
 
@@ -72,7 +72,7 @@ def parse_table(
     column_name: Callable[[int], str],
     text_columns: frozenset[int] = frozenset(),
 ) -> Float[np.ndarray, "T columns"]:
-    """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is no row.
+    """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is not a row.
 
     A row may lack cells at its end, because some writers leave out what was not seen, and may have blank
     cells too many. Only the last line of a file can have been cut: it counts as cut if it has no line end and
@@ -83,15 +83,15 @@ def parse_table(
         lines: All lines of the file.
         start: Index of the first line of the table.
         ended: Whether the last line has its line end.
-        delimiter: What stands between cells.
-        num_columns: Cells of a whole row.
-        column_name: What an error calls a column.
+        delimiter: The separator of cells.
+        num_columns: Number of cells of a whole row.
+        column_name: Name of a column in messages.
         text_columns: Columns that hold no numbers; they are returned as NaN.
 
     Raises:
-        CaptureError: No rows, a cut last row, a cell that is no number, or a row that is too long.
+        CaptureError: No rows, a cut last row, a cell that is not a number, or a row that is too long.
     """
-    numbered = [(place, line) for place, line in enumerate(lines[start:], start + 1) if line.strip()]
+    numbered = [(number, line) for number, line in enumerate(lines[start:], start + 1) if line.strip()]
     if not numbered:
         raise CaptureError("no frames: nothing follows the header")
     if not ended and numbered[-1][0] == len(lines):
@@ -118,13 +118,15 @@ def _check_whole(numbered: list[tuple[int, bytes]], delimiter: bytes, num_column
     number, line = numbered[-1]
     # Blank cells beyond the table are worth one at most: the delimiter that may end a row.
     usual = min(numbered[0][1].count(delimiter) + 1, num_columns + 1)
-    wanted, got = max(usual, num_columns), line.count(delimiter) + 1
-    if got < wanted:
-        raise CaptureError(f"truncated: line {number}, the last, has {got} of {wanted} cells and no line end")
+    expected, got = max(usual, num_columns), line.count(delimiter) + 1
+    if got < expected:
+        raise CaptureError(
+            f"truncated: line {number}, the last, has {got} of {expected} cells and no line end"
+        )
 
 
 def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], str]) -> list[float]:
-    """The slow way for one row: blanks inside cells are allowed, and the cell that is no number is named."""
+    """The slow parser for one row: cells may hold blanks, and a cell that is not a number is named."""
     values = []
     for column, cell in enumerate(cells):
         text = cell.decode("utf-8", "replace").strip()
@@ -144,7 +146,7 @@ def _check_finite(
 ) -> None:
     infinite = np.argwhere(np.isinf(table))
     if len(infinite):
-        row, column = (int(place) for place in infinite[0])
+        row, column = (int(index) for index in infinite[0])
         raise CaptureError(
             f"line {numbered[row][0]}, column {column + 1} ({column_name(column)}): infinite, expected a "
             "finite number or a blank cell"

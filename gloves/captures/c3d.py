@@ -1,7 +1,7 @@
 """C3D, the binary format of motion capture: read here, written through ezc3d.
 
-Reading does not go through ezc3d because that library (1.7) can end the whole process on a damaged file,
-fills a cut one up in silence, and stops at 65,535 frames. Only what a capture needs is read: the points,
+Reading does not use ezc3d because that library (1.7) can end the whole process on a damaged file,
+pads a cut one silently, and stops at 65,535 frames. Only what a capture needs is read: the points,
 their labels, units and rate; analog channels, events and force plates are passed over.
 """
 
@@ -53,7 +53,7 @@ def write_c3d(path: Path, capture: Capture) -> None:
     """Write float32 millimeters; a missing point gets residual -1.
 
     A take of more than 65,535 frames states its length in TRIAL:ACTUAL_END_FIELD, as the format has it;
-    programs that do not look there (ezc3d 1.7 is one) see the first 65,535 frames.
+    programs that do not read it (ezc3d 1.7 is one) see the first 65,535 frames.
 
     Raises:
         CaptureError: A label is too long, or the disk did not take the whole file.
@@ -67,7 +67,7 @@ def write_c3d(path: Path, capture: Capture) -> None:
     # ezc3d adds '.c3d' to any other ending, '.C3D' too.
     written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")
     try:
-        written.touch()  # ezc3d does not say when it may not write
+        written.touch()  # ezc3d does not report that it may not write
         _content(capture).write(str(written))
         _check_written(written, capture)
         written.replace(path)
@@ -77,7 +77,7 @@ def write_c3d(path: Path, capture: Capture) -> None:
 
 
 def _content(capture: Capture) -> ezc3d.c3d:
-    """The capture as ezc3d wants it."""
+    """The capture as an ezc3d object."""
     import ezc3d
 
     missing = np.isnan(capture.positions[..., 0]).T
@@ -101,12 +101,12 @@ def _content(capture: Capture) -> ezc3d.c3d:
 
 
 def _check_written(path: Path, capture: Capture) -> None:
-    """ezc3d does not look whether its writes succeed: a file on a full disk is too short."""
+    """Check the size of a written file: ezc3d does not notice failed writes, such as on a full disk."""
     with path.open("rb") as file:
         header = np.frombuffer(file.read(_BLOCK), "<u2")
     if len(header) == _BLOCK // 2:
-        wanted = (int(header[8]) - 1) * _BLOCK + 16 * capture.num_frames * len(capture.names)
-        if path.stat().st_size >= wanted:
+        expected = (int(header[8]) - 1) * _BLOCK + 16 * capture.num_frames * len(capture.names)
+        if path.stat().st_size >= expected:
             return
     raise CaptureError("cannot be written: the disk did not take the whole file")
 
@@ -145,9 +145,9 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
 
 
 def _stated_frames(parameters: Parameters, in_header: int) -> int | None:
-    """Number of frames: POINT:FRAMES or the header; where 16 bits are full, the places for long takes.
+    """Number of frames: POINT:FRAMES or the header; where 16 bits are full, the fields for long takes.
 
-    None means that a long take states its length nowhere, as ezc3d writes it: the data itself must tell.
+    None means that a long take states its length nowhere, as ezc3d writes it; the data itself decides.
     """
     frames = int(parameters.number("POINT", "FRAMES", default=in_header))
     frames = frames & 0xFFFF if frames < 0 else frames
@@ -177,4 +177,4 @@ def _labels(parameters: Parameters, num_points: int) -> tuple[str, ...]:
         labels += more
         number += 1
     labels = labels[:num_points] + [""] * (num_points - len(labels))
-    return tuple(label or f"*{place}" for place, label in enumerate(labels, 1))
+    return tuple(label or f"*{number}" for number, label in enumerate(labels, 1))

@@ -1,4 +1,4 @@
-"""What a marker file holds: named trajectories at a rate."""
+"""The content of a marker file: named trajectories at a frame rate."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ class Capture:
     """Trajectories of a marker file: at least one frame and one trajectory.
 
     Raises:
-        CaptureError: The arrays do not fit together, a position is infinite, or the rate is no rate.
+        CaptureError: The arrays do not fit together, a position is infinite, or the rate is not positive.
     """
 
     names: tuple[str, ...]
-    """One name a trajectory, never empty; may say nothing about the marker ("*12", "Unlabeled 2379")."""
+    """One name per trajectory, never empty; it need not name a marker ("*12", "Unlabeled 2379")."""
     positions: Float[np.ndarray, "T N 3"]
     """Positions [m] in the file's axes; NaN, always in all three coordinates, where a marker was not seen."""
     rate: float
-    """Frames a second [Hz]."""
+    """Frames per second [Hz]."""
 
     def __post_init__(self) -> None:
         positions = np.array(self.positions, dtype=np.float64)  # a copy: the next lines change it

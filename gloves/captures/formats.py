@@ -43,7 +43,7 @@ def write_capture(path: str | Path, capture: Capture) -> None:
     A TRC keeps positions to 5e-9 m; a C3D keeps single precision (6e-8 of the value).
 
     Raises:
-        CaptureError: The suffix is unknown, a name cannot stand in the file, or the disk says no.
+        CaptureError: The suffix is unknown, a name cannot be written to the file, or writing fails.
     """
     path = Path(path)
     check_suffix(path, WRITABLE)

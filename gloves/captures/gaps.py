@@ -1,4 +1,4 @@
-"""Gaps of a capture, counted as Han et al. 2018 count them in Table 3, and a marker at a time."""
+"""Gaps of a capture, counted as in Table 3 of Han et al. 2018, and per marker."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class GapCounts(NamedTuple):
     gaps: int
     """Stretches of frames in each of which at least one marker is missing."""
     average_length: float
-    """Frames a gap (AGL); NaN without gaps."""
+    """Average gap length (AGL) [frames]; NaN without gaps."""
     average_missing: float
-    """Missing markers a frame that misses any (AMF); NaN without gaps."""
+    """Average missing markers (AMF) of the frames that miss any; NaN without gaps."""
 
 
 def count_gaps(present: Bool[np.ndarray, "T M"]) -> GapCounts:
@@ -41,7 +41,7 @@ def run_lengths(flags: Bool[np.ndarray, "T M"], *, inside: bool = False) -> Int[
 
     Args:
         flags: For instance, where markers are missing.
-        inside: Leave out stretches that touch the first or the last frame: nobody knows how long they are.
+        inside: Leave out stretches that touch the first or the last frame: their true length is unknown.
     """
     padded = np.zeros((len(flags) + 2, flags.shape[1]), dtype=np.int8)
     padded[1:-1] = flags

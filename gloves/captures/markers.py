@@ -1,4 +1,4 @@
-"""Between a capture's columns and a glove's markers."""
+"""Conversion between a capture's columns and a glove's markers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, 
     """The columns of the named markers, in their order; a subject's prefix ("Anna:ThumbTip") is ignored.
 
     Raises:
-        CaptureError: A marker is not among the columns, or is there twice.
+        CaptureError: A marker is not among the columns, or is among them twice.
     """
     bare = [column.rsplit(":", 1)[-1].strip() for column in capture.names]
     for name in names:
@@ -36,7 +36,7 @@ def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, 
 
 
 def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:
-    """The points of every frame [m], nothing said of whose they are; an empty frame is (0, 3)."""
+    """The points of every frame [m] without their labels; an empty frame is (0, 3)."""
     there = np.isfinite(capture.positions).all(axis=-1)
     return [points[seen] for points, seen in zip(capture.positions, there, strict=True)]
 
@@ -47,13 +47,13 @@ def labeled_capture(
     names: Sequence[str],
     rate: float,
 ) -> Capture:
-    """Labeled points as a capture: one column a marker, then columns for the points without one.
+    """Labeled points as a capture: one column per marker, then columns for the points without one.
 
     Args:
         frames: Points of every frame [m].
         labels: Marker of every point, -1 for none.
         names: Marker names in label order.
-        rate: Frames a second [Hz].
+        rate: Frames per second [Hz].
     """
     extra = max((int((label < 0).sum()) for label in labels), default=0)
     positions = np.full((len(frames), len(names) + extra, 3), np.nan)

@@ -1,8 +1,8 @@
 """The CSV that OptiTrack Motive exports (format versions 1.2x and 1.3x).
 
 Line 1 is a list of keys and values; then rows led by a label (Type, Name, ID, in newer files Parent), a row
-of quantities, a row of axes that begins with 'Frame', and one row a frame. Labels and types decide, not
-places: newer exports add rows and a TimeCode column.
+of quantities, a row of axes that begins with 'Frame', and one row per frame. Labels and types decide,
+not positions: newer exports add rows and a TimeCode column.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def read_motive_csv(data: bytes) -> Capture:
     """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
     Raises:
-        CaptureError: Not a Motive export, without marker columns, cut, or with a cell that is no number.
+        CaptureError: Not a Motive export, without marker columns, cut, or with a cell that is not a number.
     """
     lines, ended = split_lines(data)
     if not lines[0].startswith(b"Format Version,"):
@@ -34,7 +34,7 @@ def read_motive_csv(data: bytes) -> Capture:
     rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
     rate = positive_rate(stated.get(rate_key, ""), name=rate_key)
     scale = meters_per(stated.get("Length Units") or "Meters")
-    end = next((place for place, row in enumerate(rows) if row and row[0] == "Frame"), None)
+    end = next((index for index, row in enumerate(rows) if row and row[0] == "Frame"), None)
     if end is None or (end == len(lines) - 1 and not ended):
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
     axes = rows[end]
@@ -49,7 +49,7 @@ def read_motive_csv(data: bytes) -> Capture:
         delimiter=b",",
         num_columns=len(axes),
         column_name=lambda column: f"{names[column]} {axes[column]}".strip(),
-        text_columns=frozenset(place for place, axis in enumerate(axes) if axis.lower() == "timecode"),
+        text_columns=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),
     )
     positions = table[:, np.array(columns)[:, None] + np.arange(3)]
     labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns, 1))
@@ -81,8 +81,8 @@ def _quantities(rows: list[list[str]], width: int) -> list[str]:
 def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) -> list[int]:
     """Where the position of each marker begins."""
     columns = [
-        place
-        for place, (kind, quantity, axis) in enumerate(zip(types, quantities, axes, strict=False))
+        index
+        for index, (kind, quantity, axis) in enumerate(zip(types, quantities, axes, strict=False))
         if kind == "Marker" and quantity == "Position" and axis == "X"
     ]
     if not columns:
@@ -91,9 +91,9 @@ def _marker_columns(types: list[str], quantities: list[str], axes: list[str]) ->
             "no markers: no column has type 'Marker' and quantity 'Position'; types in the file: "
             f"{', '.join(kinds) or 'none'} (export it with markers and unlabeled markers)"
         )
-    for place in columns:
-        if axes[place : place + 3] != _AXES:
+    for index in columns:
+        if axes[index : index + 3] != _AXES:
             raise CaptureError(
-                f"column {place + 1}: expected the axes X, Y, Z, got {', '.join(axes[place : place + 3])}"
+                f"column {index + 1}: expected the axes X, Y, Z, got {', '.join(axes[index : index + 3])}"
             )
     return columns

@@ -1,8 +1,8 @@
 """TRC, the tab-separated text of marker trajectories.
 
-Five header lines (file type, keys, their values, marker names, axes), then one line a frame: number, time,
-and three cells a marker. Frame counts and frame numbers are often wrong in the wild, so only names, units,
-rate and the rows themselves are believed.
+Five header lines (file type, keys, their values, marker names, axes), then one line per frame: number, time,
+and three cells per marker. Frame counts and frame numbers are often wrong in practice, so only names, units,
+rate and the rows themselves are used.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ def read_trc(data: bytes) -> Capture:
     """The capture in the bytes of a TRC file.
 
     Raises:
-        CaptureError: Not a TRC, header or last row cut, unknown units, or a cell that is no number.
+        CaptureError: Not a TRC, header or last row cut, unknown units, or a cell that is not a number.
     """
     lines, ended = split_lines(data)
     if not lines[0].lstrip().startswith(b"PathFileType"):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
-    # A header line counts only with its line end: what stands before a cut cannot be believed.
+    # A header line counts only with its line end: what precedes a cut may be incomplete.
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
         raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
@@ -101,19 +101,19 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
 def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
     """Names of line 4, one in every three cells; a blank one becomes '*n'.
 
-    Some writers put a name in every cell instead; that is believed only if line 5 has three axes a name.
+    Some writers put a name in every cell instead; that is accepted only if line 5 has three axes per name.
     """
     cells = titles[_LEADING:]
     while cells and not cells[-1]:
         cells.pop()
     if not titles[0].lower().startswith("frame") or not cells:
         raise CaptureError("no markers: line 4 should read 'Frame#', 'Time', then the marker names")
-    if not any(cell for place, cell in enumerate(cells) if place % 3):
+    if not any(cell for index, cell in enumerate(cells) if index % 3):
         return tuple(cell or f"*{number}" for number, cell in enumerate(cells[::3], 1))
     names = tuple(cell for cell in cells if cell)
     if num_axes != 3 * len(names):
         raise CaptureError(
-            f"line 4 has {len(names)} marker names and line 5 {num_axes} axes, expected three a name"
+            f"line 4 has {len(names)} marker names and line 5 {num_axes} axes, expected three per name"
         )
     return names
 

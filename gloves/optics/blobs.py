@@ -12,7 +12,17 @@ import numpy as np
 def draw_blobs(
     sources: Any, seen: Any, T_world_camera: Any, camera: Any, rng: Any, centers: Any, radii: Any
 ) -> None:
-    """Noisy blob centers [px] and radii; radius 0 where there is no blob."""
+    """Write noisy blob centers and radii of one frame; radius 0 where there is no blob.
+
+    Args:
+        sources: Positions of everything that shines (S, 3) [m]; NaN where there is none.
+        seen: Which cameras have a free view of each (S, C).
+        T_world_camera: Camera poses (C, 4, 4).
+        camera: Focal length [px], noise [px], chance to lose a blob, marker radius [m], roundness.
+        rng: Source of all randomness; the draws go by camera, then source.
+        centers: Where the centers go (C, S, 2) [px].
+        radii: Where the radii go (C, S) [px].
+    """
     focal, noise, loss, radius = camera[0], camera[1], camera[2], camera[3]
     for c in range(len(T_world_camera)):
         pose = T_world_camera[c]
@@ -35,7 +45,17 @@ def draw_blobs(
 def cast_rays(
     seen: Any, T_world_camera: Any, camera: Any, centers: Any, radii: Any, directions: Any, usable: Any
 ) -> None:
-    """Unit rays of every source's blob in every camera, after blobs that touch have become one."""
+    """Write the unit rays of every source's blob in every camera, after blobs that touch have merged.
+
+    Args:
+        seen: Which cameras have a free view of each source (S, C).
+        T_world_camera: Camera poses (C, 4, 4).
+        camera: As for `draw_blobs`.
+        centers: Blob centers (C, S, 2) [px].
+        radii: Blob radii (C, S) [px]; 0 where there is none.
+        directions: Where the rays go (S, C, 3), in the world.
+        usable: Where it goes whether there is a ray (S, C).
+    """
     focal, roundness = camera[0], camera[4]
     count = seen.shape[0]
     for c in range(len(T_world_camera)):

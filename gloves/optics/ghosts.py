@@ -1,4 +1,4 @@
-"""Points that are no markers: mirror images in shiny surfaces near the hand, and stray reflections."""
+"""Ghosts, points that are not markers: mirror images in shiny surfaces near the hand, stray reflections."""
 
 from __future__ import annotations
 
@@ -16,25 +16,29 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_GHOSTS: Final = 4
-"""Ghosts kept a frame; what is more is dropped at random."""
+"""Ghosts kept per frame; more are dropped at random."""
 GHOST_REACH: Final = 0.1
-"""A ghost farther from every marker of a hand [m] is not in its cloud; the paper clusters at 200 mm."""
+"""Largest distance [m] of a ghost in a hand's cloud from the nearest marker; the paper clusters at 200 mm."""
 
 
 @dataclass(frozen=True, slots=True)
 class GhostConfig:
-    """How often ghosts appear and where."""
+    """How often ghosts appear and where.
+
+    Raises:
+        ArgumentError: A number is out of range.
+    """
 
     mirror_rate: float = 0.25
     """Share of frames with a shiny surface near the hand."""
     mirror_distance: tuple[float, float] = (0.02, 0.10)
-    """How far the surface lies from the middle of the markers' box, beyond its half side [m]."""
+    """Distance of the surface from the middle of the markers' box, beyond its half side [m]."""
     mirror_radius: float = 0.06
-    """Size of the shiny patch [m]."""
+    """Radius of the shiny patch [m]."""
     reflectance: float = 0.5
-    """Chance that a marker's mirror image is bright enough at all."""
+    """Chance that a marker's mirror image is bright enough."""
     stray_rate: float = 0.8
-    """Mean number of stray reflections a frame, Poisson distributed."""
+    """Mean number of stray reflections per frame, Poisson distributed."""
     stray_margin: float = 0.3
     """Strays lie in the markers' box grown by this share."""
 
@@ -61,7 +65,7 @@ def sample_ghosts(
     Args:
         markers: Marker centers in the world [m].
         rig: The cameras.
-        segments: Capsule axes of everything in the way [m].
+        segments: Axes of the capsules that block the view, in the world [m].
         radii: Their radii [m].
         config: How often and where.
         min_cameras: Cameras that must see a mirror image before it is a point.
@@ -91,7 +95,7 @@ def _mirror_images(
     min_cameras: int,
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Mirror images (T, M, 3) that enough cameras see by way of the shiny patch, NaN elsewhere."""
+    """Mirror images (T, M, 3) that enough cameras see in the shiny patch, NaN elsewhere."""
     frames, count = markers.shape[:2]
     normal = rng.standard_normal((frames, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -109,7 +113,7 @@ def _mirror_images(
 def keep_some(
     candidates: Float[np.ndarray, "T N 3"], *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 4 3"]:
-    """At most `MAX_GHOSTS` of each frame's candidates, chosen at random, those that exist first."""
+    """At most `MAX_GHOSTS` of each frame's candidates [m], chosen at random; NaN candidates come last."""
     order = rng.random(candidates.shape[:2]) + np.isnan(candidates[..., 0])
     chosen = order.argsort(axis=1)[:, :MAX_GHOSTS]
     kept: NDArray[np.float64] = np.take_along_axis(candidates, chosen[..., None], axis=1)

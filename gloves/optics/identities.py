@@ -1,4 +1,4 @@
-"""Marker IDs as a real system gives them: kept while a point is seen, new after every gap."""
+"""Marker IDs as an optical system assigns them: kept while a point is seen, new after every gap."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def number_runs(present: Bool[np.ndarray, "T S"]) -> Int[np.ndarray, "T S"]:
-    """IDs from 0 in the order in which points appear, one an unbroken run; -1 where there is no point."""
+    """IDs from 0 in order of appearance, one per unbroken run of a source; -1 where there is no point."""
     begins = present.copy()
     begins[1:] &= ~present[:-1]
     numbers = np.cumsum(begins.ravel()).reshape(begins.shape) - 1
@@ -24,11 +24,11 @@ def number_runs(present: Bool[np.ndarray, "T S"]) -> Int[np.ndarray, "T S"]:
 def pack_columns(
     present: Bool[np.ndarray, "T S"], *, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, "T S"], int]:
-    """Few columns for many runs: an unbroken stretch of a column is one run, an empty frame follows it.
+    """Pack many runs into few columns: an unbroken stretch of a column is one run, then a frame is empty.
 
     Args:
         present: Which source has a point in which frame.
-        rng: Decides the order of runs that begin together, so that columns say nothing of sources.
+        rng: Decides the order of runs that begin together, so that columns do not reveal sources.
 
     Returns:
         The column of every point, -1 where there is none, and the number of columns.

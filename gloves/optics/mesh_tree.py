@@ -22,13 +22,13 @@ _PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes a
 
 
 class MeshTree:
-    """Boxes in boxes around a mesh's triangles.
+    """A tree of axis-aligned boxes around a mesh's triangles.
 
-    The surface-area heuristic cuts the mesh as it is given here; later frames only move the boxes. What
-    counts is the faces, so one tree serves all meshes that share them (`hand_tree` all hands).
+    The surface-area heuristic splits the mesh as given here; later frames only refit the boxes. Only faces
+    matter, so one tree serves all meshes that share them (`hand_tree` serves all hands).
 
-    Nodes stand in depth-first order, a left child right after its parent, and `skip` is the node that follows
-    once a branch is left out: a search needs no stack, and a refit is one pass backwards.
+    Nodes are stored in depth-first order, a left child right after its parent, and `skip` is the node that
+    follows when a branch is left out: a search needs no stack, and a refit is one backward pass.
 
     Args:
         vertices: Rest positions [m].
@@ -45,7 +45,7 @@ class MeshTree:
         faces = np.asarray(faces)
         if self.vertices.ndim != 2 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
             raise ArgumentError(
-                f"vertices {self.vertices.shape} and faces {faces.shape} are no (V, 3) and (F, 3) of a mesh"
+                f"vertices {self.vertices.shape} and faces {faces.shape}, expected (V, 3) and (F, 3)"
             )
         if faces.min() < 0 or faces.max() >= len(self.vertices):
             raise ArgumentError(
@@ -63,14 +63,19 @@ class MeshTree:
 
 @functools.cache
 def hand_tree() -> MeshTree:
-    """The tree of every hand's skin: size, side and pose change only where its vertices are."""
+    """The tree of every hand's skin: size, side and pose change only the positions of its vertices."""
     surface = build_surface(named_shape("M"))
     return MeshTree(surface.vertices, surface.faces)
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _build(low: Any, high: Any) -> Any:
-    """Order of the triangles, first triangle of every node (one more at the end), and `skip`."""
+    """Order of the triangles (F,), first triangle of every node (N + 1,), and `skip` (N,).
+
+    Args:
+        low: Low corner of each triangle's box (F, 3) [m].
+        high: High corner (F, 3) [m].
+    """
     count = len(low)
     centers = low + high
     order = np.arange(count)
@@ -99,7 +104,14 @@ def _build(low: Any, high: Any) -> Any:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
-    """Sorts `order` and says where to cut it: least sum of triangles x box area, leaves full."""
+    """Sort a node's triangles along an axis and return where to cut them: least sum of count x box area.
+
+    Args:
+        order: The node's triangles (n,), sorted in place.
+        low: Low corner of every triangle's box (F, 3) [m].
+        high: High corner (F, 3) [m].
+        centers: Twice their centers (F, 3) [m].
+    """
     count = len(order)
     least, cut = np.inf, _LEAF
     best = order.copy()
@@ -109,14 +121,14 @@ def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
         for backwards in (True, False):
             box_low, box_high = np.full(3, np.inf), np.full(3, -np.inf)
             for step in range(count):
-                place = count - 1 - step if backwards else step
+                index = count - 1 - step if backwards else step
                 for i in range(3):
-                    box_low[i] = min(box_low[i], low[sequence[place], i])
-                    box_high[i] = max(box_high[i], high[sequence[place], i])
+                    box_low[i] = min(box_low[i], low[sequence[index], i])
+                    box_high[i] = max(box_high[i], high[sequence[index], i])
                 x, y, z = box_high - box_low
                 area = x * y + y * z + z * x
                 if backwards:
-                    after[place] = area
+                    after[index] = area
                 elif (step + 1) % _LEAF == 0 and step + 1 < count:
                     cost = area * (step + 1) + after[step + 1] * (count - step - 1)
                     if cost < least:
@@ -128,7 +140,7 @@ def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _leaf_vertices(faces: Any, first: Any) -> Any:
-    """The vertices of every node's own triangles, each once, and where each node's list starts."""
+    """The vertices of every node's own triangles, each once, and where each node's list starts (N + 1,)."""
     nodes = len(first) - 1
     spots = np.empty(faces.size, dtype=np.int32)
     start = np.zeros(nodes + 1, dtype=np.int32)
@@ -149,7 +161,15 @@ def _leaf_vertices(faces: Any, first: Any) -> Any:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
-    """Moves every box to where its triangles are; spelled out, because loops over axes take longer."""
+    """Refit every box to its triangles; written out, because loops over axes take longer.
+
+    Args:
+        vertices: The mesh (V, 3) [m].
+        skip: `MeshTree.skip` (N,).
+        spots: `MeshTree.spots`, the vertices of the leaves.
+        start: `MeshTree.spots_start` (N + 1,).
+        boxes: Low and high corner of each node (N, 6) [m], overwritten.
+    """
     for back in range(len(skip)):
         node = len(skip) - 1 - back
         if start[node] == start[node + 1]:

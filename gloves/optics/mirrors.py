@@ -1,7 +1,7 @@
-"""Mirror images of markers in shiny patches, and the cameras that see them by way of the patch.
+"""Mirror images of markers in shiny patches, and the cameras that see them in the patch.
 
-The way marker -> patch -> camera unfolds into the straight line from the mirror image to the camera, so that
-an optical system puts a point where the image is.
+The path marker -> patch -> camera unfolds into the straight line from the mirror image to the camera, so an
+optical system reconstructs a point at the image.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def cameras_by_mirror(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T P C"]:
-    """Which cameras see which mirror image: over the patch, in view, and with both legs of the way free.
+    """Which cameras see which mirror image: in the patch, in view, and with both legs of the path free.
 
     Args:
         images: Mirror images of the markers [m]; NaN where there is none.
@@ -47,7 +47,7 @@ def cameras_by_mirror(
         plane_normal: Unit normal of its shiny side.
         radius: Radius of the patch [m].
         rig: The cameras.
-        segments: Capsule axes of what stands in the way [m].
+        segments: Axes of the capsules that block the view, in the world [m].
         radii: Their radii [m].
     """
     seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
@@ -61,6 +61,19 @@ def _over_patch(
     images: Any, plane_point: Any, plane_normal: Any, radius: float, T_world_camera: Any, view: float,
     segments: Any, radii: Any, seen: Any,
 ) -> None:  # fmt: skip
+    """Write which cameras see which mirror image into `seen` (T, P, C); see `cameras_by_mirror`.
+
+    Args:
+        images: Mirror images (T, P, 3) [m]; NaN where there is none.
+        plane_point: Middle of the patch (T, 3) [m].
+        plane_normal: Unit normal of its shiny side (T, 3).
+        radius: Radius of the patch [m].
+        T_world_camera: Camera poses (C, 4, 4).
+        view: Cosine of half the field of view.
+        segments: Axes of the blocking capsules (T, K, 2, 3) [m].
+        radii: Their radii (K,) [m].
+        seen: Where the result goes (T, P, C), False before.
+    """
     hit, marker, camera = np.empty(3), np.empty(3), np.empty(3)
     for t in range(len(images)):
         point, normal = plane_point[t], plane_normal[t]
@@ -76,10 +89,10 @@ def _over_patch(
                 ahead, off, deep, far = 0.0, 0.0, 0.0, 0.0
                 for i in range(3):
                     camera[i] = T_world_camera[c, i, 3]
-                    way = images[t, p, i] - camera[i]
-                    ahead -= way * normal[i]
-                    deep += way * T_world_camera[c, i, 2]
-                    far += way * way
+                    line = images[t, p, i] - camera[i]
+                    ahead -= line * normal[i]
+                    deep += line * T_world_camera[c, i, 2]
+                    far += line * line
                 if ahead <= behind or deep < view * np.sqrt(far):
                     continue
                 for i in range(3):
@@ -94,6 +107,7 @@ def _over_patch(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _clear(start: Any, end: Any, segments: Any, radii: Any) -> bool:
+    """Whether the line between two points (3,) [m] meets no capsule (axes (K, 2, 3) and radii (K,) [m])."""
     for k in range(len(radii)):
         if segment_distance_squared(start, end, segments[k, 0], segments[k, 1]) < radii[k] * radii[k]:
             return False

@@ -1,7 +1,7 @@
-"""What an optical system makes of what its cameras see: blobs, rays, points, gaps and false points.
+"""Reconstruction by an optical system: blobs, rays, points, gaps and false points.
 
-One model yields them all. A marker is a noisy blob in every camera that sees it; blobs that touch become one;
-rays through blobs meet in points, if enough of them meet closely enough; rays that found no point may meet by
+One model produces them all. A marker is a noisy blob in every camera that sees it; blobs that touch merge;
+rays through blobs meet in points, if enough of them meet closely enough; rays without a point may meet by
 chance.
 """
 
@@ -20,37 +20,41 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 MAX_FALSE_POINTS: Final = 6
-"""False intersections kept a frame."""
+"""False intersections kept per frame."""
 
 
 @dataclass(frozen=True, slots=True)
 class OpticsConfig:
-    """A camera's and a solver's properties; the defaults are those of a well-kept optical system."""
+    """Properties of cameras and solver; the defaults are those of a well-kept optical system.
+
+    Raises:
+        ArgumentError: A number is out of range.
+    """
 
     noise: float = 0.12
-    """Standard deviation of a blob's center, each axis [px]."""
+    """Standard deviation of a blob's center per axis [px]."""
     partial: float = 0.5
-    """Each look goes to a random spot of the marker within this share of its radius: what is behind an edge
-    flickers."""
+    """Each line of sight goes to a random point of the marker within this share of its radius, so markers
+    behind an edge flicker."""
     marker_radius: float = 0.0032
     """Radius of the spheres [m]; Han et al. 2018, section 3."""
     roundness: float = 0.5
-    """Two blobs that touch are one: taken for a marker while their centers lie nearer than this share of the
-    sum of their radii, and thrown away as not round beyond it."""
+    """Two blobs that touch merge: they count as a marker while their centers are nearer than this share of
+    the sum of their radii, and are discarded as not round beyond it."""
     blob_loss: float = 0.002
     """Chance that a camera misses a blob it should see."""
     dropout: float = 0.0002
-    """Chance a frame that cameras begin to lose their pictures: a lost packet, a head or an arm in front."""
+    """Chance per frame that cameras begin to lose their pictures: a lost packet, or an arm in front."""
     dropout_length: float = 3.0
-    """Mean number of pictures that they then lose."""
+    """Mean number of pictures that they lose then."""
     dropout_cameras: int = 1
-    """Cameras that lose them together, as those on one network switch do."""
+    """Number of cameras that lose them together, as those on one network switch do."""
     min_rays: int = 2
-    """Rays that must meet before a point exists or goes on."""
+    """Rays that must meet for a point to exist."""
     min_rays_to_start: int = 3
-    """Rays that must meet before a point that was not there in the frame before exists."""
+    """Rays that must meet for a point that did not exist in the frame before."""
     max_residual: float = 0.003
-    """Largest distance of a ray from its point [m]; the worst ray goes first."""
+    """Largest distance of a ray from its point [m]; the worst ray is dropped first."""
     min_angle: float = 10.0
     """Two rays alone must cross at this angle at least [deg]."""
     min_distance: float = 0.004
@@ -75,7 +79,7 @@ class Reconstruction(NamedTuple):
     """The points of every frame, each under the source it comes from."""
 
     positions: Float[np.ndarray, "T S 3"]
-    """Where the system puts each source [m], NaN where it puts none."""
+    """Reconstructed position of each source [m], NaN where there is none."""
     rays: Int[np.ndarray, "T S"]
     """Rays that made each point, 0 where there is none."""
     false_points: Float[np.ndarray, "T F 3"]
@@ -95,7 +99,7 @@ def reconstruct(
     """Simulate detection and triangulation.
 
     Args:
-        sources: True places of all that shines, markers, mirror images, strays [m]; NaN where there is none.
+        sources: True positions of markers, mirror images and strays [m]; NaN where there is none.
         seen: Which cameras have a free view of each.
         rig: The cameras.
         config: Noise, gates and losses.
@@ -125,7 +129,7 @@ def reconstruct(
 def _dropouts(
     frames: int, cameras: int, config: OpticsConfig, rng: np.random.Generator
 ) -> Bool[np.ndarray, "T C"]:
-    """Pictures that are lost: each dropout takes some cameras for a geometric number of frames."""
+    """Pictures that are lost: each dropout affects some cameras for a geometric number of frames."""
     begins = np.flatnonzero(rng.random(frames) < config.dropout)
     lasts = rng.geometric(1.0 / config.dropout_length, size=len(begins))
     lost = np.zeros((frames, cameras), dtype=bool)

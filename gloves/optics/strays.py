@@ -1,4 +1,4 @@
-"""Stray reflections that stay: a watch, a ring, a worn spot of the glove, carried along and flashing."""
+"""Stray reflections that persist: a watch, a ring, a worn spot of the glove, carried along and flashing."""
 
 from __future__ import annotations
 
@@ -15,18 +15,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StrayConfig:
-    """How many places reflect, where they sit and how long they flash."""
+    """Number of reflecting spots, their positions and the duration of their flashes.
+
+    Raises:
+        ArgumentError: A number is out of range.
+    """
 
     number: float = 1.0
-    """Mean number of reflecting places, Poisson distributed."""
+    """Mean number of reflecting spots, Poisson distributed."""
     reach: float = 0.12
-    """They sit in a ball of this radius around the middle of what carries them [m]."""
+    """Radius of the ball around the middle of the carrier in which they lie [m]."""
     shown: float = 0.4
-    """Mean time that a place reflects [s]."""
+    """Mean time that a spot reflects [s]."""
     hidden: float = 1.0
     """Mean time that it does not [s]."""
     camera_share: float = 0.5
-    """Share of the cameras that get its light."""
+    """Share of the cameras that a spot reflects to."""
 
     def __post_init__(self) -> None:
         for name in ("number", "reach", "shown", "hidden"):
@@ -48,32 +52,32 @@ def sample_strays(
     """Strays carried by a hand, an object or the room.
 
     Args:
-        T_world_carrier: Pose of what carries them.
-        middle: Middle of the ball they sit in, in the carrier's frame [m].
-        config: How many, where and how long.
-        rate: Frames a second [Hz].
+        T_world_carrier: Pose of the carrier.
+        middle: Middle of the ball in which they lie, in the carrier's frame [m].
+        config: Number, positions and durations.
+        rate: Frames per second [Hz].
         num_cameras: Cameras of the rig.
         rng: Source of all randomness.
 
     Returns:
-        Places in the world [m], and which cameras get their light; what stands in the way is not asked here.
+        Positions in the world [m], and which cameras each reflects to; occlusion is not tested here.
     """
     count = int(rng.poisson(config.number))
     directions = rng.standard_normal((count, 3))
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     local = middle + config.reach * np.cbrt(rng.random((count, 1))) * directions
-    places = np.einsum("tij,kj->tki", T_world_carrier[:, :3, :3], local) + T_world_carrier[:, None, :3, 3]
-    shining = np.zeros((len(places), count), dtype=bool)
+    positions = np.einsum("tij,kj->tki", T_world_carrier[:, :3, :3], local) + T_world_carrier[:, None, :3, 3]
+    shining = np.zeros((len(positions), count), dtype=bool)
     for number in range(count):
-        shining[:, number] = _flashes(len(places), config, rate, rng)
-    reached = rng.random((count, num_cameras)) < config.camera_share
-    return places, shining[..., None] & reached
+        shining[:, number] = _flashes(len(positions), config, rate, rng)
+    lit = rng.random((count, num_cameras)) < config.camera_share
+    return positions, shining[..., None] & lit
 
 
 def _flashes(
     frames: int, config: StrayConfig, rate: float, rng: np.random.Generator
 ) -> Bool[np.ndarray, "T"]:
-    """Exponential times of light and dark by turns."""
+    """Alternating times of light and dark, exponentially distributed."""
     shown = rng.random() < config.shown / (config.shown + config.hidden)
     shining = np.empty(frames, dtype=bool)
     at = 0

@@ -9,8 +9,8 @@ import numpy as np
 
 from gloves.optics.blobs import cast_rays, draw_blobs
 
-_FALSE_REACH = 0.25  # [m] a false point farther than this from every source is outside the capture volume
-_FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last frame is the same one
+_FALSE_REACH = 0.25  # [m] farther than this from every source is outside the capture volume
+_FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last frame is the same
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
@@ -18,7 +18,20 @@ def reconstruct_frames(
     sources: Any, seen: Any, T_world_camera: Any, camera: Any, gates: Any, min_rays: Any, rng: Any,
     positions: Any, rays: Any, false_points: Any,
 ) -> None:  # fmt: skip
-    """Fill positions (T, S, 3), rays (T, S) and false_points (T, F, 3); see `reconstruct`."""
+    """Write the points of every frame; see `reconstruct`.
+
+    Args:
+        sources: True positions (T, S, 3) [m]; NaN where there is none.
+        seen: Which cameras have a free view of each (T, S, C).
+        T_world_camera: Camera poses (C, 4, 4).
+        camera: Focal length [px], noise [px], chance to lose a blob, marker radius [m], roundness.
+        gates: Largest residual of a ray [m], sine of the smallest angle, smallest distance of two points [m].
+        min_rays: Rays that must meet for a point to go on, and to begin.
+        rng: Source of all randomness.
+        positions: Where the points go (T, S, 3) [m].
+        rays: Where the number of their rays goes (T, S).
+        false_points: Where false intersections go (T, F, 3) [m]; NaN before.
+    """
     count, cameras = seen.shape[1:]
     centers, radii = np.empty((cameras, count, 2)), np.empty((cameras, count))
     directions = np.empty((count, cameras, 3))
@@ -38,7 +51,7 @@ def reconstruct_frames(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _meet(directions: Any, usable: Any, T_world_camera: Any, gates: Any, enough: int, point: Any) -> int:
-    """The point nearest to a source's rays, the worst dropped until all are within the gate; rays used."""
+    """Write the point (3,) nearest to a source's rays (C, 3), the worst ones dropped; number of rays."""
     used = usable.copy()
     count = 0
     for c in range(len(used)):
@@ -88,7 +101,7 @@ def _nearest_point(directions: Any, used: Any, T_world_camera: Any, point: Any) 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _off(point: Any, direction: Any, pose: Any) -> float:
-    """Distance of a point from a camera's ray; infinite behind the camera."""
+    """Distance [m] of a point from a camera's ray; infinite behind the camera."""
     x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
     along = x * direction[0] + y * direction[1] + z * direction[2]
     if along <= 0.0:
@@ -112,7 +125,7 @@ def _wide(directions: Any, used: Any, min_sine: float) -> bool:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
-    """Of two points closer than the system can tell apart, the one with fewer rays goes."""
+    """Remove the point with fewer rays of any two that are closer than `min_distance` [m]."""
     for s in range(len(rays)):
         for o in range(s):
             if rays[s] > 0 and rays[o] > 0:
@@ -127,7 +140,7 @@ def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
-    """Rays that made a point make no other; a camera that does not see its source lends another's ray."""
+    """Mark the rays of a point as used; a camera without a ray of its source gives its nearest ray."""
     for c in range(len(T_world_camera)):
         taken, near = -1, gate
         if usable[source, c]:
@@ -148,7 +161,7 @@ def _meet_by_chance(
     sources: Any, directions: Any, usable: Any, T_world_camera: Any, gates: Any, min_rays: Any,
     positions: Any, false: Any,
 ) -> None:  # fmt: skip
-    """Points where rays left over from different sources meet; written into `now` (F, 3)."""
+    """Write where unused rays of different sources meet into the second of `false`, each (F, 3) [m]."""
     before, now = false
     left = np.argwhere(usable)
     pair, two = np.empty((len(T_world_camera), 3)), np.zeros(len(T_world_camera), dtype=np.bool_)
@@ -167,21 +180,21 @@ def _meet_by_chance(
                 _off(point, pair[c], T_world_camera[c]), _off(point, pair[k], T_world_camera[k])
             ) > gates[0]:  # fmt: skip
                 continue
-            place = _false_place(point, before, now)
-            fewest = min_rays[0] if place >= 0 else min_rays[1]
-            if place < 0:
-                place = _free_place(before, now)
-            if place < 0 or _support(point, left, directions, usable, T_world_camera, gates[0]) < fewest:
+            column = _false_column(point, before, now)
+            fewest = min_rays[0] if column >= 0 else min_rays[1]
+            if column < 0:
+                column = _free_column(before, now)
+            if column < 0 or _support(point, left, directions, usable, T_world_camera, gates[0]) < fewest:
                 continue
             if _new_and_near(point, sources, positions, gates[2]):
-                now[place] = point
+                now[column] = point
                 _spend(point, s, directions, usable, T_world_camera, gates[0])
                 usable[s, c] = usable[o, k] = False
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _support(point: Any, left: Any, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> int:
-    """Cameras with a ray left that passes through the point."""
+    """Number of cameras with an unused ray through the point."""
     through = np.zeros(len(T_world_camera), dtype=np.bool_)
     for s, c in left:
         if usable[s, c] and not through[c]:
@@ -191,7 +204,7 @@ def _support(point: Any, left: Any, directions: Any, usable: Any, T_world_camera
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float) -> bool:
-    """Whether a false point lies in the capture volume and not where a point is already."""
+    """Whether a false point lies in the capture volume and away from all other points."""
     near = False
     for s in range(len(sources)):
         there, true = 0.0, 0.0
@@ -205,18 +218,18 @@ def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float)
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _false_place(point: Any, before: Any, now: Any) -> int:
+def _false_column(point: Any, before: Any, now: Any) -> int:
     """The column whose false point of the frame before lies near, -1 for none."""
-    for place in range(len(before)):
-        if np.isnan(now[place, 0]) and np.sum((before[place] - point) ** 2) < _FALSE_STEP * _FALSE_STEP:
-            return place
+    for column in range(len(before)):
+        if np.isnan(now[column, 0]) and np.sum((before[column] - point) ** 2) < _FALSE_STEP * _FALSE_STEP:
+            return column
     return -1
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _free_place(before: Any, now: Any) -> int:
+def _free_column(before: Any, now: Any) -> int:
     """A column that was empty in the frame before and is empty now, -1 for none."""
-    for place in range(len(before)):
-        if np.isnan(now[place, 0]) and np.isnan(before[place, 0]):
-            return place
+    for column in range(len(before)):
+        if np.isnan(now[column, 0]) and np.isnan(before[column, 0]):
+            return column
     return -1

@@ -1,4 +1,4 @@
-"""Which camera sees which marker: rays against the hand's capsules, facing, and field of view."""
+"""Visibility of markers: lines of sight past the hand's capsules, facing, and field of view."""
 
 from __future__ import annotations
 
@@ -28,7 +28,13 @@ def free_rays(
     """Which straight lines from marker to camera meet no capsule.
 
     A ray meets a capsule exactly when the segment marker-camera comes nearer to the capsule's axis than
-    its radius, so one distance between two segments decides it; MuJoCo's `mj_multiRay` is the test's oracle.
+    its radius, so one distance between two segments decides it.
+
+    Args:
+        markers: Marker centers in the world [m].
+        cameras: Camera positions in the world [m].
+        segments: Both ends of every capsule's axis in the world [m].
+        radii: Capsule radii [m].
     """
     free: NDArray[np.bool_] = _free(markers, cameras, segments, radii)
     return free
@@ -41,11 +47,11 @@ def visible_cameras(
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which cameras see each marker: in view, facing, and with nothing of the hand between.
+    """Which cameras see each marker: in view, facing, and not occluded by the hand.
 
     Args:
         markers: Marker centers in the world [m].
-        normals: Unit directions in which the markers look away from the skin.
+        normals: Outward unit directions of the skin under the markers.
         rig: The cameras.
         segments: Both ends of every capsule's axis in the world [m].
         radii: Capsule radii [m].
@@ -58,11 +64,11 @@ def visible_cameras(
 def facing_cameras(
     markers: Float[np.ndarray, "T M 3"], normals: Float[np.ndarray, "T M 3"], rig: CameraRig
 ) -> Bool[np.ndarray, "T M C"]:
-    """Which cameras would see each marker if nothing stood in the way: in view, and on its open side.
+    """Which cameras would see each marker without occlusion: in view, and on its outward side.
 
     Args:
         markers: Marker centers in the world [m].
-        normals: Unit directions in which the markers look away from what carries them.
+        normals: Outward unit directions of the surface under the markers.
         rig: The cameras.
     """
     cameras = rig.positions
@@ -74,7 +80,7 @@ def facing_cameras(
 
 
 def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
-    """One bit a camera: bit c is set where camera c sees."""
+    """Visibility as one bit per camera: bit c is set where camera c sees."""
     bits = visible.astype(np.uint32) << np.arange(visible.shape[-1], dtype=np.uint32)
     packed: NDArray[np.uint32] = bits.sum(axis=-1, dtype=np.uint32)
     return packed
@@ -88,6 +94,7 @@ def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndar
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
+    """Which lines (T, M, C) meet no capsule; arguments as for `free_rays`."""
     frames, count = markers.shape[:2]
     free = np.ones((frames, count, len(cameras)), dtype=np.bool_)
     capsules = len(radii)

@@ -1,1 +1,6 @@
-"""TODO map."""
+"""Takes: whole recordings with their truth or their tracked motion.
+
+- archives: named arrays and a JSON header in one .npz
+- take: `Take`, a simulated capture and its truth
+- tracked_take: `TrackedTake`, the output of a tracker
+"""

@@ -20,13 +20,13 @@ KINDS: Final = {
     "take": "the truth of a simulated capture",
     "tracked take": "a tracked take",
 }
-"""What these files may hold, and what it is called in a sentence."""
-_OLDEST_KIND: Final = "take"  # of headers that name none
+"""Kinds of content, and their names in messages."""
+_OLDEST_KIND: Final = "take"  # of headers without a kind
 _DAMAGE: Final = (
     HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, EOFError,
     RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What reading a damaged file may end in."""
+"""Exceptions that reading a damaged file may raise."""
 
 
 def write_archive(
@@ -37,9 +37,9 @@ def write_archive(
     Args:
         path: The file, whose name should end in .npz.
         kind: One of `KINDS`.
-        schema: The number of its form.
+        schema: Version of the form.
         header: The rest of the header, as JSON.
-        arrays: By name; `header` is taken.
+        arrays: By name; the name `header` is taken.
     """
     text = json.dumps({"kind": kind, "schema": schema} | dict(header))
     with atomic_write(path) as temporary, temporary.open("wb") as file:
@@ -56,9 +56,9 @@ def read_archive(
 
     Args:
         path: The file.
-        kind: What it should hold.
-        schema: The number of its form.
-        unpack: Makes the content of header and arrays; what it raises means that they are damaged.
+        kind: The expected kind.
+        schema: Version of the form.
+        unpack: Makes the content from header and arrays; an exception means that they are damaged.
 
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
@@ -90,13 +90,13 @@ def archive_kind(path: Path) -> str:
 
 
 def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays, whatever they hold."""
+    """Header and arrays of any kind."""
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         header = json.loads(str(arrays["header"]))
         if not isinstance(header, dict):
-            raise ValueError("the header is no table")
+            raise ValueError("the header is not a table")
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
     except _DAMAGE as error:
@@ -104,7 +104,7 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]
     return header, arrays
 
 
-def check_shapes(wanted: Iterable[tuple[np.ndarray, tuple[int, ...]]]) -> None:
+def check_shapes(expected: Iterable[tuple[np.ndarray, tuple[int, ...]]]) -> None:
     """Raise a `ValueError` unless every array has its shape."""
-    if any(array.shape != shape for array, shape in wanted):
+    if any(array.shape != shape for array, shape in expected):
         raise ValueError("the arrays do not fit together")

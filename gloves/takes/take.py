@@ -1,4 +1,4 @@
-"""A take: what an optical system put out, frame by frame, and the truth beside it."""
+"""A take: the output of an optical system, frame by frame, with its truth."""
 
 from __future__ import annotations
 
@@ -52,16 +52,19 @@ class Take:
     """
 
     rate: float
-    """Frames a second [Hz]."""
+    """Frames per second [Hz]."""
     points: Float[np.ndarray, "T N 3"]
     """World frame [m], NaN where a column has no point."""
     ids: Int[np.ndarray, "T N"]
+    """The system's ID of each point, -1 where there is none."""
     labels: Int[np.ndarray, "T N"]
+    """True label of each point."""
     hands: tuple[GlovedHand, ...]
-    """The hands as they moved, their gloves as they were worn: positions after slipping."""
+    """The hands as they moved, with their gloves as worn: markers after slipping."""
     body: HeldBody | None
+    """The rigid body that was held, if any."""
     settings: dict[str, Any]
-    """What made it, as JSON."""
+    """Settings that made it, as JSON."""
 
     def __post_init__(self) -> None:
         try:
@@ -81,7 +84,7 @@ class Take:
         return tuple(range(int(low), int(high)) for low, high in itertools.pairwise(sizes))
 
     def observed(self, label: range) -> Float[np.ndarray, "T M 3"]:
-        """Where the system put the markers with these labels [m], NaN where it lost them."""
+        """Observed positions of the markers with these labels [m], NaN where they were lost."""
         observed = np.full((self.num_frames, len(label), 3), np.nan)
         mine = (self.labels >= label.start) & (self.labels < label.stop)
         frame, column = np.nonzero(mine)
@@ -89,7 +92,7 @@ class Take:
         return observed
 
     def markers_present(self) -> Bool[np.ndarray, "T M"]:
-        """Which markers of the hands have a point in which frame."""
+        """Which markers of the hands have a point in each frame."""
         observed = [self.observed(label) for label in self.hand_labels]
         present: np.ndarray = np.isfinite(np.concatenate(observed, axis=1)[..., 0])
         return present

@@ -1,4 +1,4 @@
-"""A tracked take: what a tracker made of a capture, for whoever draws it or uses the motion."""
+"""A tracked take: the motion, labels and status that a tracker made of a capture."""
 
 from __future__ import annotations
 
@@ -52,41 +52,47 @@ class TrackedTake:
     """Motion, labels and status of every frame; T frames, H hands, M markers, N points, B bodies.
 
     A label counts through the markers of the hands, in their order, then those of the bodies; -1 is a point
-    that is nobody's, or no point at all.
+    of none of them, or no point at all.
 
     Raises:
         ArgumentError: The arrays do not fit together, or hold what they cannot.
     """
 
     rate: float
-    """Frames a second [Hz]; of a stream, the usual one."""
+    """Frames per second [Hz]; of a stream, the usual one."""
     times: Float[np.ndarray, "T"]
-    """Time of each frame [s], growing."""
+    """Time of each frame [s], increasing."""
     hands: tuple[GloveFit, ...]
+    """The tracked hands, at most one per side, with equal numbers of markers."""
     qpos: Float[np.ndarray, "T H 27"]
-    """World frame, NaN where a hand is lost."""
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand is lost."""
     status: Int[np.ndarray, "T H"]
-    """Places in `STATUSES`."""
+    """Indices into `STATUSES`."""
     rms: Float[np.ndarray, "T H"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN without a fit."""
     markers: Float[np.ndarray, "T H M 3"]
     """Markers [m] as seen, or from the pose where `filled`; NaN where a hand is lost."""
     filled: Bool[np.ndarray, "T H M"]
+    """Which markers were not seen and come from the pose."""
     points: Float[np.ndarray, "T N 3"]
-    """What there was to see [m], NaN where a column has no point. The columns are the capture's; a stream's
-    points stand in the order in which they came."""
+    """Observed points [m], NaN where a column has no point. The columns are the capture's; a stream's points
+    are in the order in which they arrived."""
     ids: Int[np.ndarray, "T N"]
     """The system's ID of each point, -1 where it has none."""
     labels: Int[np.ndarray, "T N"]
+    """Label of each point."""
     confidence: Float[np.ndarray, "T N"]
-    """How sure each label is, 0 to 1; NaN where there is no point."""
+    """Probability of each label, 0 to 1; NaN where there is no point."""
     bodies: tuple[MarkedBody, ...]
+    """The tracked rigid bodies."""
     body_poses: Float[np.ndarray, "T B 7"]
-    """Place [m] and orientation (wxyz) in the world, NaN where a body is lost."""
+    """Position [m] and orientation (wxyz) in the world, NaN where a body is lost."""
     body_status: Int[np.ndarray, "T B"]
+    """Indices into `STATUSES`."""
     body_rms: Float[np.ndarray, "T B"]
+    """3D RMS distance of the labeled markers from the pose's [m]; NaN without a fit."""
     settings: dict[str, Any]
-    """What made it, as JSON."""
+    """Settings that made it, as JSON."""
 
     def __post_init__(self) -> None:
         try:
@@ -106,12 +112,12 @@ class TrackedTake:
 
     @property
     def label_names(self) -> tuple[str, ...]:
-        """What each label is called: `right:ThumbTip`, `pen:Pen1`."""
+        """Name of each label: `right:ThumbTip`, `pen:Pen1`."""
         hands = [f"{hand.side}:{name}" for hand in self.hands for name in hand.layout.names]
         return (*hands, *(f"{body.name}:{name}" for body in self.bodies for name in body.marker_names))
 
     def hand(self, side: Side) -> int:
-        """The place of a hand among the hands.
+        """The index of a hand among the hands.
 
         Raises:
             ArgumentError: It was not tracked.
@@ -126,9 +132,9 @@ class TrackedTake:
         return np.where(self.filled[:, hand, :, None], np.nan, self.markers[:, hand])
 
     def motion(self, side: Side) -> HandMotion:
-        """The motion of a hand, whole: where it is lost, from the pose before straight to the pose after.
+        """The motion of a hand without gaps: where it is lost, linear from the pose before to the pose after.
 
-        It stands still before its first pose and after its last; `status` says which frames are made up so.
+        It keeps its first pose before it and its last pose after it; `status` tells which frames are filled.
 
         Raises:
             ArgumentError: The hand was never tracked.
@@ -151,7 +157,7 @@ def save_tracked_take(path: Path, take: TrackedTake) -> None:
     }
     arrays = {name: np.asarray(getattr(take, name), dtype) for name, dtype in _ARRAYS.items()}
     arrays["hands"] = np.array([pack_hand(hand.shape) for hand in take.hands], dtype=HAND_DTYPE)
-    for name in _WORN:
+    for name in _ATTACHMENT:
         arrays[f"attachment_{name}"] = np.stack([getattr(hand.attachment, name) for hand in take.hands])
     arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.positions for body in take.bodies)])
     write_archive(path, KIND, SCHEMA, header, arrays)
@@ -181,28 +187,28 @@ _ARRAYS: Final = {
     "body_status": "i1",
     "body_rms": "f8",
 }
-"""The fields that lie in a file by their names, and as what."""
-_WORN: Final = ("points", "normals", "bone_indices", "bone_weights")
+"""The fields that a file holds by their names, and their types."""
+_ATTACHMENT: Final = ("points", "normals", "bone_indices", "bone_weights")
 
 
 def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTake:
     if tuple(header["statuses"]) != STATUSES:
-        raise ValueError("the statuses are others")
+        raise ValueError("other statuses")
     hands = []
-    worn = zip(*(arrays[f"attachment_{name}"] for name in _WORN), strict=True)
+    worn = zip(*(arrays[f"attachment_{name}"] for name in _ATTACHMENT), strict=True)
     for record, layout, parts in zip(arrays["hands"], header["layouts"], worn, strict=True):
         attachment = Attachment(stored_layout(layout), *parts)
         hands.append(GloveFit(HandModel(unpack_hand(record)), attachment))
     names = [(stored["name"], tuple(stored["marker_names"])) for stored in header["bodies"]]
-    places = np.split(arrays["body_places"], np.cumsum([len(markers) for _, markers in names], dtype=int))
-    if len(places.pop()):
-        raise ValueError("places of no body's markers")
+    positions = np.split(arrays["body_places"], np.cumsum([len(markers) for _, markers in names], dtype=int))
+    if len(positions.pop()):
+        raise ValueError("positions of markers without a body")
     if any(arrays[name].dtype != dtype for name, dtype in _ARRAYS.items()):
-        raise ValueError("numbers of another kind")
+        raise ValueError("numbers of another type")
     return TrackedTake(
         rate=float(header["rate"]),
         hands=tuple(hands),
-        bodies=tuple(MarkedBody(*name, place) for name, place in zip(names, places, strict=True)),
+        bodies=tuple(MarkedBody(*name, markers) for name, markers in zip(names, positions, strict=True)),
         settings=header["settings"],
         **{name: arrays[name] for name in _ARRAYS},
     )
@@ -213,7 +219,9 @@ def _check(take: TrackedTake) -> None:
     frames, columns = take.num_frames, take.points.shape[1]
     hands, bodies = len(take.hands), len(take.bodies)
     if not frames or not hands or len(set(take.sides)) < hands:
-        raise ValueError(f"{frames} frames of the hands {take.sides}, expected some of one hand of a side")
+        raise ValueError(
+            f"{frames} frames of the hands {take.sides}, expected at least one frame and one hand per side"
+        )
     counts = {hand.layout.num_markers for hand in take.hands}
     if len(counts) > 1:
         raise ValueError("the hands wear gloves with different numbers of markers")
@@ -234,13 +242,13 @@ def _check(take: TrackedTake) -> None:
         ]
     )
     if not 0.0 < take.rate < np.inf or not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():
-        raise ValueError("the rate is none, or times do not grow")
+        raise ValueError("the rate is not positive, or times do not increase")
     for status, poses in ((take.status, take.qpos), (take.body_status, take.body_poses)):
         if (
             not _within(status, 0, len(STATUSES) - 1)
             or (np.isnan(poses) != (status == LOST)[..., None]).any()
         ):
-            raise ValueError("a status is none, or does not fit its pose")
+            raise ValueError("a status is unknown, or does not fit its pose")
     if not _within(take.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
 

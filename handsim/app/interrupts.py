@@ -1,4 +1,4 @@
-"""Ctrl-C as a word to be read when it suits, for loops that have something to finish."""
+"""Ctrl-C as a flag that a loop reads when it has finished a step."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from types import FrameType
 
 @contextmanager
 def interrupt_told() -> Iterator[Callable[[], bool]]:
-    """Within the block, the first interrupt raises nothing; the function that is given says whether it came.
+    """Within the block the first interrupt raises nothing; the yielded function returns whether it came.
 
     An exception from a signal can be lost: compiled code that calls back into Python swallows it. A second
-    interrupt raises as ever. Signals are the main thread's; in others the answer is always no.
+    interrupt raises as usual. Only the main thread gets signals; in other threads the function returns False.
     """
-    told = threading.Event()
+    received = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield told.is_set
+        yield received.is_set
         return
 
-    def tell(_number: int, _frame: FrameType | None) -> None:
-        if told.is_set():
+    def note(_number: int, _frame: FrameType | None) -> None:
+        if received.is_set():
             raise KeyboardInterrupt
-        told.set()
+        received.set()
 
-    before = signal.signal(signal.SIGINT, tell)
+    before = signal.signal(signal.SIGINT, note)
     try:
-        yield told.is_set
+        yield received.is_set
     finally:
         signal.signal(signal.SIGINT, before)

@@ -34,7 +34,7 @@ th:first-child, td:first-child { text-align: left; padding-right: 2.5rem; }
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One heading with what stands below it."""
+    """One heading with the text, pictures and table below it."""
 
     title: str
     text: str
@@ -47,7 +47,7 @@ class Section:
 
 
 def write_page(path: Path, sections: Sequence[Section], *, title: str, lead: str) -> None:
-    """Write the page under this title, the lead below it; nothing in it is fetched from elsewhere."""
+    """Write the page with this title and the lead below it; it loads nothing from the network."""
     body = "\n".join(_section(section) for section in sections)
     page = (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'

@@ -36,7 +36,7 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
 
 
 class _Speed(ProgressColumn):
-    """How many a second of late; blank until there is something to measure."""
+    """Recent speed in units per second; blank until there is something to measure."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Jobs with numbers, done in processes of their own."""
+"""Numbered jobs, done in worker processes."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from handsim.errors import DatasetError
 
 
 def in_processes(job: Callable[[int], int], todo: Sequence[int], workers: int) -> Iterator[int]:
-    """Do jobs and yield each one's number when it is done; the first is done here, before the others.
+    """Do jobs and yield the number of each when it is done.
 
-    So it fills numba's cache before workers ask for it, and what is wrong with all of them is told at once.
+    The first is done in this process, before the others. This fills numba's cache before workers need it, and
+    a mistake common to all jobs shows at once.
 
     Args:
         job: Takes a number and returns it; workers are spawned and unpickle it.
-        todo: The numbers.
-        workers: Processes; with one all is done here.
+        todo: The numbers of the jobs.
+        workers: Number of processes; with one, all jobs are done in this process.
 
     Raises:
         DatasetError: A worker died.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
 _PROBE_SECONDS: Final = 120.0
-# Run in processes of their own: a broken driver takes its process with it, and torch and GL stay out of ours.
+# These run in processes of their own: a broken driver ends its process, and torch and GL stay out of ours.
 _DRAW: Final = """
 import os
 os.environ["PYOPENGL_PLATFORM"] = "egl"
@@ -53,8 +53,8 @@ class Finding:
 
     what: str
     found: str
-    wanted: str = ""
-    """What would do, in words or as limits of a version; empty when anything does."""
+    expected: str = ""
+    """What is needed, in words or as limits of a version; empty when anything will do."""
     advice: str = ""
     """What to do about it; empty when all is well."""
     needed: bool = True
@@ -125,7 +125,7 @@ def _release(version: str) -> tuple[int, ...]:
 
 
 def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]) -> Iterator[Finding]:
-    """Whether the generic import names, and pyrender's, belong to whom they should.
+    """Whether the generic import names, and pyrender's, belong to the right distributions.
 
     Args:
         owners: The distributions that install each import name.
@@ -158,13 +158,13 @@ def _pyrender_version() -> str:
 
 def check_drawing(code: int, output: str) -> Finding:
     """Whether pictures can be drawn without a screen, judged by an attempt."""
-    what, wanted = "drawing (EGL)", "an OpenGL driver"
+    what, expected = "drawing (EGL)", "an OpenGL driver"
     if code == 0:
-        return Finding(what, output, wanted)
+        return Finding(what, output, expected)
     if sys.platform != "linux":
-        return Finding(what, output, wanted, "drawing without a screen needs Linux; all else works here")
+        return Finding(what, output, expected, "drawing without a screen needs Linux; all else works here")
     found = "libEGL is missing" if ctypes.util.find_library("EGL") is None else output
-    return Finding(what, found, wanted, f"run `apt-get install {EGL_PACKAGES}` as root")
+    return Finding(what, found, expected, f"run `apt-get install {EGL_PACKAGES}` as root")
 
 
 def check_gpu(code: int, output: str) -> Finding:
@@ -183,7 +183,7 @@ def check_room() -> Iterator[Finding]:
 
 
 def _start(code: str) -> subprocess.Popen[str]:
-    # -P: a stranger's file in the current folder must not answer to numpy's or torch's name
+    # -P: a file in the current folder must not be imported as numpy or torch
     command = [sys.executable, "-P", "-c", code]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -205,10 +205,10 @@ def _print_report(findings: Sequence[Finding]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table("", "what", "found", "wanted", box=None, pad_edge=False)
+    table = Table("", "what", "found", "expected", box=None, pad_edge=False)
     for finding in findings:
         mark = "[green]ok" if not finding.advice else "[red]missing" if finding.needed else "[yellow]low"
-        table.add_row(mark, Text(finding.what), Text(finding.found), Text(finding.wanted))
+        table.add_row(mark, Text(finding.what), Text(finding.found), Text(finding.expected))
     console = Console()
     console.print(table)
     troubles = [finding for finding in findings if finding.advice]

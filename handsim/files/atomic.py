@@ -1,4 +1,4 @@
-"""Files that are either whole or not there at all."""
+"""Files that are written whole or not at all, and TOML files read with one kind of error."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
 
     Args:
         path: The file.
-        error: What to raise, in one sentence, when it cannot be read or is no TOML.
+        error: What to raise, in one sentence, when the file cannot be read or is not TOML.
     """
     try:
         return tomllib.loads(path.read_text("utf-8"))

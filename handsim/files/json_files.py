@@ -1,4 +1,4 @@
-"""JSON files, whole or not there at all, and folders that a settings file marks as somebody's."""
+"""JSON files, written whole or not at all, and output folders that a settings file claims for one job."""
 
 from __future__ import annotations
 
@@ -21,27 +21,29 @@ def load_json(path: Path) -> dict[str, Any]:
     """Read a JSON object.
 
     Raises:
-        DatasetError: The file is no JSON object.
+        DatasetError: The file does not hold a JSON object.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        raise DatasetError(f"{path} is damaged: it holds no JSON") from error
+        raise DatasetError(f"{path} is damaged: it does not hold JSON") from error
     if not isinstance(content, dict):
-        raise DatasetError(f"{path} is damaged: it holds no JSON object")
+        raise DatasetError(f"{path} is damaged: it does not hold a JSON object")
     return content
 
 
 def claim(path: Path, settings: dict[str, Any], *, noun: str, error: type[HandSimError]) -> None:
-    """Mark the folder of a settings file as theirs, or check that it is; clear what a killed run left.
+    """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
 
     Raises:
         HandSimError: Of class `error`: the `noun` there has other settings, or something else is there.
     """
     out = path.parent
     if path.is_file():
-        found, wanted = load_json(path), json.loads(json.dumps(settings))
-        differing = sorted(key for key in found.keys() | wanted.keys() if found.get(key) != wanted.get(key))
+        found, expected = load_json(path), json.loads(json.dumps(settings))
+        differing = sorted(
+            key for key in found.keys() | expected.keys() if found.get(key) != expected.get(key)
+        )
         if differing:
             begun = f"{noun} begun with other settings ({', '.join(differing)})"
             raise error(f"{out} holds a {begun}; use them or another folder")

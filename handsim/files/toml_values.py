@@ -1,6 +1,6 @@
-"""Values of TOML files: checked for their kind, told of in a sentence, and written so that they read back.
+"""Values of TOML files: type checks, their form in messages, and their form in files.
 
-What is wrong is a `HandSimError` that names the key; whoever knows the file makes it one of its own.
+A wrong value raises a `HandSimError` that names the key; the caller, which knows the file, adds its name.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyon
 def check_keys(
     table: Mapping[str, object], owner: str, valid: Collection[str], *, optional: Collection[str] = ()
 ) -> None:
-    """Whether a table has all the keys that it must have, and no others."""
+    """Raise a `HandSimError` unless a table has all the keys that it must have, and no others."""
     for key in table:
         if key not in valid:
             raise HandSimError(f"{owner} has an {choices(key, valid, noun='key')}")
@@ -32,15 +32,15 @@ def check_keys(
 
 
 def tables_of(table: Mapping[str, object], key: str) -> list[dict[str, Any]]:
-    """A list of tables, which may be missing."""
+    """A list of tables; empty if the key is missing."""
     tables = table.get(key, [])
     if not isinstance(tables, list) or not all(isinstance(entry, dict) for entry in tables):
-        raise HandSimError(f"{key} is not a list of tables; expected one [[{key}]] table a {key}")
+        raise HandSimError(f"{key} is not a list of tables; expected one [[{key}]] table per {key}")
     return tables
 
 
 def text_of(table: Mapping[str, object], key: str, prefix: str = "", *, default: str | None = None) -> str:
-    """Text, of whatever characters."""
+    """Text of any characters."""
     value = table.get(key, default)
     if not isinstance(value, str):
         raise HandSimError(f"{prefix}{key} is {shown(value)}, expected text in quotes")
@@ -54,8 +54,8 @@ def number_of(
     return float(numbers(f"{prefix}{key}", table.get(key, default), (), "a number"))
 
 
-def numbers(owner: str, value: object, shape: tuple[int, ...], wanted: str) -> NDArray[np.float64]:
-    """Nested lists of finite numbers as an array of exactly this shape; `wanted` says so in words."""
+def numbers(owner: str, value: object, shape: tuple[int, ...], expected: str) -> NDArray[np.float64]:
+    """Nested lists of finite numbers as an array of exactly this shape; `expected` describes it in words."""
     try:
         array = np.array(value, dtype=object)
     except ValueError:  # rows of different lengths
@@ -65,7 +65,7 @@ def numbers(owner: str, value: object, shape: tuple[int, ...], wanted: str) -> N
         isinstance(entry, int | float) and not isinstance(entry, bool) and abs(entry) < _LARGEST
         for entry in flat
     ):
-        raise HandSimError(f"{owner} is {shown(value)}, expected {wanted}")
+        raise HandSimError(f"{owner} is {shown(value)}, expected {expected}")
     return np.array(flat, dtype=np.float64).reshape(shape)
 
 

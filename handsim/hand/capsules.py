@@ -1,6 +1,6 @@
-"""The hand's flesh as capsules: what touches, and what stands between a marker and a camera.
+"""The hand's flesh as capsules, for contact and for occlusion.
 
-A capsule's radius is a share of the skin's, because flesh gives way where bone does not: fingers side by side
+A capsule's radius is a share of the skin's, because flesh yields where bone does not: fingers side by side
 press into each other, and a marker on the skin must stay outside the capsule it sits on.
 """
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FIRMNESS: Final = 0.8
 """Capsule radius over skin radius."""
 _CARPUS_SPREAD: Final = (
-    0.42  # where the metacarpals begin: their sideways place at the carpus over the knuckles'
+    0.42  # where the metacarpals begin: their sideways position at the carpus over the knuckles'
 )
 _CARPUS_RISE: Final = 0.28  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
 
@@ -34,7 +34,7 @@ class Capsules:
     """Capsules fixed to bones: K segments with a radius each."""
 
     bones: Int[np.ndarray, "K"]
-    """The bone each one moves with, a place in `topology.BONES`."""
+    """The bone that carries each capsule, an index into `topology.BONES`."""
     starts: Float[np.ndarray, "K 3"]
     """One end of each axis in its bone's frame [m]."""
     ends: Float[np.ndarray, "K 3"]
@@ -67,6 +67,14 @@ def _touching_pairs(bones: tuple[int, ...]) -> NDArray[np.int64]:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _posed(transforms: Any, bones: Any, starts: Any, ends: Any) -> Any:
+    """Ends of the capsules' axes (T, K, 2, 3) [m], in the world.
+
+    Args:
+        transforms: `T_world_bone` (T, L, 4, 4).
+        bones: Bone of each capsule (K,).
+        starts: One end of each axis in its bone's frame (K, 3) [m].
+        ends: The other end (K, 3) [m].
+    """
     posed = np.empty((len(transforms), len(bones), 2, 3))
     for frame in range(len(transforms)):
         for capsule in range(len(bones)):
@@ -80,7 +88,14 @@ def _posed(transforms: Any, bones: Any, starts: Any, ends: Any) -> Any:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def bounding_spheres(segments: Any, radii: Any, centers: Any, sizes: Any) -> None:
-    """Balls around the capsules of one frame, written into `centers` and `sizes`."""
+    """Write the bounding spheres of one frame's capsules.
+
+    Args:
+        segments: Both ends of every axis (K, 2, 3) [m].
+        radii: Capsule radii (K,) [m].
+        centers: Where the spheres' centers go (K, 3) [m].
+        sizes: Where the spheres' radii go (K,) [m].
+    """
     for k in range(len(radii)):
         squared = 0.0
         for i in range(3):
@@ -91,16 +106,16 @@ def bounding_spheres(segments: Any, radii: Any, centers: Any, sizes: Any) -> Non
 
 
 def build_capsules(shape: HandShape) -> Capsules:
-    """Capsules of a hand: one a phalanx, one a metacarpal, two for the wrist; mirrored for a left hand."""
+    """Capsules of a hand: one per phalanx and metacarpal, two for the wrist; mirrored for a left hand."""
     rows: list[tuple[int, NDArray[np.float64], NDArray[np.float64], float]] = []
     firm = FIRMNESS * shape.radii
     for number, bone in enumerate(BONES):
         if bone.digit < 0:
             continue
-        place = (number - 1) % 3
-        length, tip = shape.bone_lengths[bone.digit, place], shape.radii[bone.digit, 3]
-        far = length - tip if place == 2 else length
-        radius = float(firm[bone.digit, place : place + 2].mean())
+        index = (number - 1) % 3
+        length, tip = shape.bone_lengths[bone.digit, index], shape.radii[bone.digit, 3]
+        far = length - tip if index == 2 else length
+        radius = float(firm[bone.digit, index : index + 2].mean())
         rows.append((number, np.zeros(3), np.array([far, 0.0, 0.0]), radius))
     thickness = FIRMNESS * shape.palm_thickness / 2
     for digit in range(1, len(DIGITS)):
@@ -110,10 +125,8 @@ def build_capsules(shape: HandShape) -> Capsules:
         )
         rows.append((PALM, carpus, knuckle, min(thickness, float(firm[digit, 0]) * 1.1)))
     for sideways in (-0.1, 0.1):
-        place_across = sideways * shape.breadth
-        wrist = np.array(
-            [[-0.15 * shape.length, place_across, 0.0], [0.05 * shape.length, place_across, 0.0]]
-        )
+        across = sideways * shape.breadth
+        wrist = np.array([[-0.15 * shape.length, across, 0.0], [0.05 * shape.length, across, 0.0]])
         rows.append((PALM, wrist[0], wrist[1], FIRMNESS * 0.2 * shape.breadth))
     mirror = MIRROR if shape.side == "left" else np.eye(3)
     return Capsules(

@@ -1,4 +1,4 @@
-"""How deep a hand digs into itself, and into another one."""
+"""Depth of a hand's overlap with itself, and with another hand."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def penetration_depth(
     capsules: Capsules, T_world_bone: Float[np.ndarray, "T L 4 4"]
 ) -> Float[np.ndarray, "T"]:
-    """Deepest overlap of any two capsules that may collide [m], a frame each; 0 where nothing touches."""
+    """Deepest overlap of any two capsules that may collide [m] in each frame; 0 where nothing touches."""
     depth: NDArray[np.float64] = _deepest(
         capsules.posed(T_world_bone), capsules.radii, capsules.touching_pairs()
     )
@@ -40,6 +40,13 @@ def overlap_between(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
+    """Deepest overlap (T,) [m] of the capsules of one hand; 0 where nothing touches.
+
+    Args:
+        segments: Both ends of every axis (T, K, 2, 3) [m].
+        radii: Capsule radii (K,) [m].
+        pairs: Capsules that may collide (P, 2).
+    """
     depth = np.zeros(len(segments))
     centers, sizes = np.empty((len(radii), 3)), np.empty(len(radii))
     for frame in range(len(segments)):
@@ -61,6 +68,14 @@ def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _overlap(first: Any, first_radii: Any, second: Any, second_radii: Any) -> Any:
+    """Deepest overlap (T,) [m] of capsules of two hands; minus the gap where nothing touches.
+
+    Args:
+        first: Both ends of every axis of one hand (T, K, 2, 3) [m].
+        first_radii: Its capsule radii (K,) [m].
+        second: The same of the other hand (T, K, 2, 3) [m].
+        second_radii: Its capsule radii (K,) [m].
+    """
     overlap = np.full(len(first), -np.inf)
     for frame in range(len(first)):
         for i in range(len(first_radii)):

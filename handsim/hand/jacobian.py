@@ -1,4 +1,4 @@
-"""How skinned points move with the hand's 26 degrees of freedom, batched over frames."""
+"""Jacobian of skinned points with respect to the hand's 26 degrees of freedom, batched over frames."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 NUM_VELOCITIES: Final = 6 + NUM_JOINTS
-"""MuJoCo's nv: wrist velocity in the world, wrist turning rate in its own frame, hinge rates."""
+"""MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""
 
 
 def _moved_bones() -> NDArray[np.bool_]:
-    """Which bones (J, L) each hinge moves: its own and all beyond it."""
+    """Which bones (J, L) each joint moves: its own and all beyond it."""
     moved = np.zeros((NUM_JOINTS, NUM_BONES), dtype=bool)
     for number, joint in enumerate(JOINTS):
         for bone in range(NUM_BONES):
@@ -30,16 +30,16 @@ def _moved_bones() -> NDArray[np.bool_]:
 
 
 _MOVED: Final = _moved_bones()
-# The first hinge of a bone turns about an axis fixed in the parent, a second one about its own bone's.
+# The first joint of a bone rotates about an axis fixed in the parent, a second one about its own bone's.
 _FIRST: Final = np.array([n == 0 or JOINTS[n - 1].bone != joint.bone for n, joint in enumerate(JOINTS)])
 _BONE: Final = np.array([joint.bone for joint in JOINTS])
 _PARENT: Final = np.array([BONES[joint.bone].parent for joint in JOINTS])
 
 
-def hinge_axes(
+def joint_axes(
     model: HandModel, T_world_bone: Float[np.ndarray, "T L 4 4"]
 ) -> tuple[Float[np.ndarray, "T J 3"], Float[np.ndarray, "T J 3"]]:
-    """Axes and anchors [m] of all hinges in the world."""
+    """Unit axes and anchors [m] of all joints in the world."""
     skeleton = model.skeleton
     parent = T_world_bone[:, _PARENT, :3, :3] @ skeleton.rotations[_BONE]
     own = T_world_bone[:, _BONE, :3, :3]
@@ -54,7 +54,7 @@ def skinned_jacobian(
     bone_indices: Int[np.ndarray, "M 4"],
     bone_weights: Float[np.ndarray, "M 4"],
 ) -> Float[np.ndarray, "T M 3 26"]:
-    """Derivative of skinned points by MuJoCo's velocities.
+    """Derivative of skinned points [m] with respect to MuJoCo's velocities (`NUM_VELOCITIES`).
 
     Args:
         model: The hand.
@@ -74,8 +74,8 @@ def skinned_jacobian(
     turning = np.swapaxes(wrist[:, :3, :3], 1, 2)  # rows are the wrist's own axes in the world
     arms = placed - wrist[:, None, :3, 3]
     jacobian[..., 3:6] = np.cross(turning[:, None], arms[:, :, None]).swapaxes(-1, -2)
-    axes, anchors = hinge_axes(model, T_world_bone)
-    # A hinge moves the share of a point that its bones carry: axis x (sum of w (p - anchor)).
+    axes, anchors = joint_axes(model, T_world_bone)
+    # A joint moves the share of a point that its bones carry: axis x (sum of w (p - anchor)).
     shares = bone_weights * _MOVED[:, bone_indices]  # (J, M, 4)
     lever = np.einsum("jmk,tmki->tmji", shares, carried)
     lever -= shares.sum(-1).T[..., None] * anchors[:, None]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class HandModel:
-    """A hand of one shape. Everything but the skeleton is built when first asked for.
+    """A hand of one shape. Everything but the skeleton is built on first use.
 
     Args:
         shape: The person's hand; its `side` decides which hand this is.
@@ -36,7 +36,11 @@ class HandModel:
 
     @classmethod
     def named(cls, size: str, *, side: Side = "right") -> HandModel:
-        """Hand of one of the five sizes XS, S, M, L, XL."""
+        """Hand of one of the five sizes XS, S, M, L, XL.
+
+        Raises:
+            ArgumentError: There is no such size or side.
+        """
         return cls(named_shape(size, side=side))
 
     @cached_property
@@ -63,7 +67,7 @@ class HandModel:
         """`T_world_bone` of every bone in every frame.
 
         Args:
-            qpos: Wrist position [m], wrist orientation (wxyz), twenty hinge angles [rad].
+            qpos: Wrist position [m], wrist orientation (wxyz), twenty joint angles [rad].
 
         Raises:
             ArgumentError: `qpos` is not (T, 27) or not finite.
@@ -72,7 +76,11 @@ class HandModel:
         return bone_transforms(self.skeleton, values)
 
     def skin(self, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T V 3"]:
-        """Skin vertices [m] in the world, by linear blend skinning."""
+        """Skin vertices [m] in the world, by linear blend skinning.
+
+        Args:
+            qpos: As for `forward_kinematics`.
+        """
         surface = self.surface
         return skin_frames(
             surface.vertices,
@@ -83,7 +91,11 @@ class HandModel:
         )
 
     def penetration(self, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T"]:
-        """Deepest self-penetration [m] in every frame."""
+        """Deepest self-penetration [m] in every frame.
+
+        Args:
+            qpos: As for `forward_kinematics`.
+        """
         return penetration_depth(self.capsules, self.forward_kinematics(qpos))
 
 
@@ -93,7 +105,16 @@ def join_qpos(
     position: Float[np.ndarray, "*T 3"] | None = None,
     quaternion: Float[np.ndarray, "*T 4"] | None = None,
 ) -> Float[np.ndarray, "T 27"]:
-    """Full qpos of hinge angles [rad], with the wrist at the origin unless told otherwise."""
+    """Full qpos of joint angles, with the wrist at the origin by default.
+
+    Args:
+        angles: Joint angles [rad], in the order of `topology.JOINTS`.
+        position: Wrist position in the world [m], one per frame or one for all.
+        quaternion: Wrist orientation in the world (wxyz), one per frame or one for all.
+
+    Raises:
+        ArgumentError: `angles` is not (T, 20) or not finite.
+    """
     angles = check_array("angles", angles, (None, NUM_JOINTS))
     qpos = np.zeros((len(angles), NUM_QPOS))
     qpos[:, :3] = 0.0 if position is None else position

@@ -1,4 +1,4 @@
-"""Hands as rows of an array: how a person's shape lies in files."""
+"""Hand shapes as rows of a structured array, the form that files hold."""
 
 from __future__ import annotations
 

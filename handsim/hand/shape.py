@@ -1,4 +1,4 @@
-"""How a hand is built: lengths, breadths and girths in meters, five named sizes, and a population.
+"""The shape of a hand: lengths, breadths and girths [m], five named sizes, and a population to sample from.
 
 Sources, in docs/anatomy.md with their tables: bone lengths from Buryanov and Kotiuk 2010 (Int. J. Morphol.
 28:755), hand length and breadth from ANSUR II (2012), finger girths from Greiner 1991 (NATICK/TR-92/011).
@@ -38,7 +38,7 @@ _BONE_LENGTHS: Final = np.array(
 _KNUCKLES: Final = np.array(
     [[26.0, 25.5, -17.5], [97.5, 27.0, -2.0], [98.0, 5.0, 2.0], [90.5, -15.5, 0.0], [80.5, -35.0, -8.0]]
 )
-# How each digit points at zero angles [deg]: turn about z, tip towards the palm, roll about its own length.
+# Direction of each digit at zero angles [deg]: yaw about z, pitch towards the palm, roll about its length.
 # The rolls make flexed fingers converge on the scaphoid; the thumb's nail faces sideways.
 _BASE_ANGLES: Final = np.array(
     [[30.0, 32.0, -87.0], [-1.0, -8.0, -10.0], [-5.0, -2.0, -3.0], [-10.0, -2.0, 4.0], [-18.0, -2.0, 12.0]]
@@ -72,7 +72,12 @@ SIZES: Final[dict[str, tuple[float, float]]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandShape:
-    """One person's hand, always described as a right hand; `side` says which one it is."""
+    """One person's hand, always described as a right hand; `side` names the hand it is.
+
+    Raises:
+        ArgumentError: The side is unknown, an array has another shape or is not finite, a length is not
+            positive, or the hand length is not between 0.05 and 0.35 m.
+    """
 
     side: Side
     length: float
@@ -82,9 +87,9 @@ class HandShape:
     bone_lengths: Float[np.ndarray, "5 3"]
     """Lengths [m] of the three moving bones of each digit, the last one to the soft tip."""
     knuckles: Float[np.ndarray, "5 3"]
-    """Where each digit's first joint sits [m] in the wrist frame."""
+    """Position of each digit's first joint [m] in the wrist frame."""
     base_angles: Float[np.ndarray, "5 3"]
-    """How each digit points at zero angles [rad]: turn, tip, roll."""
+    """Direction of each digit at zero angles [rad]: yaw, pitch, roll."""
     radii: Float[np.ndarray, "5 4"]
     """Skin radius [m] at each digit's three joints and behind its tip."""
     palm_thickness: float
@@ -131,7 +136,11 @@ def shape_from_measures(length: float, breadth: float, *, side: Side = "right") 
 
 
 def named_shape(size: str, *, side: Side = "right") -> HandShape:
-    """One of the five sizes XS, S, M, L, XL."""
+    """One of the five sizes XS, S, M, L, XL.
+
+    Raises:
+        ArgumentError: There is no such size or side.
+    """
     if size not in SIZES:
         raise ArgumentError(choices(size, SIZES, noun="size"))
     length, breadth = SIZES[size]
@@ -140,7 +149,7 @@ def named_shape(size: str, *, side: Side = "right") -> HandShape:
 
 @dataclass(frozen=True, slots=True)
 class Population:
-    """Whose hands `sample_shape` draws; the spreads are standard deviations around the mean proportions."""
+    """The people whose hands `sample_shape` draws; spreads are standard deviations from mean proportions."""
 
     children: float = 0.0
     """Share of children: hand lengths from 0.6 of an adult's (about three years old) upwards."""
@@ -149,7 +158,7 @@ class Population:
     bone_spread: float = 0.045
     """Log spread of a single bone's length."""
     knuckle_spread: float = 0.001
-    """Spread of each knuckle's place [m]."""
+    """Spread of each knuckle's position [m]."""
     angle_spread: float = 3.0
     """Spread of each finger's base angles [deg]; three times this for the thumb."""
     girth_spread: float = 0.06
@@ -168,7 +177,13 @@ EVERYBODY: Final = Population(children=0.2)
 def sample_shape(
     population: Population = ADULTS, *, side: Side = "right", rng: np.random.Generator
 ) -> HandShape:
-    """A random person's hand: length and breadth as ANSUR II correlates them, proportions varied on top."""
+    """A random person's hand: length and breadth as ANSUR II correlates them, proportions varied on top.
+
+    Args:
+        population: The people to draw from.
+        side: Which hand.
+        rng: Source of all randomness.
+    """
     sex = "female" if rng.random() < 0.5 else "male"
     (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]
     first, second = np.clip(rng.standard_normal(2), -2.5, 2.5)

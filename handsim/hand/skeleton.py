@@ -1,4 +1,4 @@
-"""Where a hand's bones and hinges sit at zero angles, for either side."""
+"""Bones and joint axes of a hand at zero angles, for either side."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Skeleton:
-    """Rest transforms of the bones relative to their parents, hinge axes, and bone lengths."""
+    """Rest transforms of the bones relative to their parents, joint axes, and bone lengths."""
 
     offsets: Float[np.ndarray, "L 3"]
     """Origin of each bone in its parent's frame [m]; zero for the palm."""
     rotations: Float[np.ndarray, "L 3 3"]
     """Orientation of each bone in its parent's frame at zero angles."""
     axes: Float[np.ndarray, "J 3"]
-    """Hinge axes in the frames of the bones they move."""
+    """Unit joint axes in the frames of the bones they move."""
     ranges: Float[np.ndarray, "J 2"]
-    """Lowest and highest angle of each hinge [rad]."""
+    """Lowest and highest angle of each joint [rad]."""
     lengths: Float[np.ndarray, "L"]
     """Length of each bone along its x axis [m]; for the palm, wrist to the middle knuckle."""
 
@@ -49,16 +49,16 @@ def build_skeleton(shape: HandShape) -> Skeleton:
     for number, bone in enumerate(BONES):
         if bone.digit < 0:
             continue
-        place = (number - 1) % 3
-        lengths[number] = shape.bone_lengths[bone.digit, place]
-        if place == 0:
+        index = (number - 1) % 3
+        lengths[number] = shape.bone_lengths[bone.digit, index]
+        if index == 0:
             offsets[number] = shape.knuckles[bone.digit]
             rotations[number] = euler_matrix(shape.base_angles[bone.digit])
         else:
-            offsets[number, 0] = shape.bone_lengths[bone.digit, place - 1]
+            offsets[number, 0] = shape.bone_lengths[bone.digit, index - 1]
     axes = np.array([joint.axis for joint in JOINTS])
     if shape.side == "left":
         offsets, rotations = offsets @ MIRROR, MIRROR @ rotations @ MIRROR
-        axes = -axes @ MIRROR  # a mirrored turn goes the other way round
+        axes = -axes @ MIRROR  # a mirrored rotation has the opposite sense
     ranges = np.deg2rad([(joint.low, joint.high) for joint in JOINTS])
     return Skeleton(offsets, rotations, axes, ranges, lengths)

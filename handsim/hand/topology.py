@@ -1,4 +1,4 @@
-"""The one ordered list of bones and joints: sixteen bones, twenty hinges, four a digit.
+"""The one ordered list of bones and joints: sixteen bones, twenty joints, four per digit.
 
 Together with the free joint of the wrist this is the 26 degree-of-freedom hand of Han et al. 2018,
 section 4.1. Axes are given for the right hand in the frame of the joint's bone: x along the bone,
@@ -15,7 +15,7 @@ DIGITS: Final = ("thumb", "index", "middle", "ring", "little")
 
 
 class Bone(NamedTuple):
-    """A rigid segment: its name, its parent's place in `BONES` (palm: -1), and its digit (palm: -1)."""
+    """A rigid segment: its name, its parent's index in `BONES` (palm: -1), and its digit (palm: -1)."""
 
     name: str
     parent: int
@@ -23,7 +23,7 @@ class Bone(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """A hinge: its name, the place in `BONES` of the bone it moves, its axis, its range [deg]."""
+    """A hinge joint: its name, the index in `BONES` of the bone it moves, its axis, its range [deg]."""
 
     name: str
     bone: int
@@ -42,10 +42,10 @@ BONES: Final[tuple[Bone, ...]] = (
     Bone("thumb_proximal", 1, 0),
     Bone("thumb_distal", 2, 0),
     *(
-        Bone(f"{digit}_{segment}", PALM if place == 0 else 1 + 3 * number + place - 1, number)
+        Bone(f"{digit}_{segment}", PALM if index == 0 else 1 + 3 * number + index - 1, number)
         for number, digit in enumerate(DIGITS)
         if number > 0
-        for place, segment in enumerate(("proximal", "middle", "distal"))
+        for index, segment in enumerate(("proximal", "middle", "distal"))
     ),
 )
 BONE_NAMES: Final[tuple[str, ...]] = tuple(bone.name for bone in BONES)
@@ -68,12 +68,12 @@ _SUFFIXES: Final = {
 JOINTS: Final[tuple[Joint, ...]] = tuple(
     Joint(
         f"{digit}_{suffix}",
-        1 + 3 * number + max(0, place - 1),
-        _ABDUCTION if place == 0 else _FLEXION,
-        *_RANGES[digit][place],
+        1 + 3 * number + max(0, index - 1),
+        _ABDUCTION if index == 0 else _FLEXION,
+        *_RANGES[digit][index],
     )
     for number, digit in enumerate(DIGITS)
-    for place, suffix in enumerate(_SUFFIXES["thumb" if number == 0 else "finger"])
+    for index, suffix in enumerate(_SUFFIXES["thumb" if number == 0 else "finger"])
 )
 JOINT_NAMES: Final[tuple[str, ...]] = tuple(joint.name for joint in JOINTS)
 NUM_JOINTS: Final = len(JOINTS)
@@ -81,6 +81,6 @@ NUM_QPOS: Final = 7 + NUM_JOINTS
 
 
 def bones_of(digit: str) -> tuple[int, int, int]:
-    """Places in `BONES` of a digit's three bones, from the knuckle outwards."""
+    """Indices in `BONES` of a digit's three bones, from the knuckle outwards."""
     first = 1 + 3 * DIGITS.index(digit)
     return first, first + 1, first + 2

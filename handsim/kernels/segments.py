@@ -1,4 +1,4 @@
-"""Distance between two straight segments, compiled: the one geometric test of contact and of sight."""
+"""Distance between two straight segments, compiled: the geometric test of contact and of visibility."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 @numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
 def segment_distance_squared(p: Any, q: Any, a: Any, b: Any) -> float:
-    """Squared distance [m^2] between the segments p-q and a-b (each point three floats).
+    """Squared distance [m^2] between the segments p-q and a-b, each point (3,) [m].
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9; degenerate segments are points.
     """
@@ -39,5 +39,5 @@ def segment_distance_squared(p: Any, q: Any, a: Any, b: Any) -> float:
 def segment_distance(
     p: np.ndarray[Any, Any], q: np.ndarray[Any, Any], a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]
 ) -> float:
-    """Distance [m] between the segments p-q and a-b, each point an array (3,)."""
+    """Distance [m] between the segments p-q and a-b, each point an array (3,) [m]."""
     return float(np.sqrt(segment_distance_squared(p, q, a, b)))

@@ -1,1 +1,8 @@
-"""TODO map."""
+"""Space around the hand: frames, cameras and objects.
+
+- transforms: rotations and rigid transforms on numpy arrays
+- cameras: `CameraRig`, shipped rigs and rigs from files
+- rig_file: the TOML form of a rig
+- solids: the simple solids that objects are made of
+- objects: rigid objects that a hand holds
+"""

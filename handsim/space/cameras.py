@@ -1,4 +1,4 @@
-"""Cameras around the hand: where they stand, where they look, how wide they see."""
+"""Camera rigs: poses, field of view and resolution of the cameras around the hand, by name or from a file."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 FEWEST_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32
-"""A marker's visibility is one bit a camera in 32 bits."""
+"""A marker's visibility is one bit per camera in 32 bits."""
 ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
 HAND_REACH: Final = 0.25
-"""No hand reaches further from its wrist [m], and no camera that watches it stands nearer."""
+"""No hand reaches further from its wrist [m]; cameras stand at least this far from the wrists' volume."""
 _WIDEST: Final = 170.0  # [deg]
 _FARTHEST: Final = 50.0  # [m]
 _APART: Final = 1e-3  # [m]
@@ -36,9 +36,9 @@ class CameraRig:
     Messages count cameras from 1, in the order given.
 
     Raises:
-        RigError: Too few or too many cameras, two at one place, a pose that is not one or lies beyond
-            50 m,
-            or a field of view or resolution that no camera has.
+        ArgumentError: `T_world_camera` is not (C, 4, 4) or not finite.
+        RigError: Too few or too many cameras, two at one position, a pose that is not rigid or lies beyond
+            50 m, or a field of view or resolution that no camera has.
     """
 
     name: str
@@ -78,16 +78,17 @@ class CameraRig:
         return float(self.resolution / 2 / np.tan(self.field_of_view / 2))
 
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch C"]:
-        """Which cameras have each point inside their view cone."""
+        """Which cameras have each point [m], in the world, inside their view cone."""
         rays = points[..., None, :] - self.positions
         ahead = np.einsum("...ci,ci->...c", rays, self.T_world_camera[:, :3, 2])
         inside: NDArray[np.bool_] = ahead >= np.cos(self.field_of_view / 2) * np.linalg.norm(rays, axis=-1)
         return inside
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch C 2"]:
-        """Where each camera's picture shows each point [px], right and down from the picture's center.
+        """Pixel of each point [m] in each camera [px], right and down from the picture's center.
 
-        NaN for points that are not in front of the camera; the edge of the view is not looked at (`in_view`).
+        NaN for points that are not in front of the camera. Points outside the view cone are projected too;
+        `in_view` tells them apart.
         """
         rays = points[..., None, :] - self.positions
         x, y, depth = np.moveaxis(np.einsum("...ci,cij->...cj", rays, self.T_world_camera[:, :3, :3]), -1, 0)
@@ -97,7 +98,7 @@ class CameraRig:
 
 
 def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """Pose of a camera at `position` that looks at `target` and holds its picture upright (world z)."""
+    """`T_world_camera` of a camera at `position` [m] that looks at `target` [m], upright (world z)."""
     forward = (target - position) / np.linalg.norm(target - position)
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
     right = np.cross(forward, up)
@@ -125,7 +126,7 @@ def named_rig(name: str) -> CameraRig:
 
 
 def load_rig(name_or_path: str | Path) -> CameraRig:
-    """A rig by its name, or anybody's by the path of its `.toml` file (docs/rigs.md says what stands in it).
+    """A shipped rig by its name, or your own by the path of its `.toml` file (format: docs/rigs.md).
 
     Raises:
         RigError: No such rig or file, or the file does not describe one; the sentence names the file.
@@ -155,20 +156,20 @@ def _read(path: Path) -> CameraRig:
 
 def _aimed(number: int, position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
     if np.linalg.norm(target - position) < _APART:
-        raise RigError(f"camera {number} looks at the place it stands at; expected a target in front of it")
+        raise RigError(f"camera {number} looks at its own position; expected a target in front of it")
     return look_at(position, target)
 
 
 def check_outside(
     rig: CameraRig, points: Float[np.ndarray, "*batch 3"], *, clearance: float = 0.05, what: str = "hand"
 ) -> None:
-    """Refuses a rig with a camera in or at something.
+    """Refuse a rig with a camera inside or near an object or a hand.
 
     Args:
         rig: The cameras.
-        points: The thing's vertices, or places along it, in all frames [m]; NaN points are left out.
-        clearance: Least distance of a camera from any of them [m].
-        what: What the points are, for the sentence.
+        points: The object's vertices, or other points of it, in all frames [m]; NaN points are left out.
+        clearance: Smallest distance of a camera from any of them [m].
+        what: Name of the object, for the message.
 
     Raises:
         ArgumentError: A camera is nearer.
@@ -187,13 +188,13 @@ def check_outside(
 def check_outside_volume(
     rig: CameraRig, center: Float[np.ndarray, "3"], half_side: float, *, clearance: float = HAND_REACH
 ) -> None:
-    """Refuses a rig with a camera in or at the cube that wrists move in, before anything is simulated.
+    """Refuse a rig with a camera inside or near the cube that wrists move in, before anything is simulated.
 
     Args:
         rig: The cameras.
         center: Middle of the cube in the world [m].
         half_side: Half its side [m].
-        clearance: Least distance of a camera from the cube [m].
+        clearance: Smallest distance of a camera from the cube [m].
 
     Raises:
         ArgumentError: A camera is nearer.
@@ -209,10 +210,10 @@ def check_outside_volume(
 
 
 def _check_pose(owner: str, pose: NDArray[np.float64]) -> None:
-    turn = pose[:3, :3]
+    rotation = pose[:3, :3]
     if (
-        not np.allclose(turn.T @ turn, np.eye(3), atol=1e-6)
-        or np.linalg.det(turn) < 0.0
+        not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-6)
+        or np.linalg.det(rotation) < 0.0
         or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])
     ):
         raise RigError(f"{owner}: T_world_camera is not a rotation and a position, expected a rigid pose")
@@ -230,5 +231,6 @@ def _check_apart(name: str, positions: NDArray[np.float64]) -> None:
     first, second = np.unravel_index(gaps.argmin(), gaps.shape)
     if gaps[first, second] < _APART:
         raise RigError(
-            f"cameras {first + 1} and {second + 1} of rig '{name}' stand at one place, expected places apart"
+            f"cameras {first + 1} and {second + 1} of rig '{name}' stand at one position, "
+            "expected different ones"
         )

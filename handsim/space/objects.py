@@ -1,6 +1,6 @@
-"""Rigid things that a hand holds: what cameras see, what fingers touch, and the markers stuck on.
+"""Rigid objects that a hand holds: the surface that cameras see, the parts that fingers touch, the markers.
 
-Five come with handsim, in `data/objects.json`; any closed mesh can be loaded.
+Five objects come with handsim, in `data/objects.json`; any closed mesh can be loaded.
 """
 
 from __future__ import annotations
@@ -33,7 +33,12 @@ _SMALLEST: Final = 0.002
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidObject:
-    """A thing in its own frame: meters, markers one radius above the surface."""
+    """An object in its own frame: meters, markers one radius above the surface.
+
+    Raises:
+        ArgumentError: An array has another shape, a face names no vertex, the mass is not positive, or
+            there are no parts.
+    """
 
     name: str
     vertices: Float[np.ndarray, "V 3"]
@@ -41,14 +46,14 @@ class RigidObject:
     faces: Int[np.ndarray, "F 3"]
     """Triangles, counter-clockwise from outside."""
     parts: tuple[Part, ...]
-    """What fingers touch."""
+    """Convex pieces that fingers touch."""
     marker_names: tuple[str, ...]
     markers: Float[np.ndarray, "Q 3"]
     """Centers of its own retro-reflective markers [m]; none for most things."""
     marker_normals: Float[np.ndarray, "Q 3"]
     """Outward unit normals of the surface under them."""
     mass: float
-    """[kg]."""
+    """Mass [kg]."""
     shiny: Float[np.ndarray, "S 7"]
     """Mirror-like patches: a point [m], its outward unit normal, the patch's radius [m]."""
 
@@ -92,10 +97,10 @@ def named_object(name: str) -> RigidObject:
 
 
 def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
-    """A thing of one's own, from a mesh file in meters.
+    """An object of your own, from a mesh file in meters.
 
-    Cameras see the mesh as it is; fingers touch its convex hull, so that nothing reaches into hollows. It
-    carries no markers. A file with several meshes makes one object.
+    Cameras see the mesh as it is; fingers touch its convex hull, so they cannot reach into hollows. The
+    object carries no markers. A file with several meshes makes one object.
 
     Args:
         path: An .stl, .obj, .ply or .glb file, in meters.

@@ -1,4 +1,4 @@
-"""What a camera rig's TOML file says, each value checked for its kind."""
+"""A camera rig's TOML file, each value checked for its type."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CAMERA_KEYS: Final = ("position", "target", "T_world_camera")
 
 
 class RigTable(NamedTuple):
-    """A rig as written; whether cameras can stand like that is `CameraRig`'s to say."""
+    """A rig as written in its file; `CameraRig` checks whether cameras can stand like that."""
 
     name: str
     field_of_view: float
@@ -34,7 +34,7 @@ def read_rig_file(path: Path) -> RigTable:
     """Read a rig's file.
 
     Raises:
-        RigError: It cannot be read, is damaged, or a key is missing, unknown or of another kind.
+        RigError: It cannot be read, is damaged, or a key is missing, unknown or of another type.
     """
     table = read_toml(path, error=RigError)
     try:
@@ -65,9 +65,9 @@ def _parse_camera(
             f"{owner}: T_world_camera", table["T_world_camera"], (4, 4), "four rows of four numbers"
         )
     if set(table) == {"position", "target"}:
-        wanted = "three numbers [x, y, z] in meters"
+        expected = "three numbers [x, y, z] in meters"
         position, target = (
-            numbers(f"{owner}: {key}", table[key], (3,), wanted) for key in ("position", "target")
+            numbers(f"{owner}: {key}", table[key], (3,), expected) for key in ("position", "target")
         )
         return position, target
     given = " and ".join(table) or "nothing"

@@ -1,4 +1,4 @@
-"""The simple solids that things are made of: convex parts for fingers, and a mesh for cameras."""
+"""The simple solids that objects are made of: convex parts for fingers, and a mesh for cameras."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ class Part:
     size: Float[np.ndarray, "3"]
     """MuJoCo's sizes [m]: radius; radius and half length along z; three half sizes; zeros for a mesh."""
     T_object_part: Float[np.ndarray, "4 4"]
+    """The part's frame seen from the object [m]."""
     vertices: Float[np.ndarray, "N 3"]
     """Corners of a mesh [m], in the part's frame; none for the other kinds."""
 
@@ -44,7 +45,7 @@ def build_solid(kind: str, numbers: Sequence[float]) -> Solid:
 
 
 def hull_part(vertices: Float[np.ndarray, "N 3"]) -> Part:
-    """The convex hull of some points as a part."""
+    """The convex hull of some points [m] as a part."""
     hull = trimesh.convex.convex_hull(np.asarray(vertices))
     return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
 
@@ -130,8 +131,8 @@ def _tube_mesh(
     ring: bool,
 ) -> Any:
     """Mesh around a polyline: closed upon itself, or with flat ends."""
-    turn = np.linspace(0.0, 2 * np.pi, _TUBE_SIDES, endpoint=False)
-    cross = np.cos(turn)[:, None, None] * outward + np.sin(turn)[:, None, None] * across
+    angle = np.linspace(0.0, 2 * np.pi, _TUBE_SIDES, endpoint=False)
+    cross = np.cos(angle)[:, None, None] * outward + np.sin(angle)[:, None, None] * across
     rows = (points + tube * cross).swapaxes(0, 1)  # (points, sides, 3)
     if ring:
         rows = rows[:-1]

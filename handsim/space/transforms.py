@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-MIRROR = np.diag([1.0, -1.0, 1.0])  # right hand <-> left hand, in the wrist frame
+MIRROR = np.diag([1.0, -1.0, 1.0])
+"""Right hand to left hand and back, in the wrist frame."""
 
 
 def axis_angle_matrix(axis: Float[np.ndarray, "3"], angle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -52,7 +53,7 @@ def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]
 
 
 def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
-    """Rotation Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: turn, then tip, then roll about the own x axis."""
+    """Rotation Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
     x, y, z = np.eye(3)
     matrix: NDArray[np.float64] = (
         axis_angle_matrix(z, angles[0]) @ axis_angle_matrix(y, angles[1]) @ axis_angle_matrix(x, angles[2])

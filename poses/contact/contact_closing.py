@@ -1,7 +1,7 @@
-"""Hands brought together until they touch: one backs off along an axis, fingers close until something is met.
+"""Hands brought together until they touch: one backs off along an axis, fingers close until they meet a hand.
 
-Both searches come from the free side and stop at the first contact, so whatever is less far is free too. That
-is what lets a motion be smoothed afterwards: towards the free side only.
+Both searches start from the free side and stop at the first contact, so everything before it is free too. A
+motion can therefore be smoothed afterwards, towards the free side only.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from handsim.space.transforms import quaternion_matrix
 from poses.contact.contact_search import (
     NEAREST,
     Digit,
+    DigitPaths,
     Obstacles,
-    Ways,
     pose_digit,
     search_closing,
     search_contact,
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-# Fingers close in two stages: what stops a knuckle does not stop the joints beyond it. Each has a depth [m]
-# to which a finger presses into the other hand or its own, and the joints of a digit that it moves.
+# Fingers close in two stages: what stops a knuckle does not stop the joints beyond it. Each stage has a depth
+# [m] to which a finger presses into the other hand or its own, and the joints of a digit that it moves.
 _STAGES: Final = ((0.0006, slice(0, 4)), (0.0008, slice(2, 4)))
 _ORDER: Final = (1, 2, 3, 4, 0)  # the thumb closes last, over what the fingers hold
 
@@ -42,18 +42,25 @@ def first_contact(
     moving_qpos: Float[np.ndarray, "T 27"],
     axis: Float[np.ndarray, "T 3"],
 ) -> Float[np.ndarray, "T"]:
-    """How far along `axis` [m] the moving hand touches the still one, coming from far outside.
+    """Distance along `axis` [m] at which the moving hand, coming from outside, first touches the still one.
 
     Everything farther out is free. Frames without a contact give `NEAREST`.
+
+    Args:
+        still: The hand that stays.
+        still_qpos: Its poses.
+        moving: The hand that approaches.
+        moving_qpos: Its poses at distance zero.
+        axis: Unit direction in the world in which the moving hand backs off.
     """
-    reach: NDArray[np.float64] = search_contact(
+    distance: NDArray[np.float64] = search_contact(
         moving.capsules.posed(moving.forward_kinematics(moving_qpos)),
         moving.capsules.radii,
         still.capsules.posed(still.forward_kinematics(still_qpos)),
         still.capsules.radii,
         axis,
     )
-    return reach
+    return distance
 
 
 def close_fingers(
@@ -66,16 +73,16 @@ def close_fingers(
     other_qpos: Float[np.ndarray, "T 27"],
     window: int = 1,
 ) -> Float[np.ndarray, "T 20"]:
-    """Hinge angles of fingers that close from one pose towards another until they meet a hand.
+    """Joint angles [rad] of fingers that close from one pose towards another until they meet a hand.
 
     Args:
         model: The hand whose fingers close.
-        opened: Where it is, with its fingers open.
-        closed: Angles [rad] its fingers would have with nothing in the way.
-        strength: Share of the way that is gone where nothing is in the way, a digit each.
-        other: The hand that is in the way, besides the own one.
-        other_qpos: Where that is.
-        window: Frames over which the ways are smoothed; 1 leaves each frame alone.
+        opened: Its poses with open fingers.
+        closed: Joint angles [rad] of the fingers if nothing blocks them.
+        strength: Share of the path that each digit closes if nothing blocks it.
+        other: The hand that blocks the fingers, besides their own.
+        other_qpos: Its poses.
+        window: Frames over which the paths are smoothed; 1 leaves each frame alone.
     """
     busy = np.flatnonzero(strength.max(axis=1) > 0.0)
     angles = opened[:, 7:].copy()
@@ -87,12 +94,12 @@ def close_fingers(
         for digit in _ORDER:
             parts = digit_parts(model, digit)
             rest = [k for k in range(len(model.capsules.bones)) if k not in parts.capsules]
-            place = slice(4 * digit, 4 * digit + 4)
-            goal = angles[:, place].copy()
-            goal[:, joints] = closed[:, place][:, joints]
+            columns = slice(4 * digit, 4 * digit + 4)
+            goal = angles[:, columns].copy()
+            goal[:, joints] = closed[:, columns][:, joints]
             share = np.ones(len(angles))
             share[busy] = search_closing(
-                Ways(rotations, positions, angles[busy, place], goal[busy]),
+                DigitPaths(rotations, positions, angles[busy, columns], goal[busy]),
                 parts,
                 Obstacles(
                     np.concatenate([others, own[:, rest]], axis=1),
@@ -102,8 +109,8 @@ def close_fingers(
                 ),
             )
             share = smooth_below(share, window) * strength[:, digit]
-            angles[:, place] += share[:, None] * (goal - angles[:, place])
-            own[:, parts.capsules] = pose_digit((rotations, positions), angles[busy, place], parts)
+            angles[:, columns] += share[:, None] * (goal - angles[:, columns])
+            own[:, parts.capsules] = pose_digit((rotations, positions), angles[busy, columns], parts)
     return angles
 
 
@@ -123,19 +130,20 @@ def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarra
 
 
 def digit_parts(model: HandModel, digit: int) -> Digit:
+    """A digit of a hand (0: thumb) as the compiled searches need it."""
     capsules, skeleton = model.capsules, model.skeleton
     first = 1 + 3 * digit
-    places = np.array([int(np.flatnonzero(capsules.bones == first + number)[0]) for number in range(3)])
+    indices = np.array([int(np.flatnonzero(capsules.bones == first + number)[0]) for number in range(3)])
     meets = np.zeros((len(capsules.bones),) * 2, dtype=bool)
     pairs = capsules.touching_pairs()
     meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
     return Digit(
-        capsules=places,
+        capsules=indices,
         offsets=skeleton.offsets[first : first + 3],
         rotations=skeleton.rotations[first : first + 3],
         axes=skeleton.axes[4 * digit : 4 * digit + 4],
-        ends=np.stack([capsules.starts[places], capsules.ends[places]], axis=1),
-        radii=capsules.radii[places],
-        meets=meets[places],
-        reach=float(skeleton.lengths[first : first + 3].sum() + capsules.radii[places].max()),
+        ends=np.stack([capsules.starts[indices], capsules.ends[indices]], axis=1),
+        radii=capsules.radii[indices],
+        meets=meets[indices],
+        reach=float(skeleton.lengths[first : first + 3].sum() + capsules.radii[indices].max()),
     )

@@ -1,4 +1,4 @@
-"""The compiled searches behind `touch`: where a hand first meets another, how far a digit can close."""
+"""The compiled searches of `contact_closing`: where a hand first meets another, how far a digit can close."""
 
 from __future__ import annotations
 
@@ -18,50 +18,69 @@ FARTHEST: Final = 0.4
 NEAREST: Final = -0.15
 """Where it ends without one [m]."""
 _PRESS: Final = 0.0005  # depth [m] to which a hand is brought to the other
-_STEP: Final = 0.15  # of all hinges together [rad], from open to closed until the first that is blocked
+_STEP: Final = 0.15  # of all joints together [rad], from open to closed until the first that is blocked
 _HALVINGS: Final = 6  # of that last step, or fewer where that is exact to
-_PRECISION: Final = 0.003  # of all hinges together [rad]
+_PRECISION: Final = 0.003  # of all joints together [rad]
 
 
 class Digit(NamedTuple):
-    """What the searches need of a digit: three bones, four hinges, three capsules."""
+    """The data of a digit that the searches need: three bones, four joints, three capsules."""
 
     capsules: NDArray[np.int64]
+    """Indices of its capsules among the hand's (3,)."""
     offsets: NDArray[np.float64]
+    """Origin of each bone in its parent's frame (3, 3) [m]."""
     rotations: NDArray[np.float64]
+    """Orientation of each bone in its parent's frame at zero angles (3, 3, 3)."""
     axes: NDArray[np.float64]
+    """Unit axes of its joints in the frames of the bones they move (4, 3)."""
     ends: NDArray[np.float64]
+    """Both ends of each capsule in its bone's frame (3, 2, 3) [m]."""
     radii: NDArray[np.float64]
+    """Radii of its capsules (3,) [m]."""
     meets: NDArray[np.bool_]
     """Which capsules of the hand each of its own may collide with (3, K)."""
     reach: float
-    """Farthest that its skin gets from its first joint [m]."""
+    """Largest distance of its skin from its first joint [m]."""
 
 
-class Ways(NamedTuple):
-    """A digit's way in every frame: the wrist's place, hinges (T, 4) at the start and at the goal [rad]."""
+class DigitPaths(NamedTuple):
+    """A digit's path in every frame: the pose of the wrist, and joint angles at the start and at the goal."""
 
     rotations: NDArray[np.float64]
+    """Orientation of the wrist (T, 3, 3)."""
     positions: NDArray[np.float64]
+    """Position of the wrist (T, 3) [m]."""
     start: NDArray[np.float64]
+    """Joint angles at the start (T, 4) [rad]."""
     goal: NDArray[np.float64]
+    """Joint angles at the goal (T, 4) [rad]."""
 
 
 class Obstacles(NamedTuple):
-    """What a digit may meet: capsules of the other hand and of its own."""
+    """Capsules that a digit may meet: those of the other hand and of its own."""
 
     segments: NDArray[np.float64]
     """Axes in the world (T, K, 2, 3) [m]."""
     radii: NDArray[np.float64]
+    """Their radii (K,) [m]."""
     meets: NDArray[np.bool_]
     """Which of them stop which of the digit's bones (3, K)."""
     press: float
-    """How deep [m] it may press into them."""
+    """Depth to which the digit may press into them [m]."""
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def search_contact(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
-    """How far along the axis capsules first touch others (conservative advancement), in every frame."""
+    """Distance (T,) [m] along the axis at which capsules first touch others, by conservative advancement.
+
+    Args:
+        moving: Axes of the moving capsules at distance zero, in the world (T, K, 2, 3) [m].
+        moving_radii: Their radii (K,) [m].
+        still: Axes of the other capsules in the world (T, L, 2, 3) [m].
+        still_radii: Their radii (L,) [m].
+        axis: Unit direction in which the moving capsules back off (T, 3).
+    """
     reach = np.empty(len(moving))
     p, q = np.empty(3), np.empty(3)
     for frame in range(len(moving)):
@@ -78,7 +97,7 @@ def search_contact(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
                 squared = segment_distance_squared(p, q, still[frame, j, 0], still[frame, j, 1])
                 if near > 0.0 and squared < near * near:
                     gap = np.sqrt(squared) - moving_radii[i] - still_radii[j]
-            # No point moves faster than the hand: so far it can go without a touch.
+            # No point moves faster than the hand, so it can advance by the gap without a touch.
             shift -= gap + _PRESS
             if gap + _PRESS < 2e-5 or shift <= NEAREST:
                 break
@@ -88,7 +107,7 @@ def search_contact(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
-    """Pairs whose bounding balls meet somewhere along the axis; the others never touch."""
+    """Pairs (P, 2) whose bounding spheres meet somewhere along the axis; the others never touch."""
     pairs = np.empty((len(moving_radii) * len(still_radii), 2), dtype=np.int64)
     count = 0
     for i in range(len(moving_radii)):
@@ -108,24 +127,30 @@ def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def search_closing(ways: Any, parts: Any, obstacles: Any) -> Any:
-    """Share of its way that a digit can go before it meets something, in every frame."""
-    share = np.ones(len(ways.start))
+def search_closing(paths: Any, parts: Any, obstacles: Any) -> Any:
+    """Share (T,) of its path that a digit can follow before it meets something.
+
+    Args:
+        paths: The digit's `DigitPaths`.
+        parts: The `Digit`.
+        obstacles: The `Obstacles`.
+    """
+    share = np.ones(len(paths.start))
     near = np.empty(len(obstacles.radii), dtype=np.int64)
     angles, bones, scratch = np.empty(4), np.empty((3, 2, 3)), np.empty((4, 3))
-    for frame in range(len(ways.start)):
-        wrist = ways.rotations[frame], ways.positions[frame]
+    for frame in range(len(paths.start)):
+        wrist = paths.rotations[frame], paths.positions[frame]
         count = _within_reach(wrist, parts, obstacles, frame, near)
         if count == 0:
             continue
-        bend = np.abs(ways.goal[frame] - ways.start[frame]).sum()
+        bend = np.abs(paths.goal[frame] - paths.start[frame]).sum()
         steps = max(1, int(np.ceil(bend / _STEP)))
         low, high = 0.0, 1.0
         for step in range(1, steps + _HALVINGS + 1):
             tried = step / steps if step <= steps and high == 1.0 else (low + high) / 2
-            for hinge in range(4):
-                angles[hinge] = ways.start[frame, hinge] + tried * (
-                    ways.goal[frame, hinge] - ways.start[frame, hinge]
+            for joint in range(4):
+                angles[joint] = paths.start[frame, joint] + tried * (
+                    paths.goal[frame, joint] - paths.start[frame, joint]
                 )
             pose_digit_axes(wrist, angles, parts, bones, scratch)
             if _blocked(bones, parts, obstacles, frame, near[:count]):
@@ -140,7 +165,7 @@ def search_closing(ways: Any, parts: Any, obstacles: Any) -> Any:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> int:
-    """Fill in which obstacles a digit can reach at all, and count them."""
+    """Write the indices of the obstacles that a digit can reach into `near` (K,), and count them."""
     knuckle = wrist[1].copy()
     for row in range(3):
         for column in range(3):
@@ -157,6 +182,7 @@ def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any)
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> bool:
+    """Whether a digit with capsule axes `bones` (3, 2, 3) [m] meets one of the obstacles `near`."""
     for i in range(3):
         for j in near:
             if obstacles.meets[i, j]:
@@ -169,7 +195,13 @@ def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> b
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
-    """Capsule axes (T, 3, 2, 3) of a digit at hinge angles (T, 4); wrists are rotations and positions."""
+    """Capsule axes (T, 3, 2, 3) [m] of a digit in the world.
+
+    Args:
+        wrists: Orientations (T, 3, 3) and positions (T, 3) [m] of the wrist.
+        angles: The digit's joint angles (T, 4) [rad].
+        parts: The `Digit`.
+    """
     posed, scratch = np.empty((len(angles), 3, 2, 3)), np.empty((4, 3))
     for frame in range(len(angles)):
         pose_digit_axes((wrists[0][frame], wrists[1][frame]), angles[frame], parts, posed[frame], scratch)

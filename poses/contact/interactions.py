@@ -1,4 +1,4 @@
-"""How two hands meet: the interactions of `data/interactions.json`, and one course drawn from them."""
+"""Interactions of two hands, from `data/interactions.json`, and random meetings drawn from them."""
 
 from __future__ import annotations
 
@@ -44,16 +44,17 @@ INTERACTIONS: Final[tuple[str, ...]] = tuple(library()["interactions"])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fingers:
-    """Hinge angles of one hand, a beat each."""
+    """Joint angles of one hand, one row per beat."""
 
     opened: Float[np.ndarray, "K 20"]
+    """Open fingers [rad]."""
     closed: Float[np.ndarray, "K 20"]
-    """Where the fingers would go if nothing were in the way."""
+    """Closed fingers if nothing blocks them [rad]."""
     strength: Float[np.ndarray, "K 5"]
-    """Share of that way, a digit each."""
+    """Share of that path that each digit closes."""
 
     def at(self, beats: Float[np.ndarray, "T"]) -> Fingers:
-        """The same between beats."""
+        """Interpolated between beats, which count from 0."""
         return Fingers(*(at_beats(keys, beats) for keys in (self.opened, self.closed, self.strength)))
 
 
@@ -69,14 +70,14 @@ class Meeting:
     targets: Float[np.ndarray, "K 3"]
     """Points of the still hand [m]."""
     anchors: Float[np.ndarray, "K 3"]
-    """Points of the moving hand [m] that are laid on them."""
+    """Points of the moving hand [m] that are put on them."""
     axis: Float[np.ndarray, "3"]
-    """Direction in which the moving hand backs off."""
+    """Unit direction in which the moving hand backs off."""
 
     def placement(self, beats: Float[np.ndarray, "T"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist before it backs off."""
-        turns = Rotation.from_rotvec(at_beats(self.rotations, beats)).as_matrix()
-        rotations = turns @ self.rotation
+        tilts = Rotation.from_rotvec(at_beats(self.rotations, beats)).as_matrix()
+        rotations = tilts @ self.rotation
         anchors = np.einsum("tij,tj->ti", rotations, at_beats(self.anchors, beats))
         return rotations, at_beats(self.targets, beats) - anchors
 
@@ -99,7 +100,7 @@ def check_names(names: tuple[str, ...]) -> None:
 
 
 def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
-    """One of the ways in which an interaction is described."""
+    """One of the variants of an interaction, chosen at random."""
     variants = library()["interactions"][name]
     variant: dict[str, Any] = variants[rng.integers(len(variants))]
     return variant
@@ -114,14 +115,14 @@ def draw_meeting(
     together: bool,
     rng: np.random.Generator,
 ) -> Meeting:
-    """Random places, orientations and fingers for `count` beats.
+    """Random positions, orientations and fingers for `count` beats.
 
     Args:
-        variant: Its description, of `draw_variant`.
+        variant: Its description, from `draw_variant`.
         still: The hand that holds still.
         moving: The other hand, of the other side.
-        count: Beats.
-        together: Whether beats belong to one meeting, and so resemble each other, or are apart.
+        count: Number of beats, K.
+        together: Whether beats belong to one meeting, and so resemble each other, or are independent.
         rng: Source of all randomness.
     """
     noise = _Noise(count, together, rng)
@@ -131,7 +132,7 @@ def draw_meeting(
         for model, role in ((still, "still"), (moving, "moving"))
     ]
     targets = np.tile(variant["target"], (count, 1))
-    targets[:, :2] += noise.around(np.array(variant["jitter"]), 0.0) + _places(variant, count, rng)
+    targets[:, :2] += noise.around(np.array(variant["jitter"]), 0.0) + _offsets(variant, count, rng)
     tilts = noise.around(np.deg2rad(variant["tilt"]), 0.3)
     axis = np.array(variant["axis"], dtype=np.float64) @ mirror
     return Meeting(
@@ -162,15 +163,15 @@ class _Noise:
         return noise
 
 
-def _places(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Places (K, 2) of the beats around the middle one."""
+def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Offsets (K, 2) of the beats from the middle one, in hand lengths."""
     reach = np.array(variant["place"])
     if variant["pattern"] == "random":
         return reach * rng.uniform(-1.0, 1.0, size=(count, 2))
     side = (-1.0) ** np.arange(count)[:, None]
     direction = reach * np.array([1.0, rng.uniform(-1.0, 1.0)])
-    places: NDArray[np.float64] = side * direction * rng.uniform(0.6, 1.0, size=(count, 1))
-    return places
+    offsets: NDArray[np.float64] = side * direction * rng.uniform(0.6, 1.0, size=(count, 1))
+    return offsets
 
 
 def _draw_fingers(
@@ -187,14 +188,14 @@ def _draw_fingers(
 
 
 def _loosened(model: HandModel, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Valid poses, those that press hard into themselves a little nearer to rest: fingers need room."""
+    """Valid poses, those with deep contact a little nearer to rest, because fingers need room."""
     hard = ~is_valid(model, angles, max_penetration=_SNUG)
     angles[hard] += 0.1 * (resting_angles(model) - angles[hard])
     return angles
 
 
 def _angles(name: str) -> NDArray[np.float64]:
-    """Hinge angles [rad] of a gesture, or of a hand that only this data file knows."""
+    """Joint angles [rad] of a gesture, or of a hand pose of this data file alone."""
     if name in gesture_names():
         return gesture(name)
     return np.deg2rad(np.array(library()["hands"][name], dtype=np.float64).ravel())

@@ -32,22 +32,22 @@ def point_pen(
     other_motion: HandMotion,
     path: Float[np.ndarray, "T 4 4"],
 ) -> tuple[HandMotion, BodyMotion]:
-    """The pen led along a path by the hand that holds it, drawn back wherever something would touch.
+    """A pen led along a path by the hand that holds it, drawn back wherever something would touch.
 
     Args:
         holder: The hand with the pen.
         other: The hand that is pointed at.
         pen: The pen; its tip is its first marker, its body goes from there along its z axis.
-        held: How fingers and pen move against the wrist; where the wrist goes is decided here.
-        other_motion: What the other hand does.
-        path: Where the tip shall be and how the pen shall stand, see `pointing_path`.
+        held: Motion of fingers and pen relative to the wrist; the wrist's own motion is computed here.
+        other_motion: Motion of the other hand.
+        path: Poses of the pen with its tip at the origin, from `pointing_path`.
 
     Raises:
-        PoseError: Even drawn back, something touches.
+        PoseError: Something touches even when drawn back.
     """
     motion, body = held
     T_wrist_pen = np.linalg.inv(wrist_poses(motion.qpos)) @ body.T_world_body
-    T_world_pen = path @ _turned_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
+    T_world_pen = path @ _rotated_to_the_arm(T_wrist_pen.mean(axis=0), pen.markers[0])
     qpos = motion.qpos.copy()
     qpos[:, :7] = pose_to_qpos(T_world_pen @ np.linalg.inv(T_wrist_pen))
     led = HandMotion(qpos, motion.rate), BodyMotion(T_world_pen, motion.rate)
@@ -62,18 +62,18 @@ def keep_apart(
     other_motion: HandMotion,
     direction: Float[np.ndarray, "T 3"],
 ) -> tuple[HandMotion, BodyMotion]:
-    """A hand and what it holds, drawn back smoothly wherever either would touch the other hand.
+    """A hand and the object it holds, drawn back smoothly wherever either would touch the other hand.
 
     Args:
-        holder: The hand with the thing.
-        other: The hand that is in the way.
-        thing: What is held.
-        held: How hand and thing would move.
-        other_motion: What the other hand does.
+        holder: The hand with the object.
+        other: The hand to stay clear of.
+        thing: The object.
+        held: Motion of hand and object before they are drawn back.
+        other_motion: Motion of the other hand.
         direction: Unit directions to draw back in.
 
     Raises:
-        PoseError: Even drawn back, something touches.
+        PoseError: Something touches even when drawn back.
     """
     motion, body = held
     back = np.zeros(len(direction))
@@ -96,15 +96,15 @@ def keep_apart(
     raise PoseError("the hands touch, however far one of them draws back")
 
 
-def _turned_to_the_arm(
+def _rotated_to_the_arm(
     T_wrist_pen: Float[np.ndarray, "4 4"], tip: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Pen in the path's frame: its tip at the origin, turned about itself until the wrist is at +x."""
+    """Pen in the path's frame: its tip at the origin, rotated about itself until the wrist is at +x."""
     wrist = np.linalg.inv(T_wrist_pen)[:3, 3]
     away = np.arctan2(wrist[1], wrist[0])
-    turn = np.eye(4)
-    turn[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), np.array([-away]))[0]
+    rotation = np.eye(4)
+    rotation[:3, :3] = axis_angle_matrix(np.array([0.0, 0.0, 1.0]), np.array([-away]))[0]
     shift = np.eye(4)
     shift[:3, 3] = -tip
-    posed: np.ndarray = turn @ shift
+    posed: np.ndarray = rotation @ shift
     return posed

@@ -23,11 +23,12 @@ _TOUCHING, _GAP, _HALF_CLOSED = 0.7, 0.06, 0.3
 
 
 class _Course(NamedTuple):
-    """What a meeting's frames do, each (T,)."""
+    """The course of a meeting, each array (T,)."""
 
     beats: NDArray[np.float64]
+    """Position among the beats, which count from 0."""
     lift: NDArray[np.float64]
-    """How far the hands are from touching [m]."""
+    """Distance of the hands from touching [m]."""
     grip: NDArray[np.float64]
     """Share of their strength with which fingers close."""
 
@@ -35,7 +36,15 @@ class _Course(NamedTuple):
 def play_meeting(
     right: HandModel, left: HandModel, name: str, config: TwoHandConfig, *, rng: np.random.Generator
 ) -> Passage | None:
-    """One interaction from coming together to letting go; nothing when this draw breaks a rule."""
+    """One interaction from coming together to letting go; None when this draw is not valid.
+
+    Args:
+        right: The right hand.
+        left: The left hand.
+        name: One of `INTERACTIONS`.
+        config: Speeds and times.
+        rng: Source of all randomness.
+    """
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
     count = int(rng.integers(variant["beats"][0], variant["beats"][1] + 1))
@@ -43,12 +52,12 @@ def play_meeting(
         draw_meeting(variant, still, moving, count, together=True, rng=rng)
         for _ in range(variant.get("tries", 1))
     ]
-    meeting = min(draws, key=lambda draw: float(_reach(still, moving, draw, np.zeros(1))[0]))
+    meeting = min(draws, key=lambda draw: float(_contact_distance(still, moving, draw, np.zeros(1))[0]))
     course = _course(variant, count, config, rng)
-    reach = _reach(still, moving, meeting, course.beats)
-    if (reach <= NEAREST).any():
+    distance = _contact_distance(still, moving, meeting, course.beats)
+    if (distance <= NEAREST).any():
         return None
-    passage = _brought_together(still, moving, meeting, course, reach=reach, rate=config.rate)
+    passage = _close_contact(still, moving, meeting, course, distance=distance, rate=config.rate)
     if _too_fast(passage, config) or not valid_frames(right, left, passage).all():
         return None
     return passage
@@ -57,25 +66,33 @@ def play_meeting(
 def draw_poses(
     right: HandModel, left: HandModel, name: str, count: int, *, rng: np.random.Generator
 ) -> Passage:
-    """Up to `count` valid single poses of one interaction, with the roles drawn once."""
+    """Up to `count` valid single poses of one interaction, with the roles drawn once.
+
+    Args:
+        right: The right hand.
+        left: The left hand.
+        name: One of `INTERACTIONS`.
+        count: Number of poses to draw; those that are not valid are left out.
+        rng: Source of all randomness.
+    """
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
     tries = variant.get("tries", 1)
     meeting = draw_meeting(variant, still, moving, count * tries, together=False, rng=rng)
-    reach = _reach(still, moving, meeting, np.arange(float(count * tries)))
-    best = tries * np.arange(count) + reach.reshape(count, tries).argmin(axis=1)
+    distance = _contact_distance(still, moving, meeting, np.arange(float(count * tries)))
+    best = tries * np.arange(count) + distance.reshape(count, tries).argmin(axis=1)
     lift = np.where(rng.random(count) < _TOUCHING, 0.0, _GAP * rng.random(count))
     grip = np.where(rng.random(count) < _HALF_CLOSED, rng.random(count), 1.0)
-    passage = _brought_together(
-        still, moving, meeting, _Course(best.astype(float), lift, grip), reach=reach[best], rate=None
+    passage = _close_contact(
+        still, moving, meeting, _Course(best.astype(float), lift, grip), distance=distance[best], rate=None
     )
-    return passage.at((reach[best] > NEAREST) & valid_frames(right, left, passage))
+    return passage.at((distance[best] > NEAREST) & valid_frames(right, left, passage))
 
 
-def _reach(
+def _contact_distance(
     still: HandModel, moving: HandModel, meeting: Meeting, beats: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """How far the moving hand must back off with open fingers [m]."""
+    """Distance (T,) [m] that the moving hand must back off with open fingers."""
     return first_contact(
         still,
         join_qpos(meeting.still.at(beats).opened),
@@ -85,21 +102,21 @@ def _reach(
     )
 
 
-def _brought_together(
+def _close_contact(
     still: HandModel,
     moving: HandModel,
     meeting: Meeting,
     course: _Course,
     *,
-    reach: NDArray[np.float64],
+    distance: NDArray[np.float64],
     rate: float | None,
 ) -> Passage:
-    """Hands brought to each other and their fingers closed; smoothed in time where there is a rate."""
+    """Hands brought into contact with their fingers closed; smoothed in time if there is a rate."""
     contact_window, finger_window = (
         1 if rate is None else 2 * int(window * rate / 2) + 1 for window in (_CONTACT_WINDOW, _FINGER_WINDOW)
     )
     rotation, position = meeting.placement(course.beats)
-    position = position + (smooth_above(reach, contact_window) + course.lift)[:, None] * meeting.axis
+    position = position + (smooth_above(distance, contact_window) + course.lift)[:, None] * meeting.axis
     fingers = meeting.still.at(course.beats), meeting.moving.at(course.beats)
     still_qpos, moving_qpos = join_qpos(fingers[0].opened), placed_qpos(fingers[1].opened, rotation, position)
     strength = [each.strength * course.grip[:, None] for each in fingers]
@@ -128,7 +145,7 @@ def _brought_together(
 
 
 def _course(variant: dict[str, Any], count: int, config: TwoHandConfig, rng: np.random.Generator) -> _Course:
-    """Come together, stay and move `count` times, let go."""
+    """The course of a meeting: come together, stay and move `count` times, let go."""
     ends = [int(rng.uniform(*config.approach) * config.rate) + 1 for _ in range(2)]
     # Fingers close after the hands met, and open before they part.
     grips = [int(rng.uniform(*config.approach) * config.rate) + 1 for _ in range(2)]
@@ -156,7 +173,7 @@ def _course(variant: dict[str, Any], count: int, config: TwoHandConfig, rng: np.
 
 
 def _too_fast(passage: Passage, config: TwoHandConfig) -> bool:
-    """Whether some hinge is."""
+    """Whether a joint exceeds the limits of speed or acceleration."""
     angles = np.concatenate([passage.right, passage.left], axis=1)
     speeds = np.diff(angles, axis=0) * config.rate
     accelerations = np.diff(speeds, axis=0) * config.rate

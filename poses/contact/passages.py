@@ -27,16 +27,20 @@ _DISTANCE: Final = (0.25, 0.45)  # between the wrists of hands that are apart [m
 
 @dataclass(frozen=True, slots=True)
 class TwoHandConfig:
-    """How fast two hands move, how far they part and where they go."""
+    """Speeds of two hands, times of their approach, and the volume in which they move.
+
+    Raises:
+        ArgumentError: A number or a pair of numbers is out of range.
+    """
 
     rate: float = 120.0
-    """Frames a second [Hz]."""
+    """Frames per second [Hz]."""
     max_speed: float = 10.0
-    """Fastest hinge [rad/s]."""
+    """Highest joint speed [rad/s]."""
     max_acceleration: float = 200.0
-    """Largest hinge acceleration [rad/s^2]."""
+    """Largest joint acceleration [rad/s^2]."""
     wrist_speed: float = 1.0
-    """Fastest travel of the pair, and of either hand against it between two meetings [m/s]."""
+    """Highest speed of the pair, and of either hand against it between two meetings [m/s]."""
     approach: tuple[float, float] = (0.4, 0.8)
     """Shortest and longest time to come together or to let go [s]."""
     apart: tuple[float, float] = (0.0, 0.6)
@@ -54,12 +58,16 @@ class TwoHandConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Passage:
-    """Frames of two hands: the left wrist in the right one's frame, and the hinges of both."""
+    """Frames of two hands: the left wrist in the right one's frame, and the joints of both."""
 
     rotation: Float[np.ndarray, "T 3 3"]
+    """Orientation of the left wrist."""
     position: Float[np.ndarray, "T 3"]
+    """Position of the left wrist [m]."""
     right: Float[np.ndarray, "T 20"]
+    """Joint angles of the right hand [rad]."""
     left: Float[np.ndarray, "T 20"]
+    """Joint angles of the left hand [rad]."""
 
     def __len__(self) -> int:
         return len(self.right)
@@ -70,7 +78,7 @@ class Passage:
 
 
 def join_passages(passages: list[Passage]) -> Passage:
-    """One after the other."""
+    """Passages concatenated in time."""
     return Passage(
         np.concatenate([passage.rotation for passage in passages]),
         np.concatenate([passage.position for passage in passages]),
@@ -79,7 +87,7 @@ def join_passages(passages: list[Passage]) -> Passage:
     )
 
 
-def way_between(
+def path_between(
     right: HandModel,
     left: HandModel,
     start: Passage,
@@ -88,13 +96,22 @@ def way_between(
     *,
     rng: np.random.Generator,
 ) -> Passage | None:
-    """Frames from one pose to another over a place where the hands are apart; nothing when not valid."""
+    """Frames from one pose to another by way of one where the hands are apart; None when not valid.
+
+    Args:
+        right: The right hand.
+        left: The left hand.
+        start: Where the path begins, one frame.
+        end: Where it ends, one frame.
+        config: Speeds and times.
+        rng: Source of all randomness.
+    """
     apart = Passage(
         *_place_apart(rng), sample_valid_angles(right, 1, rng=rng), sample_valid_angles(left, 1, rng=rng)
     )
     rest = apart.at(np.zeros(int(rng.uniform(*config.apart) * config.rate), dtype=int))
-    way = join_passages([_straight(start, apart, config, rng), rest, _straight(apart, end, config, rng)])
-    return way if valid_frames(right, left, way).all() else None
+    path = join_passages([_straight(start, apart, config, rng), rest, _straight(apart, end, config, rng)])
+    return path if valid_frames(right, left, path).all() else None
 
 
 def valid_frames(right: HandModel, left: HandModel, passage: Passage) -> Bool[np.ndarray, "T"]:
@@ -122,19 +139,19 @@ def placed_qpos(
 
 def _straight(start: Passage, end: Passage, config: TwoHandConfig, rng: np.random.Generator) -> Passage:
     """Minimum-jerk frames from a single pose to another, without the first."""
-    turns = Rotation.from_matrix(np.concatenate([start.rotation, end.rotation]))
+    rotations = Rotation.from_matrix(np.concatenate([start.rotation, end.rotation]))
     bend = max(np.abs(end.right - start.right).max(), np.abs(end.left - start.left).max())
     seconds = max(
         rng.uniform(*config.approach),
         PEAK_SPEED * bend / config.max_speed,
         np.sqrt(PEAK_ACCELERATION * bend / config.max_acceleration),
-        PEAK_SPEED * (turns[0].inv() * turns[1]).magnitude() / _TURNING,
+        PEAK_SPEED * (rotations[0].inv() * rotations[1]).magnitude() / _TURNING,
         PEAK_SPEED * 0.5 * float(np.linalg.norm(end.position - start.position)) / config.wrist_speed,
     )
     share = minimum_jerk(int(np.ceil(seconds * config.rate)) + 1)
     along = share[:, None]
     return Passage(
-        Slerp([0.0, 1.0], turns)(share).as_matrix(),
+        Slerp([0.0, 1.0], rotations)(share).as_matrix(),
         start.position + along * (end.position - start.position),
         start.right + along * (end.right - start.right),
         start.left + along * (end.left - start.left),
@@ -144,6 +161,6 @@ def _straight(start: Passage, end: Passage, config: TwoHandConfig, rng: np.rando
 def _place_apart(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Orientation (1, 3, 3) and position (1, 3) of the left wrist: from side by side to palm facing palm."""
     roll = rng.uniform(0.0, np.pi)
-    turn = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
+    rotation = Rotation.from_rotvec(rng.normal(scale=0.4, size=3)) * Rotation.from_rotvec([-roll, 0.0, 0.0])
     direction = np.array([rng.uniform(-0.3, 0.3), np.cos(roll / 2), -np.sin(roll / 2)])
-    return turn.as_matrix()[None], rng.uniform(*_DISTANCE) * direction[None] / np.linalg.norm(direction)
+    return rotation.as_matrix()[None], rng.uniform(*_DISTANCE) * direction[None] / np.linalg.norm(direction)

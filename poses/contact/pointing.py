@@ -1,4 +1,4 @@
-"""Where a pen goes that points at one marker after another of the other hand (Han et al. 2018, hand-pen)."""
+"""Paths of a pen that points at one marker after another of the other hand (Han et al. 2018, hand-pen)."""
 
 from __future__ import annotations
 
@@ -15,30 +15,34 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 _UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
-"""How a pen in the right hand of somebody at -y stands over a palm that looks down."""
+"""Direction of a pen in the right hand of a person at -y, over a palm that faces down."""
 _ARM: Final = np.array([0.8, -0.6, 0.0])  # where the writing arm comes from
 _CONE: Final = 1.2  # farthest that the pen leans from upright [rad]
 _MOST_LEAN: Final = 1.0  # as a tangent
-_BEHIND: Final = -0.2  # places that look away from the pen by more, as a cosine, are not pointed at
-_STEADY: Final = 0.15  # [s] over which the pen follows what its places look at, standard deviation
+_BEHIND: Final = -0.2  # targets that face away from the pen by more, as a cosine, are not pointed at
+_STEADY: Final = 0.15  # [s] over which outward directions are smoothed, standard deviation
 
 
 @dataclass(frozen=True, slots=True)
 class PointingConfig:
-    """How the pen is led."""
+    """Distances, times and speeds of the pen.
+
+    Raises:
+        ArgumentError: A number or a pair of numbers is out of range.
+    """
 
     distance: tuple[float, float] = (0.006, 0.02)
-    """Least and greatest distance of the tip from the place it points at [m]."""
+    """Smallest and largest distance of the tip from its target [m]."""
     retreat: float = 0.05
-    """How far the tip draws back between two places [m]."""
+    """Distance that the tip draws back between two targets [m]."""
     stay: tuple[float, float] = (0.15, 0.6)
-    """Shortest and longest time at a place [s]."""
+    """Shortest and longest time at a target [s]."""
     way: tuple[float, float] = (0.4, 0.9)
-    """Shortest and longest time from place to place [s]."""
+    """Shortest and longest time from target to target [s]."""
     tilt: float = 0.6
-    """How far the pen leans from straight at the place, standard deviation of the tangent."""
+    """Lean of the pen from the outward direction, standard deviation of the tangent."""
     speed: float = 0.6
-    """Fastest way of the tip between places that keep still, retreat aside [m/s]; ways get longer for it."""
+    """Highest speed of the tip between still targets, without the retreat [m/s]; slow paths take longer."""
     turning: float = 3.0
     """The same for the rotation of the pen [rad/s]."""
 
@@ -52,29 +56,29 @@ class PointingConfig:
 
 
 def pointing_path(
-    places: Float[np.ndarray, "T M 3"],
+    positions: Float[np.ndarray, "T M 3"],
     outward: Float[np.ndarray, "T M 3"],
     rate: float,
     config: PointingConfig | None = None,
     *,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "T 4 4"]:
-    """Poses of a pen, its tip at the origin and its body along +z, that visits moving places at random.
+    """Poses of a pen, its tip at the origin and its body along +z, that visits moving targets at random.
 
     Args:
-        places: What may be pointed at, moving in the world [m].
+        positions: Possible targets, moving in the world [m].
         outward: Unit directions from which each can be reached.
-        rate: Frames a second [Hz].
-        config: Distances and times.
+        rate: Frames per second [Hz].
+        config: Distances, times and speeds; the defaults if not given.
         rng: Source of all randomness.
     """
     config = config or PointingConfig()
     outward = gaussian_filter1d(outward, _STEADY * rate, axis=0, mode="nearest")
     outward = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-9)
-    visits = _plan(places, outward, rate, config, rng)
+    visits = _plan(positions, outward, rate, config, rng)
     share = np.concatenate([visit.share for visit in visits])
     number = np.repeat(np.arange(len(visits)), [len(visit.share) for visit in visits])
-    now = np.arange(len(places))
+    now = np.arange(len(positions))
     share, number = share[now], number[now]
 
     def at(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +86,7 @@ def pointing_path(
         lean = np.stack([visit.lean for visit in visits])[which]
         distance = np.array([visit.distance for visit in visits])[which]
         axis = _axes(outward[now, target], lean)
-        return places[now, target] + distance[:, None] * axis, axis
+        return positions[now, target] + distance[:, None] * axis, axis
 
     (here, axis_here), (there, axis_there) = at(number), at(number + 1)
     blend = share[:, None]
@@ -93,28 +97,28 @@ def pointing_path(
 
 @dataclass(frozen=True, slots=True)
 class _Visit:
-    """One place, and the way from it to the next."""
+    """One target, and the path from it to the next."""
 
     target: int
     distance: float
     lean: Float[np.ndarray, "3"]
     share: Float[np.ndarray, "S"]
-    """Of the way, for each frame."""
+    """Share of the path after each frame."""
 
 
 def _plan(
-    places: Float[np.ndarray, "T M 3"],
+    positions: Float[np.ndarray, "T M 3"],
     outward: Float[np.ndarray, "T M 3"],
     rate: float,
     config: PointingConfig,
     rng: np.random.Generator,
 ) -> list[_Visit]:
-    """Visits for all frames, and one more where the last way leads."""
+    """Visits for all frames, and one more where the last path leads."""
     visits: list[_Visit] = []
     frame = 0
     target, lean = _draw(outward[0], config, rng)
-    while frame < len(places):
-        here, axis = places[frame], _axes(outward[frame, target], lean)
+    while frame < len(positions):
+        here, axis = positions[frame], _axes(outward[frame, target], lean)
         following, next_lean = _draw(outward[frame], config, rng)
         next_axis = _axes(outward[frame, following], next_lean)
         turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
@@ -133,16 +137,18 @@ def _plan(
 def _draw(
     outward: Float[np.ndarray, "M 3"], config: PointingConfig, rng: np.random.Generator
 ) -> tuple[int, Float[np.ndarray, "3"]]:
-    """A place that can be reached now, and how the pen leans there."""
+    """A target that can be reached now, and the lean of the pen there."""
     open_to_pen = np.flatnonzero(outward @ _UPRIGHT > _BEHIND)
     target = int(rng.choice(open_to_pen if len(open_to_pen) else len(outward)))
     lean = config.tilt * rng.standard_normal(3)
-    lean -= (lean @ outward[target]) * outward[target]  # sideways, or a turn of the place would swing the pen
+    lean -= (lean @ outward[target]) * outward[
+        target
+    ]  # sideways, or a rotation of the target would swing the pen
     return target, lean * min(1.0, _MOST_LEAN / max(float(np.linalg.norm(lean)), 1e-9))
 
 
 def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
-    """Directions of the pen at places: off the skin, and never far from upright, smoothly in both."""
+    """Directions of the pen at targets: off the skin, and never far from upright, smoothly in both."""
     axis = outward + lean
     facing = np.einsum("...i,...i->...", axis, outward)[..., None]
     axis = axis + np.clip(0.5 - facing, 0.0, None) * outward
@@ -155,7 +161,7 @@ def _axes(outward: Float[np.ndarray, "*T 3"], lean: Float[np.ndarray, "*T 3"]) -
 def _between(
     start: Float[np.ndarray, "*T 3"], end: Float[np.ndarray, "*T 3"], share: Float[np.ndarray, "*T 1"]
 ) -> Float[np.ndarray, "*T 3"]:
-    """Directions a share of the shortest turn from one to another."""
+    """Directions after a share of the shortest rotation from one to another."""
     angle = np.arccos(np.clip(np.einsum("...i,...i->...", start, end), -1.0, 1.0))[..., None]
     mixed = np.sin((1.0 - share) * angle) * start + np.sin(share * angle) * end
     mixed = np.where(angle > 1e-6, mixed, start)
@@ -164,10 +170,10 @@ def _between(
 
 
 def _frames(origin: Float[np.ndarray, "T 3"], axis: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T 4 4"]:
-    """Poses with +z along `axis`, by the shortest turn from upright, where +x looks to the arm."""
+    """Poses with +z along `axis`, by the shortest rotation from upright, where +x points to the arm."""
     x = _ARM - (_ARM @ _UPRIGHT) * _UPRIGHT
     x /= np.linalg.norm(x)
-    # The shortest turn from u to a moves v to v - (v . (u + a)) / (1 + u . a) (u + a) + 2 (v . u) a.
+    # The shortest rotation from u to a moves v to v - (v . (u + a)) / (1 + u . a) (u + a) + 2 (v . u) a.
     middle = axis + _UPRIGHT
     x = x - (middle @ x / (1.0 + axis @ _UPRIGHT))[:, None] * middle
     pose = np.tile(np.eye(4), (len(origin), 1, 1))

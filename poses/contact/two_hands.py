@@ -1,8 +1,8 @@
 """Two hands that meet, clasp, clap, rub, point and part: smooth motions, and single poses drawn from them.
 
-The contact is solved, not played back: for each frame the moving hand backs off until it just touches, and
-fingers close until they meet something. Both are smoothed towards the free side, every frame is checked, and
-what fails is drawn again.
+The contact is solved for each pair of hands: in each frame the moving hand backs off until it just touches,
+and fingers close until they meet something. Both are smoothed towards the free side, every frame is checked,
+and what fails is drawn again.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import random_quaternions, rotation_quaternions
 from poses.contact.interactions import INTERACTIONS, check_names
 from poses.contact.meetings import draw_poses, play_meeting
-from poses.contact.passages import Passage, TwoHandConfig, join_passages, way_between
+from poses.contact.passages import Passage, TwoHandConfig, join_passages, path_between
 from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
 from poses.motion.wrist_paths import along
 
@@ -37,10 +37,10 @@ __all__ = [
     "two_hands_penetration",
 ]
 
-_TRAVEL_TIME: Final = (0.8, 2.5)  # between two places of the pair [s]
-_TURN: Final = 0.5  # spread of the turn between two places [rad]
+_TRAVEL_TIME: Final = (0.8, 2.5)  # between two positions of the pair [s]
+_ROTATION: Final = 0.5  # spread of the rotation between two positions [rad]
 _MOST_DRAWS: Final = 60
-_MOST_WAYS: Final = 10
+_MOST_PATHS: Final = 10
 
 
 def two_hands_penetration(
@@ -75,7 +75,7 @@ def sample_two_hand_motion(
         right: A right hand.
         left: A left hand; it may be another person's.
         duration: How long [s]; each motion has `round(duration * rate) + 1` frames.
-        config: Speeds and places; human ones when not given.
+        config: Speeds and positions; human ones by default.
         interactions: Names out of `INTERACTIONS`; all of them when not given.
         rng: Source of all randomness.
 
@@ -123,7 +123,7 @@ def sample_two_hand_poses(
     passages: list[Passage] = []
     missing = count
     for _ in range(_MOST_DRAWS):
-        # Each name twice, since roles are drawn once a batch; more than wanted, since some will fail.
+        # Each name twice, since roles are drawn once per batch; more than needed, since some will fail.
         batches = rng.multinomial(
             missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
         )
@@ -135,8 +135,8 @@ def sample_two_hand_poses(
             whole = join_passages(passages)
             whole = whole.at(rng.permutation(len(whole))[:count])
             volume = TwoHandConfig().volume
-            places = ROOM_CENTER + rng.uniform(-volume, volume, size=(count, 3))
-            return _in_world(whole, places, Rotation.from_quat(random_quaternions(count, rng=rng)))
+            positions = ROOM_CENTER + rng.uniform(-volume, volume, size=(count, 3))
+            return _in_world(whole, positions, Rotation.from_quat(random_quaternions(count, rng=rng)))
     raise PoseError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
 
 
@@ -149,7 +149,7 @@ def _next_passages(
     *,
     rng: np.random.Generator,
 ) -> list[Passage]:
-    """The way from the last frame to a meeting, and the meeting."""
+    """The path from the last frame to a meeting, and the meeting."""
     name = names[rng.integers(len(names))]
     for _ in range(_MOST_DRAWS):
         meeting = play_meeting(right, left, name, config, rng=rng)
@@ -157,34 +157,34 @@ def _next_passages(
             continue
         if last is None:
             return [meeting]
-        for _ in range(_MOST_WAYS):
-            way = way_between(right, left, last, meeting.at([0]), config, rng=rng)
-            if way is not None:
-                return [way, meeting]
-    raise PoseError(f"no valid way was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
+        for _ in range(_MOST_PATHS):
+            path = path_between(right, left, last, meeting.at([0]), config, rng=rng)
+            if path is not None:
+                return [path, meeting]
+    raise PoseError(f"no valid path was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
 
 
 def _travel(
     frames: int, config: TwoHandConfig, rng: np.random.Generator
 ) -> tuple[NDArray[np.float64], Rotation]:
-    """Positions (T, 3) and orientations of a pair of hands that goes from place to place."""
-    places = [ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)]
-    turns, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
+    """Positions (T, 3) and orientations of a pair of hands that moves from position to position."""
+    positions = [ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3)]
+    orientations, shares = [Rotation.from_quat(random_quaternions(1, rng=rng)[0])], [np.zeros(1)]
     while sum(map(len, shares)) < frames:
-        places.append(ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3))
-        turns.append(turns[-1] * Rotation.from_rotvec(rng.normal(scale=_TURN, size=3)))
-        distance = float(np.linalg.norm(places[-1] - places[-2]))
+        positions.append(ROOM_CENTER + rng.uniform(-config.volume, config.volume, size=3))
+        orientations.append(orientations[-1] * Rotation.from_rotvec(rng.normal(scale=_ROTATION, size=3)))
+        distance = float(np.linalg.norm(positions[-1] - positions[-2]))
         seconds = max(rng.uniform(*_TRAVEL_TIME), PEAK_SPEED * distance / config.wrist_speed)
-        shares.append(len(places) - 2 + minimum_jerk(int(np.ceil(seconds * config.rate))))
-    return along(np.array(places), Rotation.concatenate(turns), np.concatenate(shares)[:frames])
+        shares.append(len(positions) - 2 + minimum_jerk(int(np.ceil(seconds * config.rate))))
+    return along(np.array(positions), Rotation.concatenate(orientations), np.concatenate(shares)[:frames])
 
 
 def _in_world(
-    whole: Passage, middle: NDArray[np.float64], turns: Rotation
+    whole: Passage, middle: NDArray[np.float64], orientations: Rotation
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Both hands' qpos from the middle of their wrists and the right one's orientation."""
-    across = turns.apply(whole.position) / 2
-    rotations = turns.as_matrix()
+    across = orientations.apply(whole.position) / 2
+    rotations = orientations.as_matrix()
     return (
         join_qpos(whole.right, position=middle - across, quaternion=rotation_quaternions(rotations)),
         join_qpos(

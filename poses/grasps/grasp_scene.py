@@ -1,4 +1,4 @@
-"""A hand and a thing in one MuJoCo scene: the wrist stands still, the thing is free, hinges have motors."""
+"""A hand and an object in one MuJoCo scene: the wrist is fixed, the object is free, hinges have motors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_OBJECT_PENETRATION: Final = 0.0015
-"""Deepest overlap [m] of a hand and what it holds that counts as valid."""
+"""Deepest overlap [m] of a hand and the object it holds that counts as valid."""
 _TIMESTEP: Final = 0.002
 _STIFFNESS: Final = 2.0  # [N m/rad]
 _DAMPING: Final = 0.04  # [N m s/rad]
@@ -31,8 +31,8 @@ _FINGER_TORQUES: Final = (0.20, 0.30, 0.16, 0.06)
 _THUMB_TORQUES: Final = (0.40, 0.40, 0.25, 0.10)
 _FRICTION: Final = (1.2, 0.01, 0.001)  # of a palm on plastic: sliding, twisting (by the pad's size), rolling
 _CONTACT_TIME: Final = (0.005, 1.0)
-_GUIDE_TIME: Final = (0.03, 1.0)  # a soft hand that holds the thing while fingers close
-_FAR: Final = 0.5  # [m], beyond which distances are not wanted
+_GUIDE_TIME: Final = (0.03, 1.0)  # of a soft constraint that holds the object while fingers close
+_FAR: Final = 0.5  # [m], beyond which distances are not needed
 _GEOMS: Final = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -44,11 +44,11 @@ _GEOMS: Final = {
 
 
 class GraspScene:
-    """One hand and one thing, compiled. Poses are in the wrist's frame; the scene itself keeps no state.
+    """One hand and one object, compiled. Poses are in the wrist's frame; the scene itself keeps no state.
 
     Args:
         model: The hand.
-        obj: The thing.
+        obj: The object.
     """
 
     def __init__(self, model: HandModel, obj: RigidObject) -> None:
@@ -62,7 +62,7 @@ class GraspScene:
     def new_data(
         self, angles: Float[np.ndarray, "20"], T_wrist_object: Float[np.ndarray, "4 4"]
     ) -> mujoco.MjData:
-        """Fresh MuJoCo state at a pose, kinematics and contacts computed."""
+        """New MuJoCo state at a pose [rad], [m], with kinematics and contacts computed."""
         data = mujoco.MjData(self.mj_model)
         data.eq_active[:] = 0
         data.qpos[:NUM_JOINTS] = angles
@@ -76,7 +76,7 @@ class GraspScene:
         return qpos_to_pose(data.qpos[NUM_JOINTS:])
 
     def distances(self, data: mujoco.MjData) -> NDArray[np.float64]:
-        """Distance [m] of every hand capsule to the thing, negative where they overlap."""
+        """Distance [m] of every hand capsule to the object (K,), negative where they overlap."""
         return np.array(
             [
                 min(
@@ -90,7 +90,7 @@ class GraspScene:
     def depth(
         self, angles: Float[np.ndarray, "T 20"], T_wrist_object: Float[np.ndarray, "T 4 4"]
     ) -> NDArray[np.float64]:
-        """Deepest overlap [m] of hand and thing in every frame (T,)."""
+        """Deepest overlap [m] of hand and object in every frame (T,)."""
         data = mujoco.MjData(self.mj_model)
         qpos = np.concatenate([angles, pose_to_qpos(T_wrist_object)], axis=1)
         depth = np.zeros(len(qpos))
@@ -108,7 +108,7 @@ class GraspScene:
 
 @lru_cache(maxsize=16)
 def grasp_scene(model: HandModel, obj: RigidObject) -> GraspScene:
-    """The scene of a hand and a thing, compiled once."""
+    """The scene of a hand and an object, compiled once."""
     return GraspScene(model, obj)
 
 
@@ -118,16 +118,16 @@ def object_penetration(
     qpos: Float[np.ndarray, "T 27"],
     T_world_object: Float[np.ndarray, "T 4 4"],
 ) -> Float[np.ndarray, "T"]:
-    """Deepest overlap [m] of the hand's capsules and a thing's parts, a frame each; 0 where nothing touches.
+    """Deepest overlap [m] of hand and object in each frame; 0 where they do not touch.
 
     Args:
         model: The hand.
-        obj: The thing.
-        qpos: Wrist position [m], wrist orientation (wxyz), hinge angles [rad].
-        T_world_object: Pose of the thing in the world.
+        obj: The object.
+        qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad].
+        T_world_object: Pose of the object in the world [m].
 
     Raises:
-        ArgumentError: The arrays do not have as many frames.
+        ArgumentError: The arrays have different numbers of frames, or another shape.
     """
     qpos = check_array("qpos", qpos, (None, NUM_QPOS))
     poses = check_array("T_world_object", T_world_object, (None, 4, 4))
@@ -168,7 +168,7 @@ def _build_scene_spec(model: HandModel, obj: RigidObject) -> mujoco.MjSpec:
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 5.0
     spec.delete(spec.joint("wrist"))
-    # With the palm fixed to the world MuJoCo no longer counts it as its fingers' parent.
+    # With the palm fixed to the world, MuJoCo no longer treats it as the fingers' parent.
     for bone in BONES:
         if bone.parent == PALM:
             spec.add_exclude(bodyname1=BONE_NAMES[PALM], bodyname2=bone.name)
@@ -190,7 +190,7 @@ def _add_object(spec: mujoco.MjSpec, obj: RigidObject) -> None:
     body.add_freejoint(name="object")
     middle = (obj.vertices.min(axis=0) + obj.vertices.max(axis=0)) / 2
     half = np.ptp(obj.vertices, axis=0) / 2
-    # Inertia of the box around it: exact enough, and never degenerate.
+    # Inertia of the bounding box: exact enough, and never degenerate.
     squares = half**2
     body.mass, body.ipos, body.explicitinertial = obj.mass, middle, True
     body.inertia = obj.mass / 3 * (squares.sum() - squares) + 1e-6

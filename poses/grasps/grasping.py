@@ -1,4 +1,4 @@
-"""Grasps settled by dynamics: fingers close around a thing until it stays, however it is shaken."""
+"""Grasps settled by dynamics: fingers close around an object until it stays even when shaken."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MOST_TRIES: Final = 40
-_LOOSENESS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # spread of the angles from try to try
+_LOOSENESS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # spread of the angles between tries
 _RAMP: Final = 10  # pieces in which the motors' targets go from open to closed
 _CLOSE, _SETTLE, _SHAKE, _REST = 400, 200, 60, 60  # steps of 2 ms
 _GRAVITY: Final = 9.81
 _TETRAHEDRON: Final = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3.0)
 _MOST_DRIFT: Final = 0.004  # [m] while shaken
-_MOST_TURN: Final = np.deg2rad(8.0)
+_MOST_ROTATION: Final = np.deg2rad(8.0)
 _TOUCHING: Final = 0.0005  # [m]
 _DEEPEST: Final = MAX_OBJECT_PENETRATION - 1e-5  # [m]
 _SLOW: Final = 0.5  # [rad/s], of the hinges at the end
@@ -37,27 +37,28 @@ _SLOW: Final = 0.5  # [rad/s], of the hinges at the end
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hold:
-    """A hand that holds a thing."""
+    """A grasp: a hand that holds an object."""
 
     name: str
-    """Its style, one of `hold_names`."""
+    """The style of the hold, one of `hold_names`."""
     angles: Float[np.ndarray, "20"]
-    """Hinge angles [rad]."""
+    """Joint angles [rad]."""
     T_wrist_object: Float[np.ndarray, "4 4"]
+    """Pose of the object in the wrist's frame [m]."""
     contacts: tuple[str, ...]
-    """Names of the hand's capsules that touch the thing."""
+    """Names of the hand's capsules that touch the object."""
 
 
 def settle_hold(
     model: HandModel, obj: RigidObject, *, rng: np.random.Generator, hold: str | None = None
 ) -> Hold:
-    """A valid grasp of a thing: it is placed, fingers close under limited torque, and it is shaken.
+    """A valid grasp of an object: it is placed, fingers close under limited torque, and it is shaken.
 
     Args:
         model: The hand.
-        obj: What it holds.
+        obj: The object it holds.
         rng: Source of all randomness: placement, and the style when none is named.
-        hold: One of `hold_names`; any of them when not given.
+        hold: One of `hold_names`; a random one by default.
 
     Raises:
         ArgumentError: The object has no hold of this name.
@@ -76,7 +77,7 @@ def settle_hold(
 
 
 def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldStyle:
-    """The style with angles that differ a little, and more the more often it has failed."""
+    """The style with slightly different angles; the change grows with the number of failed tries."""
     spread = _LOOSENESS[min(attempt, len(_LOOSENESS) - 1)]
     change = spread * rng.standard_normal(NUM_JOINTS).clip(-2.0, 2.0)
     opened, closed = (np.clip(angles + change, LOW, HIGH) for angles in (style.open, style.closed))
@@ -84,11 +85,11 @@ def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldSty
 
 
 def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> Hold | str:
-    """One try: a hold, or why there is none."""
+    """One try: a hold, or the reason why there is none."""
     start = place_object(scene, style, rng=rng)
     data = scene.new_data(style.open, start)
     _close(scene, data, style, start)
-    _shake(scene, data)  # it finds its seat
+    _shake(scene, data)  # it settles
     before = scene.object_pose(data)
     _shake(scene, data)
     if not _stayed(scene, data, before):
@@ -106,7 +107,7 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
 
 
 def why_not_held(style: HoldStyle, touching: set[str]) -> str:
-    """What is missing to a hold by these capsules of the hand; nothing (an empty string) if it holds."""
+    """What a hold by these capsules of the hand lacks; an empty string if it holds."""
     for need in style.needs:
         if not any(name.startswith(need) for name in touching):
             return f"the {need} does not touch it"
@@ -115,7 +116,7 @@ def why_not_held(style: HoldStyle, touching: set[str]) -> str:
 
 
 def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDArray[np.float64]) -> None:
-    """Close the fingers, the thing first guided by a soft spring and then free, or lying in the palm."""
+    """Close the fingers; the object is first guided by a soft spring, then free, or lies in the palm."""
     model = scene.mj_model
     guide = pose_to_qpos(start)
     data.mocap_pos[0], data.mocap_quat[0] = guide[:3], guide[3:]
@@ -123,27 +124,29 @@ def _close(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, start: NDAr
     body = model.body("object").id
     data.xfrc_applied[body, 2] = style.palm_up * scene.obj.mass * _GRAVITY
     for share in np.arange(1, _RAMP + 1) / _RAMP:
-        _pull(scene, data, style, style.open + share * (style.closed - style.open))
+        _set_targets(scene, data, style, style.open + share * (style.closed - style.open))
         mujoco.mj_step(model, data, nstep=_CLOSE // _RAMP)
     data.eq_active[:] = 0
     for _ in range(_SETTLE // 25):
-        _pull(scene, data, style, style.closed)
+        _set_targets(scene, data, style, style.closed)
         mujoco.mj_step(model, data, nstep=25)
     data.xfrc_applied[body] = 0.0
 
 
-def _pull(scene: GraspScene, data: mujoco.MjData, style: HoldStyle, wanted: NDArray[np.float64]) -> None:
-    """Set the motors' targets, so near to where the hinges are that no torque exceeds the style's share.
+def _set_targets(
+    scene: GraspScene, data: mujoco.MjData, style: HoldStyle, target: NDArray[np.float64]
+) -> None:
+    """Set the motors' targets, so near to the joint angles that no torque exceeds the style's share.
 
-    A motor at the end of its torque would yield to any push; these keep their stiffness both ways.
+    A motor at its torque limit would yield to any push; these keep their stiffness in both directions.
     """
     here = data.qpos[:NUM_JOINTS]
-    reach = style.strength * scene.mj_model.actuator_forcerange[:, 1] / scene.mj_model.actuator_gainprm[:, 0]
-    data.ctrl[:] = here + np.clip(wanted - here, -reach, reach)
+    limit = style.strength * scene.mj_model.actuator_forcerange[:, 1] / scene.mj_model.actuator_gainprm[:, 0]
+    data.ctrl[:] = here + np.clip(target - here, -limit, limit)
 
 
 def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
-    """Pull the thing by its own weight to the four corners of a tetrahedron, then let it rest."""
+    """Pull the object by its own weight towards the four corners of a tetrahedron, then let it rest."""
     body = scene.mj_model.body("object").id
     for corner in _TETRAHEDRON:
         data.xfrc_applied[body, :3] = scene.obj.mass * _GRAVITY * corner
@@ -153,12 +156,12 @@ def _shake(scene: GraspScene, data: mujoco.MjData) -> None:
 
 
 def _stayed(scene: GraspScene, data: mujoco.MjData, before: NDArray[np.float64]) -> bool:
-    """Whether the thing is where it was, and the fingers are still."""
+    """Whether the object is where it was, and the fingers are still."""
     after = scene.object_pose(data)
     drift = np.linalg.norm(after[:3, 3] - before[:3, 3])
-    turn = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
+    rotation = np.arccos(np.clip((np.trace(after[:3, :3].T @ before[:3, :3]) - 1) / 2, -1.0, 1.0))
     slow = np.abs(data.qvel[:NUM_JOINTS]).max() < _SLOW
-    return bool(drift < _MOST_DRIFT and turn < _MOST_TURN and slow and np.isfinite(data.qpos).all())
+    return bool(drift < _MOST_DRIFT and rotation < _MOST_ROTATION and slow and np.isfinite(data.qpos).all())
 
 
 def _contacts(scene: GraspScene, angles: NDArray[np.float64], pose: NDArray[np.float64]) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Named ways to hold things, in `data/holds.json`, and where they put a thing in a certain hand."""
+"""Named ways to hold objects, from `data/holds.json`, and where they put an object in a certain hand."""
 
 from __future__ import annotations
 
@@ -26,47 +26,47 @@ if TYPE_CHECKING:
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
 _SLIDE: Final = 0.15  # [m] from where an object comes up to the palm
 _HALVINGS: Final = 12
-_ANY: Final = "any"  # the entry for things that have none of their own
+_ANY: Final = "any"  # the entry for objects that have none of their own
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HoldStyle:
-    """One way to hold one thing."""
+    """One way to hold one object."""
 
     name: str
     open: Float[np.ndarray, "20"]
     """Angles [rad] before the fingers close."""
     closed: Float[np.ndarray, "20"]
-    """Where the motors pull [rad]."""
+    """Angles that the motors close to [rad]."""
     strength: Float[np.ndarray, "20"]
     """Share of the motors' torques."""
     palm_up: float
-    """Share of its weight with which the thing lies in the palm while the fingers close."""
+    """Share of its weight with which the object lies in the palm while the fingers close."""
     needs: tuple[str, ...]
-    """Bones or digits that must touch."""
+    """Bones or digits that must touch the object."""
     fingers: int
-    """How many fingers must touch."""
+    """Number of fingers that must touch it."""
     free: tuple[str, ...]
-    """Digits that may leave the thing."""
+    """Digits that may leave the object."""
     press: tuple[str, ...]
     """Digits that may tap on it."""
     scribble: float
-    """How far a writing wrist goes [m]; 0 for what does not write."""
+    """Amplitude of a writing wrist [m]; 0 for objects that do not write."""
     entry: dict[str, Any]
-    """The rest of its entry: place, axes and what varies."""
+    """The rest of its entry: placement, axes and variation."""
 
 
 def hold_names(obj: RigidObject) -> tuple[str, ...]:
-    """Names of the ways to hold a thing; one loaded from a file knows one way, `"grasp"`."""
+    """Names of the ways to hold an object; one loaded from a file has a single way, `"grasp"`."""
     return tuple(_holds(obj))
 
 
 @lru_cache(maxsize=64)
 def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
-    """A way to hold a thing, with the angles that bring this hand's tips where the mean hand has them.
+    """A way to hold an object, with the angles that bring this hand's tips where the mean hand has them.
 
     Raises:
-        ArgumentError: It is not held so.
+        ArgumentError: The object has no hold of this name.
     """
     holds = _holds(obj)
     if name not in holds:
@@ -104,31 +104,31 @@ def _holds(obj: RigidObject) -> dict[str, Any]:
 
 def _angles(start: NDArray[np.float64], digits: dict[str, Any]) -> NDArray[np.float64]:
     angles = start.copy()
-    for place, digit in enumerate(DIGITS):
+    for number, digit in enumerate(DIGITS):
         if digit in digits:
-            angles[4 * place : 4 * place + 4] = np.deg2rad(digits[digit])
+            angles[4 * number : 4 * number + 4] = np.deg2rad(digits[digit])
     return angles
 
 
 def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """`T_wrist_object` (4, 4) before the fingers close, varied as the style says."""
+    """`T_wrist_object` (4, 4) before the fingers close, varied at random within the style."""
     model, obj, entry = scene.hand, scene.obj, style.entry
     mirror = MIRROR if model.shape.side == "left" else np.eye(3)
-    place, vary = entry["place"], entry["vary"]
+    placement, vary = entry["place"], entry["vary"]
     frame = np.eye(4) if obj.name in _library() else _box_frame(obj)
-    point = 1e-3 * np.array(place["point"], dtype=np.float64)
+    point = 1e-3 * np.array(placement["point"], dtype=np.float64)
     point[2] += 1e-3 * rng.uniform(*vary["along"])
     bones = model.forward_kinematics(join_qpos(style.open[None]))[0]
     pose = np.eye(4)
-    # All is placed for a right hand, then mirrored.
-    if "between" in place:
-        at = np.mean([_landmark(model, bones, mark) for mark in place["between"]], axis=0) @ mirror
-        back = _landmark(model, bones, place["through"]) @ mirror
+    # Everything is placed for a right hand, then mirrored.
+    if "between" in placement:
+        at = np.mean([_landmark(model, bones, mark) for mark in placement["between"]], axis=0) @ mirror
+        back = _landmark(model, bones, placement["through"]) @ mirror
         z = back - at
-        x = _turned_about(z, rng.uniform(0.0, 2 * np.pi))
+        x = _perpendicular(z, rng.uniform(0.0, 2 * np.pi))
     else:
         length, breadth = model.shape.length, model.shape.breadth
-        at = np.array([place["under"][0] * length, place["under"][1] * breadth, 0.0])
+        at = np.array([placement["under"][0] * length, placement["under"][1] * breadth, 0.0])
         x, z = (np.array(entry["axes"][name], dtype=np.float64) for name in "xz")
     z /= np.linalg.norm(z)
     y = np.cross(z, x)
@@ -140,11 +140,11 @@ def place_object(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generato
     pose[:3, :3] = mirror @ rotation @ MIRROR if model.shape.side == "left" else rotation
     pose[:3, 3] = mirror @ (at - rotation @ point)
     pose = pose @ np.linalg.inv(frame)
-    return pose if "between" in place else _slid_to_palm(scene, style, pose)
+    return pose if "between" in placement else _slid_to_palm(scene, style, pose)
 
 
 def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
-    """Middle of a thing's bounding box, x along its shortest side and z along its longest."""
+    """Middle of an object's bounding box, x along its shortest side and z along its longest."""
     low, high = obj.vertices.min(axis=0), obj.vertices.max(axis=0)
     shortest, _, longest = np.argsort(high - low, kind="stable")
     x, z = np.eye(3)[shortest], np.eye(3)[longest]
@@ -153,18 +153,19 @@ def _box_frame(obj: RigidObject) -> NDArray[np.float64]:
     return frame
 
 
-def _turned_about(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+def _perpendicular(axis: NDArray[np.float64], angle: float) -> NDArray[np.float64]:
+    """Unit vector (3,) perpendicular to an axis, at an angle [rad] about it."""
     axis = axis / np.linalg.norm(axis)
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
-    turned: NDArray[np.float64] = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
-    return turned
+    rotated: NDArray[np.float64] = np.cos(angle) * first + np.sin(angle) * np.cross(axis, first)
+    return rotated
 
 
 def _landmark(
     model: HandModel, bones: NDArray[np.float64], mark: tuple[str, float, float, float]
 ) -> NDArray[np.float64]:
-    """Place on a bone in the wrist's frame, for either side."""
+    """Point on a bone in the wrist's frame (3,) [m], for either side."""
     name, along, sideways, back = mark
     number = BONE_NAMES.index(name)
     radius = model.capsules.radii[model.capsules.bones == number][0]
@@ -175,7 +176,7 @@ def _landmark(
 
 
 def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The object brought up from below until it almost touches the palm."""
+    """`T_wrist_object` (4, 4) of the object raised from below until it almost touches the palm."""
     palm = [scene.mj_model.geom(geom).name.startswith("palm") for geom in scene.hand_geoms]
 
     def gap(height: float) -> float:

@@ -1,7 +1,7 @@
-"""A hand that holds a thing and plays with it: smooth motion between variants of settled grasps.
+"""A hand that holds an object and plays with it: smooth motion between variants of settled grasps.
 
-Grasps are settled by dynamics (`settle_hold`); what moves between them is smooth, no faster than a hand, and
-checked at every frame: ranges, the hand's own flesh, and the thing's.
+Grasps are settled by dynamics (`settle_hold`); the motion between them is smooth, no faster than a hand, and
+checked in every frame: ranges, self-penetration, and penetration of the object.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from poses.grasps.grasp_scene import (
     wrist_poses,
 )
 from poses.grasps.grasping import Hold, settle_hold, why_not_held
-from poses.grasps.held_poses import Held, between, is_held_valid, sample_held_poses, turn_between
+from poses.grasps.held_poses import Held, between, is_held_valid, rotation_between, sample_held_poses
 from poses.grasps.hold_library import HoldStyle, hold_names, hold_style
 from poses.motion.minimum_jerk import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, minimum_jerk
 from poses.motion.wrist_paths import free_wrist_path
@@ -44,9 +44,9 @@ __all__ = [
 _VARIANTS: Final = 12  # drawn at once
 _MOST_DRAWS: Final = 20
 _HOLDS: Final = 3  # grasps of one style that a motion goes between
-_SHIFTS: Final = 0.15  # how often the thing shifts in the hand
-_LOOSEST: Final = 0.003  # [m] between the thing and the digits that hold it, while it shifts
-_SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the thing in the hand [m/s], [rad/s]
+_SHIFTS: Final = 0.15  # how often the object shifts in the hand
+_LOOSEST: Final = 0.003  # [m] between the object and the digits that hold it, while it shifts
+_SLIDING, _ROLLING = 0.15, 4.0  # fastest shift of the object in the hand [m/s], [rad/s]
 _MARGIN: Final = 0.9  # of the fastest and of the largest acceleration, for the steps between frames
 
 
@@ -58,13 +58,13 @@ def sample_object_motion(
     *,
     rng: np.random.Generator,
 ) -> tuple[HandMotion, BodyMotion]:
-    """Random smooth motion of a hand that carries a thing and plays with it, valid at every frame.
+    """Random smooth motion of a hand that carries an object and plays with it, valid at every frame.
 
     Args:
         model: The hand.
-        obj: What it holds.
+        obj: The object it holds.
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
-        config: Speeds and places; human ones when not given.
+        config: Speeds and positions; human ones by default.
         rng: Source of all randomness.
 
     Raises:
@@ -94,7 +94,7 @@ def sample_object_motion(
 
 @dataclass(frozen=True, slots=True)
 class _Player:
-    """What moves a hand from one variant of its holds to the next."""
+    """Moves a hand from one variant of its holds to the next."""
 
     scene: GraspScene
     style: HoldStyle
@@ -103,43 +103,49 @@ class _Player:
     rng: np.random.Generator
 
     def next_part(self, last: Held, current: int) -> tuple[Held, int]:
-        """Valid frames to a variant of the current hold, or now and then to another, and which hold it is."""
+        """Valid frames to a variant of the current hold, or sometimes of another, and that hold's index.
+
+        Raises:
+            PoseError: No path was valid.
+        """
         start = Held(last.angles[-1:], last.poses[-1:])
         if self.rng.random() < _SHIFTS:
             other = int(self.rng.integers(len(self.holds)))
-            part = self._way(start, self._home(other))
+            part = self._path(start, self._home(other))
             if other != current and is_held_valid(self.scene, part).all() and self._keeps_touch(part):
                 return self._rested(part), other
         model, obj = self.scene.hand, self.scene.obj
         for _ in range(_MOST_DRAWS):
             angles, poses = sample_held_poses(model, obj, self.holds[current], _VARIANTS, rng=self.rng)
-            ways = (self._way(start, Held(angles[[number]], poses[[number]])) for number in range(_VARIANTS))
-            for part in (*ways, self._way(start, self._home(current))):
+            paths = (
+                self._path(start, Held(angles[[number]], poses[[number]])) for number in range(_VARIANTS)
+            )
+            for part in (*paths, self._path(start, self._home(current))):
                 if is_held_valid(self.scene, part).all():
                     return self._rested(part), current
-        raise PoseError(f"no valid way out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries")
+        raise PoseError(f"no valid path out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries")
 
     def _home(self, number: int) -> Held:
         return Held(self.holds[number].angles[None], self.holds[number].T_wrist_object[None])
 
-    def _way(self, start: Held, target: Held) -> Held:
+    def _path(self, start: Held, target: Held) -> Held:
         config = self.config
         distance = np.abs(target.angles - start.angles).max()
         quickest = max(
             PEAK_SPEED * distance / (_MARGIN * config.max_speed),
             np.sqrt(PEAK_ACCELERATION * distance / (_MARGIN * config.max_acceleration)),
             PEAK_SPEED * float(np.linalg.norm((target.poses - start.poses)[0, :3, 3])) / _SLIDING,
-            PEAK_SPEED * float(np.linalg.norm(turn_between(start, target)[0])) / _ROLLING,
+            PEAK_SPEED * float(np.linalg.norm(rotation_between(start, target)[0])) / _ROLLING,
         )
         frames = int(np.ceil(max(quickest, self.rng.uniform(*config.durations)) * config.rate)) + 1
         return between(start, target, minimum_jerk(frames))
 
-    def _rested(self, way: Held) -> Held:
+    def _rested(self, path: Held) -> Held:
         pause = int(self.rng.uniform(0.0, self.config.hold) * self.config.rate)
-        return Held(*(np.concatenate([part, np.repeat(part[-1:], pause, axis=0)]) for part in way))
+        return Held(*(np.concatenate([part, np.repeat(part[-1:], pause, axis=0)]) for part in path))
 
     def _keeps_touch(self, held: Held) -> bool:
-        """Whether the digits that hold the thing stay near it, halfway and at the quarters."""
+        """Whether the digits that hold the object stay near it, at the quarters and halfway."""
         scene = self.scene
         names = [scene.mj_model.geom(geom).name for geom in scene.hand_geoms]
         for number in len(held.angles) * np.array([1, 2, 3]) // 4:
@@ -151,7 +157,7 @@ class _Player:
 
 
 def _scribble(frames: int, size: float, rate: float, *, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Small quick loops of a writing wrist (T, 3) [m], that come and go."""
+    """Small quick loops of a writing wrist (T, 3) [m], whose size swells and fades."""
     time = np.arange(frames) / rate
     loops = np.zeros((frames, 3))
     for axis in range(3):

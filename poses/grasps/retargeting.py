@@ -1,4 +1,4 @@
-"""The same pose on another hand: its finger tips go where those of a hand of mean proportions are."""
+"""Retargeting: the joint angles that bring a hand's fingertips where a hand of mean proportions has them."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _ROUNDS: Final = 12
-_STIFFNESS: Final = 0.006  # [m/rad]: by how much a tip may miss so that a joint need not turn
+_STIFFNESS: Final = 0.006  # [m/rad]: residual of a tip that weighs as much as a joint's deviation
 _LONGEST_STEP: Final = 0.2  # [rad]
 
 
 def retarget_angles(model: HandModel, angles: Float[np.ndarray, "20"]) -> Float[np.ndarray, "20"]:
-    """Hinge angles [rad] that bring the last joints and the tips of a hand where the mean hand has them.
+    """Joint angles [rad] that bring the last joints and the tips of a hand where the mean hand has them.
 
-    The mean hand has the same length and breadth. What is given is what the mean hand does; it changes as
-    little as the other proportions ask for.
+    The mean hand has the same length and breadth. `angles` is its pose; the result differs as little from
+    it as the other proportions need.
     """
     shape = model.shape
     mean = HandModel(shape_from_measures(shape.length, shape.breadth, side=shape.side))
-    wanted = _marks(mean, angles)[0]
-    found = angles.copy()
+    target = _marks(mean, angles)[0]
+    solution = angles.copy()
     for _ in range(_ROUNDS):
-        placed, jacobian = _marks(model, found)
-        misses = np.concatenate([(wanted - placed).ravel(), _STIFFNESS * (angles - found)])
-        slopes = np.concatenate([jacobian.reshape(-1, len(angles)), _STIFFNESS * np.eye(len(angles))])
-        step = np.linalg.lstsq(slopes, misses, rcond=None)[0]
-        found = np.clip(found + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP), LOW, HIGH)
-    return found
+        placed, jacobian = _marks(model, solution)
+        residuals = np.concatenate([(target - placed).ravel(), _STIFFNESS * (angles - solution)])
+        system = np.concatenate([jacobian.reshape(-1, len(angles)), _STIFFNESS * np.eye(len(angles))])
+        step = np.linalg.lstsq(system, residuals, rcond=None)[0]
+        solution = np.clip(solution + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP), LOW, HIGH)
+    return solution
 
 
 def _marks(model: HandModel, angles: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Last joints and tips (10, 3) in the wrist's frame [m], and their derivative (10, 3, 20)."""
+    """Last joints and tips (10, 3) in the wrist's frame [m], and their Jacobian (10, 3, 20) [m/rad]."""
     last = np.array([bones_of(digit)[2] for digit in DIGITS])
     rest = model.rest_transforms[last]
     tips = rest[:, :3, 3] + model.skeleton.lengths[last, None] * rest[:, :3, 0]

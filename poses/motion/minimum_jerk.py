@@ -1,4 +1,4 @@
-"""How a hand goes straight from one pose to another: the minimum-jerk profile, within limits of speed."""
+"""Straight paths from pose to pose: minimum-jerk profiles (Flash and Hogan 1985) within limits of speed."""
 
 from __future__ import annotations
 
@@ -14,23 +14,27 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PEAK_SPEED: Final = 1.875
-"""Of the minimum-jerk profile, in distances per duration."""
+"""Peak speed of the minimum-jerk profile, in distances per duration."""
 PEAK_ACCELERATION: Final = 5.7735
-"""The same, in distances per duration squared."""
+"""Its peak acceleration, in distances per duration squared."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotionConfig:
-    """How fast a hand moves and where its wrist goes."""
+    """Speeds of a hand, and the volume in which its wrist moves.
+
+    Raises:
+        ArgumentError: A number or a pair of numbers is out of range.
+    """
 
     rate: float = 120.0
-    """Frames a second [Hz]."""
+    """Frames per second [Hz]."""
     max_speed: float = 10.0
-    """Fastest hinge [rad/s]; rapid finger tapping reaches about this."""
+    """Highest joint speed [rad/s]; rapid finger tapping reaches about this."""
     max_acceleration: float = 200.0
-    """Largest hinge acceleration [rad/s^2]."""
+    """Largest joint acceleration [rad/s^2]."""
     durations: tuple[float, float] = (0.15, 0.8)
-    """Shortest and longest time for a way that the limits would allow to be quicker [s]."""
+    """Shortest and longest time of a path that the limits would allow to be quicker [s]."""
     hold: float = 0.3
     """Longest rest at a pose [s]."""
     volume: float = 0.3
@@ -48,16 +52,16 @@ class MotionConfig:
 
 
 def minimum_jerk(frames: int) -> Float[np.ndarray, "T"]:
-    """Share of the way after each of `frames` frames, the last one being 1."""
+    """Share of the path after each of `frames` frames, the last one being 1."""
     time = np.arange(1, frames + 1) / frames
     share: NDArray[np.float64] = time**3 * (10.0 - 15.0 * time + 6.0 * time**2)
     return share
 
 
-def straight_way(
+def straight_path(
     start: NDArray[np.float64], target: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Frames from one pose (left out) to another, as quick as drawn and no quicker than the limits allow."""
+    """Frames (T, 20) [rad] from one pose (left out) to another, of a drawn duration within the limits."""
     distance = np.abs(target - start).max()
     quickest = max(
         PEAK_SPEED * distance / config.max_speed,
@@ -67,7 +71,7 @@ def straight_way(
     return start + minimum_jerk(frames)[:, None] * (target - start)
 
 
-def held(way: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
-    """The frames, and some more in the last pose."""
+def held(path: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator) -> NDArray[np.float64]:
+    """The frames, and a rest in the last pose."""
     pause = int(rng.uniform(0.0, config.hold) * config.rate)
-    return np.concatenate([way, np.repeat(way[-1:], pause, axis=0)])
+    return np.concatenate([path, np.repeat(path[-1:], pause, axis=0)])

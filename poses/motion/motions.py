@@ -1,7 +1,7 @@
 """Smooth motion through valid poses, at speeds a human hand reaches, valid at every frame.
 
-Between two poses every joint follows the minimum-jerk profile of human reaching (Flash and Hogan 1985). A way
-that digs into the hand is taken over rest instead, some digits ahead of the others where need be.
+Between two poses every joint follows the minimum-jerk profile of human reaching (Flash and Hogan 1985). A
+path that penetrates the hand goes by way of rest instead, with some digits ahead of the others if needed.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
 from handsim.hand.topology import NUM_JOINTS
-from poses.motion.minimum_jerk import MotionConfig, held, minimum_jerk, straight_way
-from poses.motion.rest_paths import way_to_rest
+from poses.motion.minimum_jerk import MotionConfig, held, minimum_jerk, straight_path
+from poses.motion.rest_paths import path_to_rest
 from poses.motion.wrist_paths import free_wrist_path
 from poses.shapes.validity import MAX_PENETRATION, is_valid, resting_angles, sample_valid_angles
 
@@ -39,7 +39,7 @@ def sample_motion(
     Args:
         model: The hand.
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
-        config: Speeds and places; human ones when not given.
+        config: Speeds and positions; human ones by default.
         rng: Source of all randomness.
 
     Raises:
@@ -51,7 +51,7 @@ def sample_motion(
     angles = sample_valid_angles(model, 1, rng=rng)
     parts, count = [angles], 1
     while count < frames:
-        part = _next_way(model, parts[-1][-1], config, rng)
+        part = _next_path(model, parts[-1][-1], config, rng)
         parts.append(part)
         count += len(part)
     return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
@@ -66,13 +66,13 @@ def motion_through(
 ) -> HandMotion:
     """Smooth motion of one hand from each of the given poses to the next, valid at every frame.
 
-    It begins in the first pose and rests for a moment at each later one; how long a way takes and where the
-    wrist goes is drawn.
+    It begins in the first pose and rests for a moment at each later one; durations and the wrist's path are
+    random.
 
     Args:
         model: The hand.
-        poses: Hinge angles [rad], at least two poses.
-        config: Speeds and places; human ones when not given.
+        poses: Joint angles [rad], at least two poses.
+        config: Speeds and positions; human ones by default.
         rng: Source of all randomness.
 
     Raises:
@@ -110,39 +110,43 @@ def count_frames(duration: float, config: MotionConfig) -> int:
 def angles_through(
     model: HandModel, poses: Float[np.ndarray, "K 20"], config: MotionConfig, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 20"]:
-    """Valid frames from the first of these valid poses (left out) to the last, a hold at each."""
-    ways = [straight_way(start, target, config, rng) for start, target in pairwise(poses)]
-    ends = np.cumsum([len(way) for way in ways])
-    valid = np.split(is_valid(model, np.concatenate(ways)), ends[:-1])
+    """Valid frames [rad] from the first of these valid poses (left out) to the last, with a rest at each.
+
+    Raises:
+        PoseError: No path leads out of a pose.
+    """
+    paths = [straight_path(start, target, config, rng) for start, target in pairwise(poses)]
+    ends = np.cumsum([len(path) for path in paths])
+    valid = np.split(is_valid(model, np.concatenate(paths)), ends[:-1])
     for number, direct in enumerate(valid):
         if not direct.all():
-            out = way_to_rest(model, poses[number], config, rng)
-            back = way_to_rest(model, poses[number + 1], config, rng)[-2::-1]
-            ways[number] = np.concatenate([out, back, poses[number + 1 : number + 2]])
-    return np.concatenate([held(way, config, rng) for way in ways])
+            out = path_to_rest(model, poses[number], config, rng)
+            back = path_to_rest(model, poses[number + 1], config, rng)[-2::-1]
+            paths[number] = np.concatenate([out, back, poses[number + 1 : number + 2]])
+    return np.concatenate([held(path, config, rng) for path in paths])
 
 
-def _next_way(
+def _next_path(
     model: HandModel, start: NDArray[np.float64], config: MotionConfig, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Frames from one pose to another and a hold there, all valid."""
+    """Frames from one pose to another and a rest there, all valid."""
     resting = resting_angles(model)
     for _ in range(_MOST_DRAWS):
         for target in sample_valid_angles(model, _POSES_A_DRAW, rng=rng):
-            direct = straight_way(start, target, config, rng)
+            direct = straight_path(start, target, config, rng)
             if is_valid(model, direct).all():
                 return held(direct, config, rng)
             around = np.concatenate(
-                [straight_way(start, resting, config, rng), straight_way(resting, target, config, rng)]
+                [straight_path(start, resting, config, rng), straight_path(resting, target, config, rng)]
             )
             if is_valid(model, around).all():
                 return held(around, config, rng)
-    return held(way_to_rest(model, start, config, rng), config, rng)
+    return held(path_to_rest(model, start, config, rng), config, rng)
 
 
 def with_wrist(
     angles: Float[np.ndarray, "T 20"], config: MotionConfig, *, rng: np.random.Generator
 ) -> HandMotion:
-    """The motion of these hinge angles [rad] by a hand whose wrist goes from place to place."""
+    """The motion of these joint angles [rad] by a hand whose wrist moves from position to position."""
     position, quaternion = free_wrist_path(len(angles), config, rng=rng)
     return HandMotion(join_qpos(angles, position=position, quaternion=quaternion), config.rate)

@@ -1,4 +1,4 @@
-"""Motions with a purpose: spelling, counting, touching, typing, as written in `data/scripts.json`."""
+"""Motions that follow a script of `data/scripts.json`: spelling, counting, touching, typing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 FREE: Final = "free"
-"""The script of no script: what `sample_motion` makes."""
+"""The name of a motion without a script: what `sample_motion` makes."""
 _POSES_AT_ONCE: Final = 16
 
 
@@ -57,8 +57,8 @@ def scripted_motion(
         model: The hand.
         script: One of `script_names`.
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
-        config: Speeds and places; human ones when not given. A script keeps its own pace: but for "free",
-            `durations` and `hold` are the script's.
+        config: Speeds and positions; human ones by default. Except for "free",
+            `durations` and `hold` are those of the script.
         rng: Source of all randomness.
 
     Raises:
@@ -78,16 +78,16 @@ def scripted_motion(
     at = int(rng.integers(len(poses)))
     parts, count = [poses[at : at + 1]], 1
     while count < frames:
-        turns = _turns(at, len(poses), entry["order"], rng)
-        parts.append(angles_through(model, poses[turns], config, rng=rng))
-        count, at = count + len(parts[-1]), int(turns[-1])
+        indices = _next_indices(at, len(poses), entry["order"], rng)
+        parts.append(angles_through(model, poses[indices], config, rng=rng))
+        count, at = count + len(parts[-1]), int(indices[-1])
     return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)
 
 
 def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
     """The poses [rad] a script goes through, as this hand can strike them.
 
-    Touches that this hand's thumb cannot reach and poses that it finds no valid way out of are left out.
+    Touches that this hand's thumb cannot reach and poses without a valid path to rest are left out.
 
     Raises:
         ArgumentError: There is no such script, or it has no poses of its own.
@@ -109,19 +109,19 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
 
 
 def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
-    found: list[NDArray[np.float64]] = []
+    poses: list[NDArray[np.float64]] = []
     for finger in fingers:
-        with contextlib.suppress(PoseError):  # another finger will do
-            found.append(touching_angles(model, finger))
-    touches: NDArray[np.float64] = np.array(found).reshape(-1, NUM_JOINTS)
+        with contextlib.suppress(PoseError):  # other fingers remain
+            poses.append(touching_angles(model, finger))
+    touches: NDArray[np.float64] = np.array(poses).reshape(-1, NUM_JOINTS)
     return touches
 
 
-def _turns(at: int, count: int, order: str, rng: np.random.Generator) -> Int[np.ndarray, "N"]:
-    """Which poses come next, the present one first."""
+def _next_indices(at: int, count: int, order: str, rng: np.random.Generator) -> Int[np.ndarray, "N"]:
+    """Indices of the next poses, the present one first."""
     if order == "in turn":
         steps = np.ones(_POSES_AT_ONCE, dtype=np.int64)
     else:
         steps = rng.integers(1, count, size=_POSES_AT_ONCE)
-    turns: NDArray[np.int64] = (at + np.concatenate([[0], np.cumsum(steps)])) % count
-    return turns
+    indices: NDArray[np.int64] = (at + np.concatenate([[0], np.cumsum(steps)])) % count
+    return indices

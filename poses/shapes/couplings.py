@@ -1,4 +1,4 @@
-"""What one joint's angle allows another: a projection of hinge angles onto what a relaxed hand can do.
+"""Couplings between joints: a projection of joint angles onto those of a relaxed hand.
 
 Sources (docs/anatomy.md): DIP follows PIP (two thirds on average; Lin, Wu and Huang 2000), abduction dies
 away as the MCP flexes (collateral ligaments tighten), and neighbors share tendons, so that one finger's
@@ -22,14 +22,14 @@ HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])
 _NO_ABDUCTION_AT: Final = np.deg2rad(85.0)  # MCP flexion at which abduction has shrunk to the share below
 _ABDUCTION_LEFT: Final = 0.25
 _DIP_SHARE: Final = 2.0 / 3.0
-_DIP_BELOW: Final = np.deg2rad(32.0)  # how far the DIP may stay behind or run ahead of its share of the PIP
+_DIP_BELOW: Final = np.deg2rad(32.0)  # how far the DIP may be below or above its share of the PIP
 _DIP_ABOVE: Final = np.deg2rad(28.0)
 # How much more than its neighbor a finger's MCP may flex [rad]: index-middle, middle-ring, ring-little.
 _MCP_APART: Final = np.deg2rad([85.0, 70.0, 75.0])
 
 
 def finger_view(angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 5 4"]:
-    """The same angles, a digit a row; a view, so writing to it writes to `angles`."""
+    """The same angles (T, 5, 4), one row per digit; a view, so writing to it writes to `angles`."""
     view: np.ndarray = angles.reshape(*angles.shape[:-1], 5, 4)
     return view
 

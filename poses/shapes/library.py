@@ -1,4 +1,4 @@
-"""Named hand shapes: joint angles written by us, one file a library in `data`."""
+"""Named hand shapes: joint angles written by us, one file per library in `data`."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def gesture_names(library: str = "gestures") -> tuple[str, ...]:
 
 
 def gesture(name: str) -> Float[np.ndarray, "20"]:
-    """Hinge angles [rad] of a named gesture of any library, in the order of `topology.JOINTS`.
+    """Joint angles [rad] of a named gesture of any library, in the order of `topology.JOINTS`.
 
     Raises:
         ArgumentError: No library holds this name.
@@ -69,7 +69,7 @@ def gesture(name: str) -> Float[np.ndarray, "20"]:
 
 
 def gestures_of(library: str) -> Float[np.ndarray, "G 20"]:
-    """Hinge angles [rad] of every gesture of one library, in the order of `gesture_names(library)`.
+    """Joint angles [rad] of every gesture of one library, in the order of `gesture_names(library)`.
 
     Raises:
         ArgumentError: There is no such library.
@@ -83,8 +83,8 @@ def load_gestures() -> dict[str, Float[np.ndarray, "20"]]:
 
 
 def all_gestures() -> Float[np.ndarray, "G 20"]:
-    """Hinge angles [rad] of the gestures that random poses are blended from: the library "gestures".
+    """Joint angles [rad] of the gestures that random poses are blended from: the library "gestures".
 
-    The other libraries stay out of it, so that the same seed gives the same training set as ever.
+    The other libraries are left out, so that a seed keeps giving the same training set.
     """
     return gestures_of("gestures")

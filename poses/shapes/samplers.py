@@ -1,7 +1,7 @@
 """Random poses: gestures and their blends, fingers that curl together or alone, corners of the ranges.
 
-No recorded motion stands behind these: three sources are mixed so that what people do often is dense and what
-they can do at all is reached.
+No recorded motion is used: three sources are mixed so that common poses are dense and all possible poses are
+covered.
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ _SPREAD: Final = np.deg2rad([7.0, 1.5, -5.0, -11.0])  # one standard deviation o
 
 @dataclass(frozen=True, slots=True)
 class PoseMix:
-    """How often each source of poses is drawn; the shares are normalized."""
+    """How often each source of poses is drawn; the shares are normalized.
+
+    Raises:
+        ArgumentError: A share is negative, or all are zero.
+    """
 
     gestures: float = 0.45
     """Blends of two named gestures, each digit a little ahead or behind."""
@@ -64,7 +68,7 @@ DEFAULT_MIX: Final = PoseMix()
 def sample_angles(
     count: int, mix: PoseMix = DEFAULT_MIX, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "T 20"]:
-    """Random hinge angles [rad] inside ranges and couplings; digits may still touch.
+    """Random joint angles [rad] inside ranges and couplings; digits may still touch.
 
     `poses.shapes.validity` makes such poses valid.
     """
@@ -119,7 +123,7 @@ def _shared_normals(count: int, rng: np.random.Generator, *, digits: int = 4) ->
 
 
 def _grouped(splits: NDArray[np.bool_], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard normals (T, 4), alike within a group of neighboring fingers, new where a split stands."""
+    """Standard normals (T, 4), alike within a group of neighboring fingers, drawn anew at each split."""
     grouped = normals.copy()
     for finger in range(1, 4):
         along = _ALIKE * grouped[:, finger - 1] + np.sqrt(1 - _ALIKE**2) * normals[:, finger]

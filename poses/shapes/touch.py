@@ -1,7 +1,7 @@
-"""Thumb and finger that touch: solved for one person's hand, with the place of the contact.
+"""Thumb and finger that touch: solved for one person's hand, with the position of the contact.
 
 A touch is two capsules that meet: those of the thumb's and the finger's last bones, pads facing each other.
-It is ground truth of a kind that a real hand gives without any instrument.
+A real hand gives this kind of ground truth without any instrument.
 """
 
 from __future__ import annotations
@@ -32,41 +32,41 @@ FINGERS: Final = DIGITS[1:]
 MAX_OVERLAP: Final = 0.0006
 """Deepest overlap [m] of the two last bones of a solved touch; the least is 0."""
 MIN_FACING: Final = 0.5
-"""Least cosine between a pad's direction and the way to the other bone in a solved touch."""
+"""Smallest cosine between a pad's direction and the direction to the other bone in a solved touch."""
 _PAD: Final = 0.6  # where the pad is, as a share of the last bone's capsule
-# What one unit of the sum of squares is worth: meters of overlap, of digging in, of pads apart; radians.
+# One unit of the sum of squares: meters of overlap, of penetration elsewhere, between the pads; radians.
 _OVERLAP_SCALE: Final = 5e-5
 _DIG_SCALE: Final = 1e-4
 _PAD_SCALE: Final = 3e-2
 _FACING_WEIGHT: Final = 5.0
 _ANGLE_WEIGHTS: Final = 2.0 * np.array([1.0, 1.0, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0])
-_WANTED_FACING: Final = 0.55
+_TARGET_FACING: Final = 0.55
 _MOST_ROUNDS: Final = 4
 _STEP: Final = 1e-6  # of the finite differences [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ThumbContact:
-    """How the last bones of thumb and one finger lie to each other, a frame each."""
+    """Relative position of the last bones of thumb and one finger in each frame."""
 
     finger: str
     """Which finger."""
     overlap: Float[np.ndarray, "T"]
     """How deep the two capsules overlap [m]; negative: the gap between them."""
     thumb_point: Float[np.ndarray, "T 3"]
-    """The thumb's place nearest to the finger, in the frame of the thumb's last bone [m]."""
+    """The thumb's point nearest to the finger, in the frame of the thumb's last bone [m]."""
     finger_point: Float[np.ndarray, "T 3"]
-    """The finger's place nearest to the thumb, in the frame of the finger's last bone [m]."""
+    """The finger's point nearest to the thumb, in the frame of the finger's last bone [m]."""
     facing: Float[np.ndarray, "T 2"]
-    """Cosines between a pad's direction and the way to the other bone, thumb and finger; 1: pad to pad."""
+    """Cosine between pad direction and direction to the other bone, for thumb and finger; 1: pad to pad."""
 
 
 def thumb_contact(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> ThumbContact:
-    """Where thumb and finger are nearest to each other, touching or not.
+    """The nearest points of thumb and finger, touching or not.
 
     Args:
         model: The hand.
-        angles: Hinge angles [rad].
+        angles: Joint angles [rad].
         finger: "index", "middle", "ring" or "little".
 
     Raises:
@@ -79,8 +79,8 @@ def thumb_contact(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: s
 
 def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> ThumbContact:
     bones = bones_of("thumb")[2], bones_of(finger)[2]
-    places = [int(np.flatnonzero(capsules.bones == bone)[0]) for bone in bones]
-    segments, radii = capsules.posed(frames)[:, places], capsules.radii[places]
+    indices = [int(np.flatnonzero(capsules.bones == bone)[0]) for bone in bones]
+    segments, radii = capsules.posed(frames)[:, indices], capsules.radii[indices]
     ends = _nearest_points(segments)
     way = ends[:, 1] - ends[:, 0]
     distance = np.linalg.norm(way, axis=1)
@@ -97,10 +97,10 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
 def touching_angles(
     model: HandModel, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
 ) -> Float[np.ndarray, "20"]:
-    """Hinge angles [rad] at which the pads of thumb and finger touch, the rest of the hand as in `start`.
+    """Joint angles [rad] at which the pads of thumb and finger touch, the rest of the hand as in `start`.
 
     Only the thumb and this finger move. The last bones overlap by 0 to `MAX_OVERLAP`, their pads face each
-    other, and nothing else digs in deeper than `MAX_PENETRATION`.
+    other, and nothing else penetrates deeper than `MAX_PENETRATION`.
 
     Args:
         model: The hand.
@@ -121,7 +121,7 @@ def touching_angles(
         starts = check_array("start", start, (NUM_JOINTS,)).reshape(-1, NUM_JOINTS)
     for begin in np.clip(starts, LOW, HIGH):
         angles = begin
-        for _ in range(_MOST_ROUNDS):  # each stays near where it began, so that a far touch takes some rounds
+        for _ in range(_MOST_ROUNDS):  # each solution stays near its start, so a far touch takes some rounds
             angles = _solve(model, finger, angles)
             if is_touching(model, angles[None], finger)[0]:
                 return angles
@@ -132,7 +132,7 @@ def touching_angles(
 
 
 def is_touching(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> NDArray[np.bool_]:
-    """Which poses (T,) touch as `touching_angles` promises, valid ones that overlap by 0 to `MAX_OVERLAP`."""
+    """Which poses (T,) are valid and touch as `touching_angles` defines it."""
     contact = thumb_contact(model, angles, finger)
     touching = (contact.overlap >= 0.0) & (contact.overlap <= MAX_OVERLAP)
     facing = (contact.facing >= MIN_FACING).all(axis=1)
@@ -150,23 +150,25 @@ def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray
         values: NDArray[np.float64] = residuals(x[None])[0]
         return values
 
-    def slope(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jacobian(x: NDArray[np.float64]) -> NDArray[np.float64]:
         steps = np.where(x + _STEP > high, -_STEP, _STEP)
         moved = residuals(np.vstack([x, x + np.diag(steps)]))
         quotients: NDArray[np.float64] = (moved[1:] - moved[0]).T / steps
         return quotients
 
     inside = np.clip(start[moving], low + 1e-4, high - 1e-4)
-    found = least_squares(value, inside, jac=slope, bounds=(low, high), max_nfev=60, xtol=1e-6, ftol=1e-6)
+    solution = least_squares(
+        value, inside, jac=jacobian, bounds=(low, high), max_nfev=60, xtol=1e-6, ftol=1e-6
+    )
     angles: NDArray[np.float64] = start.copy()
-    angles[moving] = found.x
+    angles[moving] = solution.x
     return angles
 
 
 def _residuals(
     model: HandModel, finger: str, start: NDArray[np.float64], moving: NDArray[np.int64]
 ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
-    """What shall be small, as a function of the moving angles (T, 8)."""
+    """The residuals (T, R) as a function of the moving angles (T, 8) [rad]."""
     capsules = model.capsules
     bones = bones_of("thumb")[2], bones_of(finger)[2]
     pads = [_pad(capsules, bone) for bone in bones]
@@ -179,7 +181,7 @@ def _residuals(
         frames = model.forward_kinematics(join_qpos(angles))
         overlaps = _overlaps(capsules.posed(frames), capsules.radii, pairs)
         contact = _contact(capsules, frames, finger)
-        places = [
+        positions = [
             np.einsum("tij,j->ti", frames[:, bone, :3, :3], pad) + frames[:, bone, :3, 3]
             for bone, pad in zip(bones, pads, strict=True)
         ]
@@ -187,8 +189,8 @@ def _residuals(
             [
                 (contact.overlap - 0.5 * MAX_OVERLAP)[:, None] / _OVERLAP_SCALE,
                 np.maximum(0.0, overlaps - 0.7 * MAX_PENETRATION) / _DIG_SCALE,
-                _FACING_WEIGHT * np.maximum(0.0, _WANTED_FACING - contact.facing),
-                (places[0] - places[1]) / _PAD_SCALE,
+                _FACING_WEIGHT * np.maximum(0.0, _TARGET_FACING - contact.facing),
+                (positions[0] - positions[1]) / _PAD_SCALE,
                 _ANGLE_WEIGHTS * (x - start[moving]),
             ],
             axis=1,
@@ -199,9 +201,9 @@ def _residuals(
 
 def _pad(capsules: Capsules, bone: int) -> NDArray[np.float64]:
     """The middle of a last bone's pad, in its frame [m]."""
-    place = int(np.flatnonzero(capsules.bones == bone)[0])
-    pad: NDArray[np.float64] = capsules.starts[place] + _PAD * (capsules.ends[place] - capsules.starts[place])
-    pad[2] -= capsules.radii[place]
+    index = int(np.flatnonzero(capsules.bones == bone)[0])
+    pad: NDArray[np.float64] = capsules.starts[index] + _PAD * (capsules.ends[index] - capsules.starts[index])
+    pad[2] -= capsules.radii[index]
     return pad
 
 
@@ -222,6 +224,13 @@ def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _overlaps(segments: Any, radii: Any, pairs: Any) -> Any:
+    """Overlaps (T, P) [m] of pairs of capsules; minus the gap where they are apart.
+
+    Args:
+        segments: Both ends of every axis (T, K, 2, 3) [m].
+        radii: Capsule radii (K,) [m].
+        pairs: Indices of two capsules each (P, 2).
+    """
     overlaps = np.empty((len(segments), len(pairs)))
     for frame in range(len(segments)):
         for pair in range(len(pairs)):

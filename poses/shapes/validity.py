@@ -1,4 +1,4 @@
-"""Poses a body could strike: in range, and not dug into itself."""
+"""Valid poses: joint angles in range, and no deep overlap of the hand with itself."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_PENETRATION: Final = 0.001
-"""Deepest self-penetration [m] of a pose that counts as valid: what skin gives way."""
+"""Deepest self-penetration [m] of a valid pose: skin yields by about this much."""
 _HALVINGS: Final = 4
 _THUMB: Final = np.array([joint.name.startswith("thumb") for joint in JOINTS])
 _ABDUCTIONS: Final = np.array([joint.name.endswith("abduction") for joint in JOINTS])
@@ -49,10 +49,10 @@ def validate(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Bool[np.ndarr
 
 
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
-    """A valid relaxed pose of this hand, its fingers fanned just as far as its girth asks for.
+    """A valid relaxed pose of this hand, its fingers fanned just as far as their girth needs.
 
     Raises:
-        PoseError: No fan makes room for these fingers.
+        PoseError: The fingers overlap however far they are fanned.
     """
     fans = np.arange(0.0, 13.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
@@ -67,32 +67,39 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
 def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
     """Poses [rad] moved towards rest just until they are valid; valid ones stay as they are.
 
-    What is in the way gives way first: the thumb alone, then thumb and abductions, and only where that is not
-    enough the whole hand opens. The way back is halved a few times, so that a fist that was too tight ends as
-    a fist whose fingers touch.
+    The thumb alone moves first, then thumb and abductions, and the whole hand opens only where that is not
+    enough. The path to rest is bisected a few times, so that a fist that was too tight ends as a fist whose
+    fingers touch.
+
+    Args:
+        model: The hand.
+        angles: Joint angles [rad].
+
+    Raises:
+        PoseError: This hand has no valid pose at rest.
     """
     resting = resting_angles(model)
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))
     for moving in (_THUMB, _THUMB | _ABDUCTIONS, np.ones_like(_THUMB)):
-        wanted = result[todo]
-        end = np.where(moving, resting, wanted)
+        target = result[todo]
+        end = np.where(moving, resting, target)
         helps = is_valid(model, end)
-        result[todo[helps]] = _nearest_valid(model, end[helps], wanted[helps])
+        result[todo[helps]] = _nearest_valid(model, end[helps], target[helps])
         todo = todo[~helps]
     return result
 
 
 def _nearest_valid(
-    model: HandModel, valid_end: NDArray[np.float64], wanted: NDArray[np.float64]
+    model: HandModel, valid_end: NDArray[np.float64], target: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The last valid poses found by halving the ways from valid ends to wanted poses."""
-    low, high = np.zeros(len(wanted)), np.ones(len(wanted))  # share of the wanted pose: valid, invalid
+    """The last valid poses that bisection finds between valid ends and target poses."""
+    low, high = np.zeros(len(target)), np.ones(len(target))  # share of the target pose: valid, invalid
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        valid = is_valid(model, valid_end + middle[:, None] * (wanted - valid_end))
+        valid = is_valid(model, valid_end + middle[:, None] * (target - valid_end))
         low, high = np.where(valid, middle, low), np.where(valid, high, middle)
-    return valid_end + low[:, None] * (wanted - valid_end)
+    return valid_end + low[:, None] * (target - valid_end)
 
 
 def sample_valid_angles(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from gloves.attachment import _crossings, _ray, attach_markers, vary_places
+from gloves.attachment import _crossings, _ray, attach_markers, vary_layout
 from gloves.layout import load_layout
 from handsim.errors import LayoutError
 from handsim.hand.mjcf import build_spec
@@ -33,7 +33,7 @@ def test_markers_sit_one_radius_above_the_skin(glove, rng):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_markers_stand_where_a_ray_through_every_triangle_leaves_the_skin(side, rng):
-    layout = vary_places(load_layout("dense19"), along=0.1, around=0.3, rng=rng)
+    layout = vary_layout(load_layout("dense19"), along=0.1, around=0.3, rng=rng)
     model = HandModel(sample_shape(EVERYBODY, side=side, rng=rng))
     attachment, skin = attach_markers(layout, model), model.surface
     corners = skin.vertices[skin.faces]
@@ -94,15 +94,15 @@ def test_a_marker_in_the_air_is_told():
     layout = load_layout("dense19")
     markers = list(layout.markers)
     markers[6] = dataclasses.replace(markers[6], along=1.3)
-    with pytest.raises(LayoutError, match=r"marker 'IndexTip' finds no skin from index_distal at along 1\.3"):
+    with pytest.raises(LayoutError, match=r"marker 'IndexTip' meets no skin from index_distal at along 1\.3"):
         attach_markers(dataclasses.replace(layout, markers=tuple(markers)), HandModel.named("M"))
 
 
 def test_slipped_markers_keep_their_bones_and_names(rng):
     layout = load_layout("dense19")
-    slipped = vary_places(layout, along=0.1, around=0.2, rng=rng)
+    slipped = vary_layout(layout, along=0.1, around=0.2, rng=rng)
     assert slipped.names == layout.names
     assert [m.bone for m in slipped.markers] == [m.bone for m in layout.markers]
     moved = np.array([a.along - b.along for a, b in zip(slipped.markers, layout.markers, strict=True)])
     assert 0.02 < moved.std() < 0.2
-    assert vary_places(layout, along=0.0, around=0.0, rng=rng) == layout
+    assert vary_layout(layout, along=0.0, around=0.0, rng=rng) == layout

@@ -54,7 +54,7 @@ def flat_hand(layout: MarkerLayout) -> Flat:
     """The hand and the glove on it, laid flat.
 
     Raises:
-        LayoutError: A marker finds no skin.
+        LayoutError: A marker meets no skin.
     """
     model = HandModel.named("M")
     worn = attach_markers(layout, model)

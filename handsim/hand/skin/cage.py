@@ -52,7 +52,7 @@ _DEPTHS: Final = np.array(
         [0.40, 0.62, 0.64, 0.64, 0.64, 0.64, 0.64, 0.60, 0.38],
     ]
 )
-_ROW_PLACES: Final = np.array(
+_ROW_POSITIONS: Final = np.array(
     [-0.26, -0.05, 0.16, 0.42, 0.70, 0.97]
 )  # along the metacarpals: 0 wrist, 1 joint
 _WRIST_COLUMNS: Final = np.array([0.215, 0.075, -0.07, -0.205])  # of the four rays, in hand breadths
@@ -60,10 +60,10 @@ _EDGES: Final = np.array([[0.15, 0.14, 0.12, 0.13, 0.13, 0.145], [0.15, 0.14, 0.
 
 _CARPUS_RISE: Final = 0.42  # the carpus arches over the line from wrist to knuckles, in palm thicknesses
 _ARCH: Final = np.array([0.0, 0.0, 0.04, 0.08, 0.08, 0.02])  # and the metacarpals' backs over theirs, by row
-# Finger joints turn nearer to the back than to the pad: how far a section's middle lies below, in radii.
+# Finger joints rotate nearer to the back than to the pad: how far a section's middle lies below, in radii.
 _PALMWARD: Final = np.array([0.0, -0.14])
 # The web row along the first phalanges; webs slope from the back to the palm, the crotch comes out halfway.
-_WEB_PLACES: Final = np.array(
+_WEB_DISTANCES: Final = np.array(
     [
         [0.43, 0.43, 0.31, 0.38, 0.45, 0.43],
         [0.31, 0.43, 0.31, 0.38, 0.45, 0.38],
@@ -92,7 +92,7 @@ _WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}
 
 @dataclass(slots=True, eq=False)
 class CageScales:
-    """What the fit to a shape's measures adjusts, so that subdivision does not shrink the hand."""
+    """Scales that the fit to a shape's measures adjusts, because subdivision shrinks the cage."""
 
     rings: list[Float[np.ndarray, " R"]]
     """Factor on the radius of each ring of each digit."""
@@ -108,13 +108,13 @@ def first_scales() -> CageScales:
     return CageScales(rings, np.zeros(len(DIGITS)), 1.1, 1.1)
 
 
-def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
+def ring_distances(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
     """Distance of each ring from the digit's first joint, along the straight digit [m]."""
     first, second, third = shape.bone_lengths[digit]
     _, radius_1, radius_2, radius_3 = shape.radii[digit]
     joint_2, tip = first + second, first + second + third
     after_2 = joint_2 + 0.6 * radius_2
-    places = [
+    distances = [
         first - 0.75 * radius_1,
         first,
         first + 0.75 * radius_1,
@@ -123,23 +123,23 @@ def ring_places(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
         np.clip(tip - radius_3, after_2 + 0.35 * (tip - after_2), after_2 + 0.6 * (tip - after_2)),
         after_2 + 0.88 * (tip - after_2),
     ]
-    return np.array([0.5 * first, *places] if digit == 0 else places)
+    return np.array([0.5 * first, *distances] if digit == 0 else distances)
 
 
 def ring_girths(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
     """Girth of the skin at each ring [m]: a little more at the joints, a little less between them."""
     names = THUMB_RINGS if digit == 0 else FINGER_RINGS
     waist = np.array([_WAISTS.get(name, 1.0) for name in names])
-    girths: np.ndarray = 2.0 * np.pi * waist * radius_at(shape, digit, ring_places(shape, digit))
+    girths: np.ndarray = 2.0 * np.pi * waist * radius_at(shape, digit, ring_distances(shape, digit))
     return girths
 
 
-def radius_at(shape: HandShape, digit: int, places: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
+def radius_at(shape: HandShape, digit: int, distances: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
     """Skin radius [m] at distances along a digit: straight between the shape's four radii."""
     first, second, third = shape.bone_lengths[digit]
     radii = shape.radii[digit]
     knots = [0.0, first, first + second, first + second + third - radii[3]]
-    radius: np.ndarray = np.interp(places, knots, radii)
+    radius: np.ndarray = np.interp(distances, knots, radii)
     return radius
 
 
@@ -148,9 +148,9 @@ def digit_frames(shape: HandShape) -> Float[np.ndarray, "5 4 4"]:
     return build_skeleton(shape.with_side("right")).rest_transforms()[1::3]
 
 
-def _around(frame: Float[np.ndarray, "4 4"], place: ArrayLike, offsets: np.ndarray) -> np.ndarray:
-    """Points at `offsets` (..., 2) (y, z) [m] from a digit's axis, `place` (...) [m] along it."""
-    along = np.broadcast_to(np.asarray(place, dtype=np.float64), offsets.shape[:-1])
+def _around(frame: Float[np.ndarray, "4 4"], distance: ArrayLike, offsets: np.ndarray) -> np.ndarray:
+    """Points at `offsets` (..., 2) (y, z) [m] from a digit's axis, `distance` (...) [m] along it."""
+    along = np.broadcast_to(np.asarray(distance, dtype=np.float64), offsets.shape[:-1])
     local = np.concatenate([along[..., None], offsets], axis=-1)
     points: np.ndarray = local @ frame[:3, :3].T + frame[:3, 3]
     return points
@@ -164,12 +164,12 @@ def cage_vertices(
     vertices[topology.palm] = _palm(shape, frames, scales)
     for digit, rings in enumerate(topology.rings):
         names = THUMB_RINGS if digit == 0 else FINGER_RINGS
-        places = ring_places(shape, digit)
+        distances = ring_distances(shape, digit)
         sections = np.array([_SECTIONS[name] for name in names])
         sections[:-2] += _PALMWARD
-        sections = sections * (radius_at(shape, digit, places) * scales.rings[digit])[:, None, None]
-        places[-1] += scales.tips[digit]
-        vertices[rings] = _around(frames[digit], places[:, None], sections)
+        sections = sections * (radius_at(shape, digit, distances) * scales.rings[digit])[:, None, None]
+        distances[-1] += scales.tips[digit]
+        vertices[rings] = _around(frames[digit], distances[:, None], sections)
     _shape_thumb_base(shape, frames, vertices, topology)
     return vertices
 
@@ -182,10 +182,10 @@ def _palm(
     wrist[:, 1] = _WRIST_COLUMNS * shape.breadth
     wrist[:, 2] = _CARPUS_RISE * shape.palm_thickness
     knuckles = shape.knuckles[1:]
-    along = np.clip(_ROW_PLACES, 0.0, 1.0)[:, None, None]
+    along = np.clip(_ROW_POSITIONS, 0.0, 1.0)[:, None, None]
     centers = (1.0 - along) * wrist + along * knuckles
-    centers[..., 0] = _ROW_PLACES[:, None] * np.where(
-        _ROW_PLACES[:, None] < 0.0, knuckles[1, 0], knuckles[:, 0]
+    centers[..., 0] = _ROW_POSITIONS[:, None] * np.where(
+        _ROW_POSITIONS[:, None] < 0.0, knuckles[1, 0], knuckles[:, 0]
     )
     columns = np.empty((6, 9, 3))
     columns[:, 1::2] = centers
@@ -200,22 +200,22 @@ def _palm(
     rows[:6, 9:, 2] -= _DEPTHS[:, ::-1] * thickness
     past = np.repeat(0.7 * shape.radii[1:, :1], 6, axis=1)
     rows[PAST_KNUCKLES] = _finger_bases(shape, frames, past, 0.12)
-    rows[WEB] = _finger_bases(shape, frames, _WEB_PLACES * shape.bone_lengths[1:, :1], 0.0)
+    rows[WEB] = _finger_bases(shape, frames, _WEB_DISTANCES * shape.bone_lengths[1:, :1], 0.0)
     return rows
 
 
 def _finger_bases(
-    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], places: Float[np.ndarray, "4 6"], deepen: float
+    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], distances: Float[np.ndarray, "4 6"], deepen: float
 ) -> Float[np.ndarray, "18 3"]:
-    """A palm row across the fingers, `places` [m] past their first joints; neighbors share their sides."""
+    """A palm row across the fingers, `distances` [m] past their first joints; neighbors share their sides."""
     row = np.zeros((AROUND, 3))
     shared = np.zeros(AROUND)
-    for finger, place in enumerate(places):
+    for finger, distance in enumerate(distances):
         digit, slots = finger + 1, finger_slots(finger)
-        radius = 1.2 * radius_at(shape, digit, place)
+        radius = 1.2 * radius_at(shape, digit, distance)
         section = (_ROUND + _PALMWARD) * radius[:, None]
         section[3:, 1] -= deepen * radius[3:]
-        row[slots] += _around(frames[digit], place, section)
+        row[slots] += _around(frames[digit], distance, section)
         shared[slots] += 1.0
     return row / shared[:, None]
 
@@ -229,8 +229,8 @@ def _shape_thumb_base(
     def at(along: float, y: float, z: float) -> np.ndarray:
         return _around(frames[0], along * length, radius * np.array([y, z]))
 
-    def move(row: int, place: int, target: np.ndarray, share: float) -> None:
-        vertex = topology.palm[row, place]
+    def move(row: int, index: int, target: np.ndarray, share: float) -> None:
+        vertex = topology.palm[row, index]
         vertices[vertex] = (1.0 - share) * vertices[vertex] + share * target
 
     move(CARPUS, dorsal(0), at(-0.1, -0.9, 0.9), 0.5)

@@ -49,17 +49,17 @@ class CageTopology:
 
 
 def dorsal(column: int) -> int:
-    """Place of a back column in a palm row."""
+    """Index of a back column in a palm row."""
     return column
 
 
 def palmar(column: int) -> int:
-    """Place of a palm column in a palm row."""
+    """Index of a palm column in a palm row."""
     return AROUND - 1 - column
 
 
 def finger_slots(finger: int) -> list[int]:
-    """Places in a palm row of the six vertices around a finger (0 to 3), in a ring's order."""
+    """Indices in a palm row of the six vertices around a finger (0 to 3), in a ring's order."""
     columns = range(2 * finger, 2 * finger + 3)
     return [dorsal(column) for column in columns] + [palmar(column) for column in reversed(columns)]
 
@@ -75,11 +75,11 @@ def cage_topology() -> CageTopology:
     back, front, three = dorsal(0), palmar(0), (CARPUS, THENAR, METACARPUS)
     hole = {(row, front) for row in three[:2]}
     quads = [
-        [palm[row, place], palm[row, place_after], palm[row + 1, place_after], palm[row + 1, place]]
+        [palm[row, index], palm[row, next_index], palm[row + 1, next_index], palm[row + 1, index]]
         for row in range(NUM_ROWS - 1)
-        for place in range(AROUND)
-        for place_after in [(place + 1) % AROUND]
-        if (row, place) not in hole
+        for index in range(AROUND)
+        for next_index in [(index + 1) % AROUND]
+        if (row, index) not in hole
     ]
     quads += [
         [palm[0, dorsal(c)], palm[0, palmar(c)], palm[0, palmar(c + 1)], palm[0, dorsal(c + 1)]]

@@ -38,6 +38,14 @@ def skin_frames(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _skin(points: Any, bones: Any, weights: Any, motion: Any) -> Any:
+    """Skinned positions (T, V, 3) [m].
+
+    Args:
+        points: Rest positions (V, 3) [m].
+        bones: The bones that move each point (V, 4).
+        weights: Their shares (V, 4), in descending order; the first zero ends a point's list.
+        motion: Transforms (T, L, 3, 4) from the rest pose to each frame.
+    """
     skinned = np.empty((len(motion), len(points), 3))
     for t in range(len(motion)):
         for v in range(len(points)):

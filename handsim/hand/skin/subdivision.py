@@ -59,7 +59,7 @@ def subdivided_loop(
 ) -> np.ndarray:
     """The 2 K vertices that a closed loop of edges passes through after one `catmull_clark` step."""
     edges, _ = edge_table(quads)
-    number = {(int(a), int(b)): place for place, (a, b) in enumerate(edges)}
+    number = {(int(a), int(b)): index for index, (a, b) in enumerate(edges)}
     result = []
     for first, second in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
         result += [first, num_vertices + number[min(first, second), max(first, second)]]

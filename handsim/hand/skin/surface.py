@@ -41,13 +41,13 @@ class HandSurface:
     faces: Int[np.ndarray, "F 3"]
     """Triangles, counter-clockwise from outside."""
     bone_indices: Int[np.ndarray, "V 4"]
-    """Places in `topology.BONES` of the bones that move each vertex."""
+    """Indices in `topology.BONES` of the bones that move each vertex."""
     bone_weights: Float[np.ndarray, "V 4"]
     """Their shares: not negative, in descending order, summing to one."""
 
 
 class _Template(NamedTuple):
-    """What all hands share. The last four are rows of `measured`, the vertices that the fit looks at."""
+    """What all hands share. The last four are rows of `measured`, the vertices that the fit measures."""
 
     topology: CageTopology
     subdivide: sparse.csr_array
@@ -88,7 +88,7 @@ def _template() -> _Template:
 def build_surface(shape: HandShape) -> HandSurface:
     """Skin of a hand at zero angles.
 
-    Subdivision shrinks, so the cage is blown up until the skin has the shape's girths, lengths, breadth and
+    Subdivision shrinks, so the cage is enlarged until the skin has the shape's girths, lengths, breadth and
     palm thickness. A left hand is the exact mirror image of the right one.
     """
     template = _template()
@@ -99,7 +99,7 @@ def build_surface(shape: HandShape) -> HandSurface:
 
 
 def _fitted_cage(shape: HandShape, template: _Template) -> np.ndarray:
-    """Cage vertices after a few corrections of their scales by wanted over measured."""
+    """Cage vertices after a few corrections of their scales by the ratio of expected and measured size."""
     topology, frames, first = template.topology, digit_frames(shape), first_scales()
     still, wide, deep = _cage_parts(shape, frames, topology)
     palm, on_ring = topology.palm.size, topology.rings[0].shape[1]

@@ -1,4 +1,4 @@
-"""How much each bone moves the skin: shares given on the cage, spread by the same subdivision."""
+"""Skinning weights: shares of the bones given on the cage, spread by the same subdivision."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Bone of the digit and its share on each ring past the web; the rest goes to the bone before it.
 _FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))
-# Share of the thumb's metacarpal on the palm's rows around it: (row, place, share).
+# Share of the thumb's metacarpal on the palm's rows around it: (row, index, share).
 _THENAR: Final = (
     (CARPUS, dorsal(0), 0.25),
     (CARPUS, palmar(0), 0.35),
@@ -51,10 +51,10 @@ def cage_weights(topology: CageTopology) -> Float[np.ndarray, "K 16"]:
                 [column // 2] if column % 2 else [f for f in (column // 2 - 1, column // 2) if 0 <= f < 4]
             )
             share = on_finger if column % 2 or len(fingers) == 1 else on_web
-            for place in (dorsal(column), palmar(column)):
-                weights[topology.palm[row, place], [4 + 3 * f for f in fingers]] = share / len(fingers)
-    for row, place, share in _THENAR:
-        weights[topology.palm[row, place], 1] = share
+            for index in (dorsal(column), palmar(column)):
+                weights[topology.palm[row, index], [4 + 3 * f for f in fingers]] = share / len(fingers)
+    for row, index, share in _THENAR:
+        weights[topology.palm[row, index], 1] = share
     for digit, rings in enumerate(topology.rings):
         first = 1 + 3 * digit
         if digit == 0:

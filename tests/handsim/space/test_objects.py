@@ -169,6 +169,6 @@ def test_bad_body_motions_are_told():
         BodyMotion(np.zeros((0, 4, 4)), 120.0)
     with pytest.raises(ArgumentError, match="the rate is 0 Hz"):
         BodyMotion(np.eye(4)[None], 0.0)
-    with pytest.raises(ArgumentError, match="no rigid transforms"):
+    with pytest.raises(ArgumentError, match="is not rigid transforms"):
         BodyMotion(2 * np.eye(4)[None], 120.0)
     assert BodyMotion(np.tile(np.eye(4), (121, 1, 1)), 120.0).duration == pytest.approx(1.0)

@@ -16,7 +16,7 @@ from handsim.hand.motion import HandMotion
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
 from poses.motion.motions import MotionConfig, minimum_jerk, motion_through, sample_motion
-from poses.motion.rest_paths import can_be_left, way_to_rest
+from poses.motion.rest_paths import can_be_left, path_to_rest
 from poses.motion.scripts import script_names, script_poses, scripted_motion
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture, gesture_names
@@ -143,7 +143,7 @@ def test_tight_poses_can_be_left(rng):
     resting = resting_angles(model)
     poses = make_valid(model, np.stack([gesture("fist"), gesture("asl_m"), resting]))
     assert can_be_left(model, poses).all()
-    way = way_to_rest(model, poses[1], MotionConfig(), rng)
+    way = path_to_rest(model, poses[1], MotionConfig(), rng)
     assert is_valid(model, way).all()
     np.testing.assert_allclose(way[-1], resting, atol=1e-12)
 
