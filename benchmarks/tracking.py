@@ -122,7 +122,7 @@ def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
         for one, true in zip(found, true_users(take), strict=True):
             errors = hand_errors(one, true)
             print(
-                f"    {one.side}: places {1e3 * errors.places.mean():.2f} mm, bones "
+                f"    {one.side}: places {1e3 * errors.positions.mean():.2f} mm, bones "
                 f"{100 * np.abs(errors.lengths).mean():.2f} %, tips {100 * np.abs(errors.tips).mean():.1f} %"
             )
         print(f"    calibration capture, its labels and the calibration took {took:.0f} s")

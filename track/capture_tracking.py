@@ -118,7 +118,9 @@ class TakeRecorder:
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
-        self._bodies = tuple(MarkedBody(body.name, body.marker_names, body.places) for body in tracker.bodies)
+        self._bodies = tuple(
+            MarkedBody(body.name, body.marker_names, body.positions) for body in tracker.bodies
+        )
         self._frames: list[tuple[StreamedFrame, TrackedFrame]] = []
 
     @property

@@ -33,8 +33,8 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
         raise HandSimError(f"--out is {out}, expected a file name that ends in {TOML}")
     found = _held(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
     save_body(out, found)
-    widest = 1e3 * np.max(found.sides)
-    say(f"{out}: {found.name}, {len(found.places)} markers, at most {widest:.1f} mm apart")
+    widest = 1e3 * np.max(found.distances)
+    say(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")
 
 
 def _held(truth: Path) -> RigidTemplate:

@@ -127,4 +127,4 @@ def _tell(done: Calibration) -> list[str]:
     if np.isfinite(before):
         line += f"; thumb and fingers {before:.1f} mm from touching before, {after:.1f} mm after"
     line += f"; hand length {1e3 * done.hand.model.shape.length:.0f} mm"
-    return [line, *done.advice()]
+    return [line, *done.suggestions()]

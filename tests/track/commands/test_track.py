@@ -70,7 +70,7 @@ def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     assert found.side == "right", "the left hand is not in the capture"
     errors = hand_errors(found, true)
     start = hand_errors(nominal_fit(load_layout("dense19"), "L", "right"), true)
-    assert np.median(errors.places) < 0.5 * np.median(start.places)
+    assert np.median(errors.positions) < 0.5 * np.median(start.positions)
     assert main(["track", str(folder / "user.c3d"), "--shape", str(folder / "user.json"), "--out",
                  str(folder / "take.npz")]) == 0  # fmt: skip
     take = load_tracked_take(folder / "take.npz")
@@ -156,7 +156,7 @@ def test_a_body_is_learned_from_a_capture_of_it(capture, tmp_path, capsys):
     assert main(["body", str(file), "--out", str(wand)]) == 0
     assert capsys.readouterr().out.startswith(f"{wand}: wand, 6 markers, at most 99.9 mm apart")
     body, true = load_body(wand), load_body("controller")
-    np.testing.assert_allclose(np.sort(body.sides.ravel()), np.sort(true.sides.ravel()), atol=0.0002)
+    np.testing.assert_allclose(np.sort(body.distances.ravel()), np.sort(true.distances.ravel()), atol=0.0002)
 
 
 def test_a_body_is_followed_through_a_stream(capture, tmp_path, capsys):
