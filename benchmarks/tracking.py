@@ -1,7 +1,7 @@
 """The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
 
     OMP_NUM_THREADS=1 python benchmarks/tracking.py [calibrated drums starts speed memory]
-        [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
+        [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recovery_times 100 --hour 432000]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
     calibrate` begins with the nearest of the five sizes, has the tracker label the capture, and writes their
@@ -44,11 +44,11 @@ from track.evaluation.take_evaluation import (
     TrackingReport,
     evaluate_tracker,
     nearest_size,
+    nominal_users,
     seen_frame,
     true_users,
-    usual_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, first_locks, recoveries, without_body
+from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times, without_body
 from track.tracker import Tracker
 from track.user import load_user
 from train.labelers.protocol import Labeler
@@ -56,12 +56,12 @@ from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 from train.simulation.twins import KINDS, Kind, TwinConfig, simulate_twin
 
-TRIALS = {"start": (first_locks, 3), "recovery": (recoveries, 5)}
+TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
 WARM_UP = 30  # frames
 FINDINGS = 25  # frames in which hands are looked for
 EVERY = 36000  # frames between two looks at the memory: five minutes
-HANDS = {"true": true_users, "uncalibrated": usual_users}
+HANDS = {"true": true_users, "uncalibrated": nominal_users}
 
 
 @cache
@@ -156,7 +156,7 @@ def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
         waits: dict[str, list[np.ndarray]] = {"start": [], "recovery": []}
         for name, take in takes.items():
             rng = np.random.default_rng(arguments.seeds[0])
-            for what, trials in (("start", arguments.starts), ("recovery", arguments.recoveries)):
+            for what, trials in (("start", arguments.starts), ("recovery", arguments.recovery_times)):
                 wait, within = TRIALS[what]
                 count, known = -(-trials // len(takes)), hands(take)
                 waits[what].append(
@@ -228,7 +228,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="of every twin; the paper's number when not given")
     parser.add_argument("--free", type=float, default=40.0, help="free motion in a calibration capture [s]")
     parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--recoveries", type=int, default=100)
+    parser.add_argument("--recovery_times", type=int, default=100)
     parser.add_argument("--hour", type=int, default=432000, help="frames that memory is watched for")
     arguments = parser.parse_args()
     unknown = set(arguments.sections) - set(SECTIONS)
@@ -241,7 +241,7 @@ def main() -> None:
         for kind in arguments.kinds
     }
     for take in takes.values():
-        warm_up(usual_users(take), labeler())
+        warm_up(nominal_users(take), labeler())
     for section in arguments.sections or SECTIONS:
         if section == "starts" and min(take.num_frames for take in takes.values()) < FEWEST_FRAMES:
             parser.error(f"starts needs {FEWEST_FRAMES} frames of every twin")

@@ -9,22 +9,28 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.layout import MarkerLayout, MarkerPlace
-from handsim.errors import LayoutError
+from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.mjcf import Site
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import HandSurface, vertex_normals
-from handsim.hand.topology import BONE_NAMES, PALM
+from handsim.hand.topology import BONE_NAMES, NUM_BONES, PALM
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
 _MOST_FITTINGS: Final = 20
+_WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
+_SUM_TOLERANCE: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attachment:
-    """Markers of one glove on one hand: rest places and the weights of the skin under them."""
+    """Markers of one glove on one hand: rest positions and the weights of the skin under them.
+
+    Raises:
+        ArgumentError: An array does not fit the layout, or holds what it cannot.
+    """
 
     layout: MarkerLayout
     points: Float[np.ndarray, "M 3"]
@@ -35,6 +41,21 @@ class Attachment:
     """The bones that carry each marker."""
     bone_weights: Float[np.ndarray, "M 4"]
     """Their shares, summing to one."""
+
+    def __post_init__(self) -> None:
+        for name, width in _WIDTHS.items():
+            shape, expected = getattr(self, name).shape, (self.layout.num_markers, width)
+            if shape != expected:
+                raise ArgumentError(f"{name} has shape {shape}, expected {expected}")
+            if not np.isfinite(getattr(self, name)).all():
+                raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
+        bones, shares = self.bone_indices, self.bone_weights
+        if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
+            raise ArgumentError(
+                f"bone_indices are no bones, expected whole numbers from 0 to {NUM_BONES - 1}"
+            )
+        if not ((shares >= 0.0).all() and (np.abs(shares.sum(axis=1) - 1.0) <= _SUM_TOLERANCE).all()):
+            raise ArgumentError("bone_weights are not shares, expected positive numbers that sum to one")
 
     @property
     def main_bones(self) -> Int[np.ndarray, "M"]:

@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, choices
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, bridge_gaps
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
-from handsim.hand.topology import NUM_BONES, NUM_QPOS, Side
+from handsim.hand.topology import NUM_QPOS, Side
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -185,7 +185,6 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTak
     worn = zip(*(arrays[f"attachment_{name}"] for name in _WORN), strict=True)
     for record, layout, parts in zip(arrays["hands"], header["layouts"], worn, strict=True):
         attachment = Attachment(stored_layout(layout), *parts)
-        _check_worn(attachment)
         hands.append(GloveFit(HandModel(unpack_hand(record)), attachment))
     names = [(stored["name"], tuple(stored["marker_names"])) for stored in header["bodies"]]
     places = np.split(arrays["body_places"], np.cumsum([len(markers) for _, markers in names], dtype=int))
@@ -200,18 +199,6 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTak
         settings=header["settings"],
         **{name: arrays[name] for name in _ARRAYS},
     )
-
-
-def _check_worn(worn: Attachment) -> None:
-    """Whether a stored attachment fits its layout."""
-    count = worn.layout.num_markers
-    check_shapes((getattr(worn, name), (count, 3 if name in _WORN[:2] else 4)) for name in _WORN)
-    if not np.isfinite(worn.points).all() or not np.isfinite(worn.normals).all():
-        raise ValueError("a marker has no place")
-    if worn.bone_indices.dtype.kind != "i" or not _within(worn.bone_indices, 0, NUM_BONES - 1):
-        raise ValueError("a marker is on no bone")
-    if not _within(worn.bone_weights, 0.0, 1.0):
-        raise ValueError("a marker's weights are no shares")
 
 
 def _check(take: TrackedTake) -> None:

@@ -16,7 +16,7 @@ from track.bodies.body_file import SUFFIX as TOML
 from track.bodies.body_file import save_body
 from track.bodies.rigid_body import RigidTemplate
 from track.calibration.body_learning import learn_body
-from track.evaluation.take_summary import say
+from track.evaluation.take_summary import print_line
 
 
 def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
@@ -34,7 +34,7 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
     found = _held(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
     save_body(out, found)
     widest = 1e3 * np.max(found.distances)
-    say(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")
+    print_line(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")
 
 
 def _held(truth: Path) -> RigidTemplate:

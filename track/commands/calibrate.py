@@ -21,7 +21,7 @@ from handsim.hand.topology import Side
 from track.calibration.user_calibration import Calibration, calibrate_hands
 from track.capture_tracking import track
 from track.commands.user_options import BOTH, Size, users
-from track.evaluation.take_summary import say
+from track.evaluation.take_summary import print_line
 from track.tracker import Tracker
 from track.user import save_user
 from train.labelers.protocol import Labeler
@@ -67,11 +67,11 @@ def calibrate(
         known = [calibration.hand for calibration in done]
         take, done = _round(source, known, start, network)
     save_user(out, [one.hand for one in done], f"calibrated from {capture.name}, size {size} to begin with")
-    say(f"{out}: {len(done)} hands in glove {glove}, from {take.num_frames} frames")
+    print_line(f"{out}: {len(done)} hands in glove {glove}, from {take.num_frames} frames")
     for hand in start:
         report = [line for one in done if one.hand.side == hand.side for line in _tell(one)]
         for line in report or ["it is not in the capture and was left out"]:
-            say(f"{hand.side} hand: {line}")
+            print_line(f"{hand.side} hand: {line}")
 
 
 def _round(

@@ -18,7 +18,7 @@ from train.simulation.twins import KINDS, TwinConfig, simulate_twin
 
 if TYPE_CHECKING:
     from gloves.takes.take import Take
-    from track.evaluation.comparison import Measured
+    from track.evaluation.comparison import Measurement
 
 _PAPERS_GLOVE: Final = "dense19"
 _WITH_BODY: Final = "hand-controller"
@@ -97,7 +97,7 @@ REPRODUCE: Final = dict(sorted({**LABELING, "table5": table5, "table7": table7}.
 }
 
 
-def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], list[Measured]]:
+def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures of all kinds, and run all trackers over them."""
     twins: dict[str, TwinConfig] = {
         kind: TwinConfig(kind, config.num_frames, config.glove, seed=config.seed) for kind in KINDS
@@ -107,7 +107,7 @@ def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], 
 
 def _measure_on(
     twins: Mapping[str, TwinConfig], config: TableConfig, *, trials: int = 0
-) -> tuple[dict[str, Take], list[Measured]]:
+) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures, and run all trackers over them without their bodies, which most know nothing of."""
     from track.evaluation.comparison import USERS, compare_trackers, trackers
     from track.evaluation.trials import without_body
@@ -129,7 +129,7 @@ def _measure_on(
     return takes, measured
 
 
-def _measure_with_body(take: Take, config: TableConfig) -> list[Measured]:
+def _measure_with_body(take: Take, config: TableConfig) -> list[Measurement]:
     """Our tracker on the capture whose object has markers of its own, which it follows too."""
     from track.evaluation.comparison import USERS, measure_with_body
 
@@ -139,7 +139,7 @@ def _measure_with_body(take: Take, config: TableConfig) -> list[Measured]:
         return measure_with_body(_WITH_BODY, take, network, done=lambda: bar.advance(task))
 
 
-def _save(table: str, config: TableConfig, measured: list[Measured], **more: Any) -> None:
+def _save(table: str, config: TableConfig, measured: list[Measurement], **more: Any) -> None:
     if config.json is not None:
         records = [one.record() for one in measured]
         content = {"table": table, "glove": config.glove, "seed": config.seed, **more, "figures": records}

@@ -28,7 +28,7 @@ from track.bodies.rigid_body import RigidTemplate
 from track.capture_tracking import TakeRecorder, follow, warm_up
 from track.capture_tracking import track as track_capture
 from track.commands.user_options import BOTH, Size, calibrated_users, users
-from track.evaluation.take_summary import say, summary
+from track.evaluation.take_summary import print_line, summarize
 from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
@@ -104,9 +104,9 @@ def track(
     save_tracked_take(out, take)
     if labeled is not None:
         write_capture(labeled, labeled_points(take))
-    say(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
-    for line in (*summary(take), *notes, f"{1e3 * np.median(watch.spent):.2f} ms a frame"):
-        say(line)
+    print_line(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
+    for line in (*summarize(take), *notes, f"{1e3 * np.median(watch.spent):.2f} ms a frame"):
+        print_line(line)
 
 
 class Stopwatch(Tracker):

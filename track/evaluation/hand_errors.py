@@ -1,9 +1,10 @@
 """Errors of a calibrated hand in its glove, where the true hand is known.
 
-Markers do not determine all of a hand. The wrist's position in the palm is a convention, so palms are aligned by
-the digits' first joints before their markers are compared. A last bone ends in soft tissue that only contacts
-determine, so its length is reported apart from those between joints. Everything else is compared directly: a
-finger's marker in the frame of its bone, whose origin is the joint and whose x axis points to the next joint.
+Markers do not determine all of a hand. The wrist's position in the palm is a convention, so palms are aligned
+by the digits' first joints before their markers are compared. A last bone ends in soft tissue that only
+contacts determine, so its length is reported apart from those between joints. Everything else is compared
+directly: a finger's marker in the frame of its bone, whose origin is the joint and whose x axis points to the
+next joint.
 """
 
 from __future__ import annotations

@@ -234,7 +234,7 @@ def test_two_markers_and_a_ghost_that_turns_about_them_are_no_body(rng):
 @pytest.mark.parametrize(
     ("places", "words"),
     [
-        ([[0, 0, 0], [0.05, 0, 0]], "2 markers, expected at least 3 to tell a pose"),
+        ([[0, 0, 0], [0.05, 0, 0]], "2 markers, expected at least 3, which determine a pose"),
         ([[0, 0, 0], [0.05, 0, 0], [0.12, 0.001, 0]], "lie on one line"),
         ([[0, 0, 0], [0.05, 0, 0], [0.05, 0.004, 0]], "m1 and m2 are 4.0 mm apart, expected at least 6 mm"),
         ([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]], "look the same from two sides (m1 at m2, m2 at m1)"),
