@@ -1,7 +1,7 @@
 """The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
 
     OMP_NUM_THREADS=1 python benchmarks/tracking.py [calibrated drums starts speed memory]
-        [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recovery_times 100 --hour 432000]
+        [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
     calibrate` begins with the nearest of the five sizes, has the tracker label the capture, and writes their
@@ -156,7 +156,7 @@ def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
         waits: dict[str, list[np.ndarray]] = {"start": [], "recovery": []}
         for name, take in takes.items():
             rng = np.random.default_rng(arguments.seeds[0])
-            for what, trials in (("start", arguments.starts), ("recovery", arguments.recovery_times)):
+            for what, trials in (("start", arguments.starts), ("recovery", arguments.recoveries)):
                 wait, within = TRIALS[what]
                 count, known = -(-trials // len(takes)), hands(take)
                 waits[what].append(
@@ -228,7 +228,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="of every twin; the paper's number when not given")
     parser.add_argument("--free", type=float, default=40.0, help="free motion in a calibration capture [s]")
     parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--recovery_times", type=int, default=100)
+    parser.add_argument("--recoveries", type=int, default=100)
     parser.add_argument("--hour", type=int, default=432000, help="frames that memory is watched for")
     arguments = parser.parse_args()
     unknown = set(arguments.sections) - set(SECTIONS)

@@ -234,7 +234,7 @@ def _draw_pictures(out: Path, chain: _Chain, seed: int, status: Any) -> Section:
     tracker = load("track.tracker:Tracker")(
         load("track.evaluation.take_evaluation:true_users")(truth), chain.labeler
     )
-    tracked = load("track.capture_tracking:track")(capture, tracker)
+    tracked = load("track.capture_tracking:track_capture")(capture, tracker)
     off = []
     for hand in truth.hands:
         found = tracked.motion(hand.side).qpos

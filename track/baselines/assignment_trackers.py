@@ -164,9 +164,9 @@ class HungarianTracker(InitializedTracker):
             labels = _assign(points, self._marker_positions(predicted))
         hands = self._solve_poses(points, labels)
         for number, (hand, tracked, last) in enumerate(zip(self._hands, hands, before, strict=True)):
-            steady = last is not None and hand.qpos is not None and tracked.has_pose and span > 0.0
-            self._velocities[number] = velocity_of(last, hand.qpos, span) if steady else 0.0  # type:
-            ignore[arg - type]
+            self._velocities[number] = 0.0
+            if last is not None and hand.qpos is not None and tracked.has_pose and span > 0.0:
+                self._velocities[number] = velocity_of(last, hand.qpos, span)
         self._time = time
         return TrackedFrame(time, tuple(hands), labels, np.ones(len(points)))
 

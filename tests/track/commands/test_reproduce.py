@@ -141,10 +141,10 @@ def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     take = without_body(simulate_twin(TwinConfig(kind="single-hand", num_frames=FEWEST_FRAMES)))
     measured = compare_trackers({"single-hand": take}, load_labeler("dense19"), seed=0, trials=1)
     by_name = {one.method: one for one in measured}
-    assert by_name[OURS].locks[0] <= 3 and by_name[OURS].recovery_times[0] <= 3
+    assert by_name[OURS].initialization[0] <= 3 and by_name[OURS].recovery[0] <= 3
     for name in NEED_FIRST_LABELS:
-        assert not len(by_name[name].locks), "they are told how it begins"
-        assert np.isnan(by_name[name].recovery_times[0])
+        assert not len(by_name[name].initialization), "they are told how it begins"
+        assert np.isnan(by_name[name].recovery[0])
     ours = [by_name[OURS]]
     joints, _ = print_errors(ours)
     assert list(joints.columns[2].cells) == [f"{1e3 * ours[0].report.by_occlusion()[0, 0][1]:.2f}"]
