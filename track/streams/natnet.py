@@ -132,7 +132,7 @@ def parse_server_info(payload: bytes) -> ServerInfo:
 
 
 def pack_frame(frame: MarkerFrame, version: Version) -> bytes:
-    """A packet with the markers of a frame: those with IDs in the list of labeled ones, all in the older one."""
+    """A packet with the markers of a frame: those with IDs in the labeled list, all in the older one."""
     known = frame.ids >= 0
     markers = np.zeros(int(known.sum()), dtype=_MARKER)
     markers["id"], markers["position"] = frame.ids[known], frame.points[known]

@@ -127,7 +127,7 @@ class PointStream(Iterator[StreamedFrame]):
         """Send a keep-alive packet when it is due; returns how long to wait for a packet [s]."""
         now = time.monotonic()
         if now >= self._kept_alive + _KEEP_ALIVE:
-            _send(self._sockets[0], natnet.pack(Kind.KEEP_KEEP_ALIVE), self._address)
+            _send(self._sockets[0], natnet.pack(Kind.KEEP_ALIVE), self._address)
             if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
                 _send(self._sockets[0], natnet.pack_connect(), self._address)
             self._kept_alive = now

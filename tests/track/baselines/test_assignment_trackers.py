@@ -60,7 +60,7 @@ def test_the_first_frame_is_as_it_is_told(kind, take, users):
     seen = seen_frame(take, 0)
     wrong = np.roll(seen.labels, 1)
     assert np.array_equal(kind(users, wrong).step(seen.points, seen.ids, 0.0).labels, wrong)
-    with pytest.raises(ArgumentError, match="first_labels name 38 points, but the first frame has 37"):
+    with pytest.raises(ArgumentError, match="first_labels are of 38 points, but the first frame has 37"):
         kind(users, wrong).step(seen.points[1:], seen.ids[1:], 0.0)
     with pytest.raises(ArgumentError, match="first_labels go up to 38, expected less than 38"):
         kind(users, wrong + 1)
