@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -208,10 +208,10 @@ class BodyTracker:
         labels[usable] = frame.labels
         return dataclasses.replace(frame, labels=labels)
 
-    def _step(self, points: Any, ids: Any, time: float) -> BodyFrame:
+    def _step(self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float) -> BodyFrame:
         elapsed = time - self._time
         if self._status != Status.LOST:
-            frame = self._follow(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
+            frame = self._track(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
             if frame is not None:
                 return frame
             self._lose()
@@ -227,7 +227,9 @@ class BodyTracker:
         self._last_ids = np.full(len(self._positions), -1)  # IDs of the markers' points in the last frame
         self._candidate, self._confirmed = np.full(7, np.nan), 0
 
-    def _follow(self, points: Any, ids: Any, time: float, elapsed: float) -> BodyFrame | None:
+    def _track(
+        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
+    ) -> BodyFrame | None:
         """The body by the IDs of its points, or near its predicted pose."""
         pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
         count, rms = track_by_ids(
@@ -246,7 +248,7 @@ class BodyTracker:
                 return self._accept(Status.FOUND, other, spread, other_assignment, ids, time)
         return self._accept(Status.TRACKED, pose, rms, assignment, ids, time)
 
-    def _coast(self, points: Any, ids: Any, elapsed: float) -> BodyFrame | None:
+    def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
         """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
         if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
             return None
@@ -257,7 +259,9 @@ class BodyTracker:
         self._status = Status.COASTING
         return self._result(pose, rms, assignment, ids)
 
-    def _initialize(self, points: Any, ids: Any, time: float, elapsed: float) -> BodyFrame:
+    def _initialize(
+        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
+    ) -> BodyFrame:
         """The body near its predicted pose, or anywhere."""
         pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
@@ -287,7 +291,14 @@ class BodyTracker:
             return _FIRST_RADIUS + _MOST_SPEED * elapsed
         return _RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
 
-    def _match(self, points: Any, near: Any, radius: float, assignment: Any, pose: Any) -> tuple[int, float]:
+    def _match(
+        self,
+        points: NDArray[np.float64],
+        near: NDArray[np.float64] | None,
+        radius: float,
+        assignment: NDArray[np.int64],
+        pose: NDArray[np.float64],
+    ) -> tuple[int, float]:
         """The unique match of the markers within a radius of a pose.
 
         Args:
@@ -316,7 +327,13 @@ class BodyTracker:
         return fitted
 
     def _accept(
-        self, status: Status, pose: Any, rms: float, assignment: Any, ids: Any, time: float
+        self,
+        status: Status,
+        pose: NDArray[np.float64],
+        rms: float,
+        assignment: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        time: float,
     ) -> BodyFrame:
         """Update pose and velocity by a fit."""
         elapsed = time - self._time
@@ -330,7 +347,9 @@ class BodyTracker:
         self._most_markers = max(self._most_markers, int((assignment >= 0).sum()))
         return self._result(pose, rms, assignment, ids)
 
-    def _result(self, pose: Any, rms: float, assignment: Any, ids: Any) -> BodyFrame:
+    def _result(
+        self, pose: NDArray[np.float64], rms: float, assignment: NDArray[np.int64], ids: NDArray[np.int64]
+    ) -> BodyFrame:
         """The result of a fit; the IDs are kept for the next frame."""
         labels, transform = np.full(len(ids), -1), np.eye(4)
         write_labels(assignment, ids, labels, self._last_ids)

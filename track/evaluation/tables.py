@@ -73,7 +73,7 @@ def print_errors(measured: Sequence[Measurement]) -> tuple[Table, Table]:
     words = ["none", *(f"{low}-{high}" for low, high in bounds[1:-1]), f"{bounds[-1][0]} or more"]
     what = "by markers that a hand lacks"
     joints = _table(f"Mean distance of joints from the truth {what} [mm]", words)
-    angles = _table(f"Mean distance of hinges from the truth {what} [deg]", words)
+    angles = _table(f"Mean error of joint angles {what} [deg]", words)
     for head, row in _rows(measured):
         errors = [_mean_errors([one.report.by_occlusion()[bound] for one in row]) for bound in bounds]
         joints.add_row(*head, *(_length(joint) for joint, _ in errors))
@@ -83,7 +83,7 @@ def print_errors(measured: Sequence[Measurement]) -> tuple[Table, Table]:
 
 def print_times(measured: Sequence[Measurement]) -> Table:
     """Time per frame [ms], over all captures."""
-    table = _table("Time of a frame on this machine [ms]", ("median", "p99"))
+    table = _table("Time per frame on this machine [ms]", ("median", "p99"))
     for head, row in _rows(measured):
         seconds = np.concatenate([one.report.seconds for one in row])
         table.add_row(*head, *(f"{1e3 * np.quantile(seconds, q):.2f}" for q in (0.5, 0.99)))
@@ -92,8 +92,8 @@ def print_times(measured: Sequence[Measurement]) -> Table:
 
 def print_trials(measured: Sequence[Measurement]) -> Table:
     """Frames until all is right, at first and after a second without points, over all captures."""
-    columns = ("first: median", "p90", "in 1 s [%]", "dark: median", "p90", "in 1 s [%]")
-    table = _table("Frames until all is right, from random frames and after a second in the dark", columns)
+    columns = ("first: median", "p90", "in 1 s [%]", "hidden: median", "p90", "in 1 s [%]")
+    table = _table("Frames until all is right, from random frames and after a second without points", columns)
     for (method, users), row in _rows(measured):
         waits = [
             np.concatenate([one.initialization for one in row]),

@@ -23,7 +23,7 @@ def summarize(take: TrackedTake) -> list[str]:
             missing = take.filled[:, number].mean(axis=1)[status != LOST].mean()
             line += f"; {_median_rms(rms)}, {100 * missing:.1f} % of markers filled in"
         else:
-            line += "; it was never found: --hands says which hands there are"
+            line += "; it was never found; --hands selects the hands"
         lines.append(line)
     for number, body in enumerate(take.bodies):
         rms = take.body_rms[:, number]
@@ -31,7 +31,7 @@ def summarize(take: TrackedTake) -> list[str]:
         lines.append(f"{body.name}: {_status_shares(take.body_status[:, number])}; {words}")
     there = np.isfinite(take.points[..., 0])
     unlabeled = int((there & (take.labels < 0)).sum())
-    return [*lines, f"{unlabeled} of {int(there.sum())} points are no markers"]
+    return [*lines, f"{unlabeled} of {int(there.sum())} points are not markers"]
 
 
 def _status_shares(status: Int[np.ndarray, "T"]) -> str:
