@@ -106,9 +106,9 @@ class PaperTracker:
                     hand.qpos
                 )
         positions[labels[labels >= 0]] = np.inf
-        labels_found = np.full(len(points), -1)
-        labels_found[free] = label_by_proximity(points[free], positions, GATE)
-        return labels_found
+        proposed = np.full(len(points), -1)
+        proposed[free] = label_by_proximity(points[free], positions, GATE)
+        return proposed
 
     def _track(
         self,
