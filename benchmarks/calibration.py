@@ -40,9 +40,9 @@ from handsim.hand.shape import SIZES, HandShape, sample_shape, shape_from_measur
 from handsim.hand.topology import BONES, SIDES
 from handsim.space.transforms import quaternion_matrix
 from poses.shapes.touch import FINGERS, is_touching, thumb_contact
-from track.calibration.contacts import meet, place_contacts
+from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.picture import save_picture
-from track.calibration.skin_walk import SkinPatch, slip
+from track.calibration.skin_coordinates import SkinPatch, displace_markers
 from track.calibration.user_calibration import calibrate
 from track.evaluation.hand_errors import hand_errors
 from track.kinematics.pose_solver import PoseSolver
@@ -77,7 +77,7 @@ def draw_user(
     grown = 1 if number % 4 < 2 else -1
     shape = draw_shape(sizes[index], 1.0 + OFF * grown, rng)
     model = HandModel(shape)
-    worn = slip(attach_markers(layout, model), shape, SLIP, LIFT, rng=rng)
+    worn = displace_markers(attach_markers(layout, model), shape, SLIP, LIFT, rng=rng)
     starts = (nominal_fit(layout, size, side) for size in (sizes[index], sizes[index - grown]))
     return GloveFit(model, worn).with_side(side), *starts
 
@@ -128,22 +128,22 @@ def skin_gaps(model: HandModel, qpos: np.ndarray, finger: str) -> np.ndarray:
     """Distance [m] of the skins of thumb and finger; angles alone decide, so right hands will do."""
     model = HandModel(model.shape.with_side("right"))
     bones = model.forward_kinematics(join_qpos(qpos[:, 7:]))
-    contacts = place_contacts(model, [(frame, finger) for frame in range(len(qpos))], bones)
-    faces = np.concatenate([contacts.thumb_places.faces, contacts.finger_places.faces])
-    return meet(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
+    contacts = initialize_contacts(model, [(frame, finger) for frame in range(len(qpos))], bones)
+    faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])
+    return contact_geometry(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
 
 
 def tell(name: str, hand: GloveFit, true: GloveFit, held_out: Take) -> list[float]:
     """Print how far a hand is from the truth; returns what is averaged over users."""
     errors, gaps = hand_errors(hand, true), 1e3 * held_out_gaps(hand, true, held_out)
-    places, lengths = 1e3 * errors.places, 100.0 * np.abs(errors.lengths)
+    off, lengths = 1e3 * errors.positions, 100.0 * np.abs(errors.lengths)
     tips = 100.0 * np.abs(errors.tips)
     flesh = " ".join(f"{gap:.2f}" for gap in gaps[:, 0])
-    print(f"  {name}: places {places.mean():.2f} mm (worst {places.max():.2f}; palm's in the wrist's frame: "
-          f"{1e3 * errors.wrist_places.mean():.2f}), bones {lengths.mean():.2f} % "
+    print(f"  {name}: places {off.mean():.2f} mm (worst {off.max():.2f}; palm's in the wrist's frame: "
+          f"{1e3 * errors.wrist_positions.mean():.2f}), bones {lengths.mean():.2f} % "
           f"(worst {lengths.max():.1f}), tips {tips.mean():.1f} %, touches off by {flesh} mm, "
           f"skins by {np.nanmean(gaps[:, 1]):.2f}")  # fmt: skip
-    return [places.mean(), places.max(), 1e3 * errors.wrist_places.mean(), lengths.mean(), lengths.max(),
+    return [off.mean(), off.max(), 1e3 * errors.wrist_positions.mean(), lengths.mean(), lengths.max(),
             tips.mean(), *np.nanmean(gaps, axis=0), np.nanmax(gaps[:, 0])]  # fmt: skip
 
 
@@ -168,11 +168,11 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
         began = time.perf_counter()
         result = calibrate(seen, begin, take.rate)
         took = time.perf_counter() - began
-        within = (1e3 * hand_errors(result.hand, true).wrist_places < 2e3 * result.place_errors).mean()
+        within = (1e3 * hand_errors(result.hand, true).wrist_positions < 2e3 * result.position_errors).mean()
         rows[name] = tell(name, result.hand, true, held_out)
         print(f"    {took:.1f} s, markers off by {1e3 * result.rms_before:.2f} mm, then "
               f"{1e3 * result.rms_after:.2f}; {len(result.touches)} touches found; {within:.0%} of places "
-              f"within two standard errors; {' / '.join(result.advice()) or 'no advice'}",
+              f"within two standard errors; {' / '.join(result.suggestions()) or 'no advice'}",
               flush=True)  # fmt: skip
         if arguments.picture and number == 0 and name == "after":
             save_picture(arguments.picture, result)

@@ -44,11 +44,11 @@ from track.evaluation.take_evaluation import (
     TrackingReport,
     evaluate_tracker,
     nearest_size,
+    nominal_users,
     seen_frame,
     true_users,
-    usual_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, first_locks, recoveries, without_body
+from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times, without_body
 from track.tracker import Tracker
 from track.user import load_user
 from train.labelers.protocol import Labeler
@@ -56,12 +56,12 @@ from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 from train.simulation.twins import KINDS, Kind, TwinConfig, simulate_twin
 
-TRIALS = {"start": (first_locks, 3), "recovery": (recoveries, 5)}
+TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
 WARM_UP = 30  # frames
 FINDINGS = 25  # frames in which hands are looked for
 EVERY = 36000  # frames between two looks at the memory: five minutes
-HANDS = {"true": true_users, "uncalibrated": usual_users}
+HANDS = {"true": true_users, "uncalibrated": nominal_users}
 
 
 @cache
@@ -122,7 +122,7 @@ def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
         for one, true in zip(found, true_users(take), strict=True):
             errors = hand_errors(one, true)
             print(
-                f"    {one.side}: places {1e3 * errors.places.mean():.2f} mm, bones "
+                f"    {one.side}: places {1e3 * errors.positions.mean():.2f} mm, bones "
                 f"{100 * np.abs(errors.lengths).mean():.2f} %, tips {100 * np.abs(errors.tips).mean():.1f} %"
             )
         print(f"    calibration capture, its labels and the calibration took {took:.0f} s")
@@ -241,7 +241,7 @@ def main() -> None:
         for kind in arguments.kinds
     }
     for take in takes.values():
-        warm_up(usual_users(take), labeler())
+        warm_up(nominal_users(take), labeler())
     for section in arguments.sections or SECTIONS:
         if section == "starts" and min(take.num_frames for take in takes.values()) < FEWEST_FRAMES:
             parser.error(f"starts needs {FEWEST_FRAMES} frames of every twin")

@@ -16,7 +16,7 @@ from gloves.layout import load_layout
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import TrackedTake
 from handsim.hand.model import HandModel
-from track.capture_tracking import track
+from track.capture_tracking import track_capture
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 from train.simulation.twins import TwinConfig, simulate_twin
@@ -44,7 +44,7 @@ def main() -> None:
     known = [hand.fit for hand in truth.hands]
     usual = [nominal_fit(load_layout("dense19"), "M", hand.side) for hand in truth.hands]
     for name, hands in (("known hands", known), ("hands of size M", usual)):
-        tell(name, track(capture, Tracker(hands, labeler)), truth)
+        tell(name, track_capture(capture, Tracker(hands, labeler)), truth)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from render.cameras.viewpoints import ViewConfig
 from render.formats.png_depth import read_depth
 from render.keypoints import hand_keypoints
 from render.session import RenderConfig, render_take
-from track.capture_tracking import track
+from track.capture_tracking import track_capture
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 from train.simulation.twins import TwinConfig, simulate_twin
@@ -36,7 +36,8 @@ def main() -> None:
     config = RenderConfig(view=ViewConfig("orbit"), passes=("rgb", "depth"), every=20, seed=1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        save_tracked_take(folder / "tracked.npz", track(capture, Tracker(hands, load_labeler("dense19"))))
+        tracked = track_capture(capture, Tracker(hands, load_labeler("dense19")))
+        save_tracked_take(folder / "tracked.npz", tracked)
         count = render_take(folder / "tracked.npz", folder / "pictures", ["coco"], config, workers=1)
         coco = json.loads((folder / "pictures" / "annotations.json").read_text())
         print(f"{count} pictures, {len(coco['annotations'])} hands")

@@ -13,13 +13,15 @@ from handsim.errors import ArgumentError, LayoutError
 from handsim.hand.mjcf import Site
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import HandSurface, vertex_normals
-from handsim.hand.topology import BONE_NAMES, PALM
+from handsim.hand.topology import BONE_NAMES, NUM_BONES, PALM
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
 _MOST_FITTINGS: Final = 20
+_WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
+_SUM_TOLERANCE: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,22 +43,19 @@ class Attachment:
     """Their shares, summing to one."""
 
     def __post_init__(self) -> None:
-        count = self.layout.num_markers
-        for name, width in (("points", 3), ("normals", 3), ("bone_indices", 4), ("bone_weights", 4)):
-            array = getattr(self, name)
-            if array.shape != (count, width):
-                raise ArgumentError(
-                    f"{name} has shape {array.shape}, expected ({count}, {width}) for this layout"
-                )
-        if not np.isfinite(self.points).all() or not np.isfinite(self.normals).all():
-            raise ArgumentError("points or normals hold NaN or infinite values, expected finite numbers")
+        for name, width in _WIDTHS.items():
+            shape, expected = getattr(self, name).shape, (self.layout.num_markers, width)
+            if shape != expected:
+                raise ArgumentError(f"{name} has shape {shape}, expected {expected}")
+            if not np.isfinite(getattr(self, name)).all():
+                raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
         bones, shares = self.bone_indices, self.bone_weights
-        if bones.dtype.kind != "i" or bones.min() < 0 or bones.max() >= len(BONE_NAMES):
+        if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
             raise ArgumentError(
-                f"bone_indices holds {bones.min()} to {bones.max()}, expected 0 to {len(BONE_NAMES) - 1}"
+                f"bone_indices are no bones, expected whole numbers from 0 to {NUM_BONES - 1}"
             )
-        if not (shares.min() >= 0.0 and shares.max() <= 1.0 + 1e-9):
-            raise ArgumentError(f"bone_weights holds {shares.min():g} to {shares.max():g}, expected 0 to 1")
+        if not ((shares >= 0.0).all() and (np.abs(shares.sum(axis=1) - 1.0) <= _SUM_TOLERANCE).all()):
+            raise ArgumentError("bone_weights are not shares, expected positive numbers that sum to one")
 
     @property
     def main_bones(self) -> Int[np.ndarray, "M"]:

@@ -13,7 +13,7 @@ from render.cameras.viewpoints import ViewConfig
 from render.keypoints import hand_keypoints
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
-from track.capture_tracking import track
+from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.commands.simulate import simulate
@@ -37,7 +37,7 @@ def tracked(truth):
     """Tracked from the file of points alone."""
     take, folder = truth
     capture = read_capture(folder / "take.c3d")
-    result = track(capture, Tracker(true_users(take), load_labeler("dense19")))
+    result = track_capture(capture, Tracker(true_users(take), load_labeler("dense19")))
     save_tracked_take(folder / "tracked.npz", result)
     return load_tracked_take(folder / "tracked.npz"), folder
 

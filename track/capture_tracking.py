@@ -1,8 +1,8 @@
-"""A tracker led through a capture or a live stream, frame by frame, and what comes of it as a take.
+"""Tracking of a whole capture or stream, frame by frame, and its result as a tracked take.
 
-Files say nothing of IDs. Every format that is read (.trc, .c3d, Motive's .csv) keeps a trajectory a column,
-so a column is an ID for as long as it has a point; after a gap it is another one, because columns of
-unlabeled points may go on with somebody else. Column names are not used.
+Marker files have no IDs. Every format that is read (.trc, .c3d, Motive's .csv) has one column per trajectory,
+so a column is an ID for as long as it has a point. After a gap it is a new ID, because a column of
+unlabeled points may continue with another marker. Column names are not used.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 
     Progress = Callable[[int, int], None]
 
-_RESTART: Final = 0.01
-"""Time between the last frame of a recording and its first, when it begins anew [s]."""
-_APART: Final = 0.5  # [m] between hands that are tried out
+_LOOP_GAP: Final = 0.01
+"""Time between the last frame of a recording and its first, when it starts again [s]."""
+_HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
-def track(capture: Capture, tracker: Tracker, *, progress: Progress | None = None) -> TrackedTake:
-    """Lead a tracker through a capture.
+def track_capture(capture: Capture, tracker: Tracker, *, progress: Progress | None = None) -> TrackedTake:
+    """Track a capture.
 
     Args:
-        capture: What was seen; its names are not used.
-        tracker: A tracker that has seen nothing yet.
-        progress: Called after each frame with how many are done and how many there are.
+        capture: The capture; its marker names are not used.
+        tracker: A tracker that has not seen a frame.
+        progress: Called after each frame with the number of tracked frames and of all frames.
 
     Raises:
         ArgumentError: The capture is not in meters.
@@ -50,7 +50,7 @@ def track(capture: Capture, tracker: Tracker, *, progress: Progress | None = Non
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
     recorder = TakeRecorder(tracker)
-    for frame, tracked in follow(frames, tracker):
+    for frame, tracked in track_stream(frames, tracker):
         recorder.add(frame, tracked)
         if progress is not None:
             progress(recorder.num_frames, len(frames))
@@ -58,21 +58,27 @@ def track(capture: Capture, tracker: Tracker, *, progress: Progress | None = Non
 
 
 def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
-    """The frames of a capture as a stream would bring them."""
-    there = np.isfinite(capture.positions[..., 0])
-    ids = number_runs(there)
-    for number, (points, seen) in enumerate(zip(capture.positions, there, strict=True)):
+    """The frames of a capture as of a stream: points [m], IDs and times [s]."""
+    present = np.isfinite(capture.positions[..., 0])
+    ids = number_runs(present)
+    for number, (points, seen) in enumerate(zip(capture.positions, present, strict=True)):
         yield StreamedFrame(number, number / capture.rate, points[seen], ids[number, seen])
 
 
-def follow(frames: Iterable[StreamedFrame], tracker: Tracker) -> Iterator[tuple[StreamedFrame, TrackedFrame]]:
-    """Lead a tracker through frames as they come, live ones too.
+def track_stream(
+    frames: Iterable[StreamedFrame], tracker: Tracker
+) -> Iterator[tuple[StreamedFrame, TrackedFrame]]:
+    """Track frames as they arrive, also from a live stream.
 
-    After a silence of a stream the tracker is told that there are no points, at the time that has gone by
-    since. A stream whose time runs back, as that of a recording which begins anew, goes on where it was.
+    During a silence of the stream the tracker gets frames without points, at the time that has passed. When
+    the stream's time runs back, as in a recording that starts again, the tracker's time continues.
+
+    Args:
+        frames: Frames in order of arrival.
+        tracker: The tracker.
 
     Yields:
-        Each frame, with the time that the tracker was told, and what the tracker made of it.
+        Each frame with the tracker's time, and the tracked frame.
     """
     ahead, last = 0.0, -np.inf
     heard = time.monotonic()
@@ -83,47 +89,53 @@ def follow(frames: Iterable[StreamedFrame], tracker: Tracker) -> Iterator[tuple[
         else:
             heard = time.monotonic()
             if now <= last:
-                ahead += last - now + _RESTART
-                now = last + _RESTART
+                ahead += last - now + _LOOP_GAP
+                now = last + _LOOP_GAP
             last = now
-        told = StreamedFrame(frame.number, now, frame.points, frame.ids, frame.silent)
-        yield told, tracker.step(frame.points, frame.ids, now)
+        timed = StreamedFrame(frame.number, now, frame.points, frame.ids, frame.silent)
+        yield timed, tracker.step(frame.points, frame.ids, now)
 
 
 def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
-    """Make ready what a tracker needs: on a machine's first run its kernels are compiled, for half a minute.
+    """Load the tracker's kernels, which the first run on a machine compiles for half a minute.
 
-    Without it the first frames of a stream would wait for that.
+    Otherwise the first frames of a stream would have to wait.
+
+    Args:
+        hands: The user's hands.
+        labeler: Labeler of their glove.
     """
     tracker = Tracker(hands, labeler)
     qpos = np.zeros((len(hands), NUM_QPOS))
-    qpos[:, 0], qpos[:, 3] = _APART * np.arange(len(hands)), 1.0
+    qpos[:, 0], qpos[:, 3] = _HAND_SPACING * np.arange(len(hands)), 1.0
     points = np.concatenate(
         [
             hand.attachment.centers(hand.model, hand.model.forward_kinematics(row[None]))[0]
             for hand, row in zip(hands, qpos, strict=True)
         ]
     )
-    for number in range(3):  # found, followed, and named anew
+    for number in range(3):  # initialized, tracked, and labeled again
         ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
         tracker.step(points, ids, 0.01 * number)
 
 
 class TakeRecorder:
-    """Keeps what a tracker said, frame by frame; `take` may be asked for at any time.
+    """Records tracked frames; `take` gives the take so far at any time.
 
     Args:
-        tracker: Whose hands and bodies these are.
+        tracker: The tracker, for its hands and bodies.
     """
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
-        self._bodies = tuple(MarkedBody(body.name, body.marker_names, body.places) for body in tracker.bodies)
+        self._bodies = tuple(
+            MarkedBody(body.name, body.marker_names, body.positions) for body in tracker.bodies
+        )
         self._frames: list[tuple[StreamedFrame, TrackedFrame]] = []
 
     @property
     def num_frames(self) -> int:
-        """How many frames there are by now."""
+        """Number of recorded frames."""
         return len(self._frames)
 
     @property
@@ -132,19 +144,19 @@ class TakeRecorder:
         return self._frames[-1][0].time - self._frames[0][0].time if self._frames else 0.0
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Keep a frame; a silence is none."""
+        """Record a frame, unless it stands for a silence of the stream."""
         if not frame.silent:
             self._frames.append((frame, tracked))
 
     def take(self, capture: Capture | None = None) -> TrackedTake:
-        """What there is so far.
+        """The tracked take so far.
 
         Args:
-            capture: Whose frames these are: its columns are kept. A stream has none, and its rate is the
-                usual one.
+            capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
+                rate is the median one.
 
         Raises:
-            CaptureError: There are too few frames to tell the rate of a stream.
+            CaptureError: There are too few frames to determine the rate of a stream.
         """
         frames = [frame for frame, _ in self._frames]
         tracked = [one for _, one in self._frames]
@@ -152,14 +164,14 @@ class TakeRecorder:
             raise CaptureError(f"{len(frames)} frames came, expected two or more")
         times = np.array([frame.time for frame in frames])
         counts = np.array([len(frame.points) for frame in frames])
-        there = np.arange(counts.max(initial=0)) < counts[:, None]
+        present = np.arange(counts.max(initial=0)) < counts[:, None]
         if capture is not None:
-            there = np.isfinite(capture.positions[: len(frames), :, 0])
+            present = np.isfinite(capture.positions[: len(frames), :, 0])
         hands = [one.hands for one in tracked]
         filled = np.zeros((len(frames), len(self._hands), hands[0][0].markers.shape[0]), dtype=bool)
         for number, row in enumerate(hands):
-            for place, hand in enumerate(row):
-                filled[number, place, hand.filled] = True
+            for index, hand in enumerate(row):
+                filled[number, index, hand.filled] = True
         return TrackedTake(
             rate=1.0 / float(np.median(np.diff(times))) if capture is None else capture.rate,
             times=times,
@@ -169,10 +181,10 @@ class TakeRecorder:
             rms=np.array([[hand.rms for hand in row] for row in hands]),
             markers=np.array([[hand.markers for hand in row] for row in hands]),
             filled=filled,
-            points=_spread(there, [frame.points for frame in frames], np.nan),
-            ids=_spread(there, [frame.ids for frame in frames], -1).astype(np.int32),
-            labels=_spread(there, [one.labels for one in tracked], -1).astype(np.int16),
-            confidence=_spread(there, [one.confidence for one in tracked], np.nan),
+            points=_spread(present, [frame.points for frame in frames], np.nan),
+            ids=_spread(present, [frame.ids for frame in frames], -1).astype(np.int32),
+            labels=_spread(present, [one.labels for one in tracked], -1).astype(np.int16),
+            confidence=_spread(present, [one.confidence for one in tracked], np.nan),
             **self._body_tracks(tracked),
             settings={},
         )
@@ -182,15 +194,15 @@ class TakeRecorder:
         poses, rms = np.full((*shape, 7), np.nan), np.full(shape, np.nan)
         status = np.full(shape, LOST, dtype=np.int8)
         for number, frame in enumerate(tracked):
-            for place, body in enumerate(frame.bodies):
-                poses[number, place] = np.concatenate([body.translation, body.rotation])
-                status[number, place], rms[number, place] = _NUMBERS[body.status], body.rms
+            for index, body in enumerate(frame.bodies):
+                poses[number, index] = np.concatenate([body.translation, body.rotation])
+                status[number, index], rms[number, index] = _NUMBERS[body.status], body.rms
         return {"bodies": self._bodies, "body_poses": poses, "body_status": status, "body_rms": rms}
 
 
-def _spread(there: Bool[np.ndarray, "T N"], rows: list[NDArray[Any]], missing: float) -> NDArray[Any]:
-    """Values of the points of all frames, each in its column."""
+def _spread(present: Bool[np.ndarray, "T N"], rows: list[NDArray[Any]], missing: float) -> NDArray[Any]:
+    """A table (T, N, ...) of the values of all frames' points, each in its column; `missing` elsewhere."""
     values = np.concatenate(rows)
-    table = np.full(there.shape + values.shape[1:], missing, dtype=values.dtype)
-    table[there] = values
+    table = np.full(present.shape + values.shape[1:], missing, dtype=values.dtype)
+    table[present] = values
     return table

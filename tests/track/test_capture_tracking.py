@@ -23,7 +23,7 @@ from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import TakeRecorder, capture_frames, follow, track
+from track.capture_tracking import TakeRecorder, capture_frames, track_capture, track_stream
 from track.streams.natnet_server import ReplayServer
 from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import Status
@@ -56,7 +56,7 @@ def capture(truth) -> Capture:
 
 @pytest.fixture(scope="module")
 def tracked(capture, user, labeler) -> TrackedTake:
-    return track(capture, Tracker(user, labeler))
+    return track_capture(capture, Tracker(user, labeler))
 
 
 def mostly_right(take: TrackedTake, labels: np.ndarray, last: int) -> bool:
@@ -92,7 +92,7 @@ def test_a_capture_is_tracked_as_its_truth_says(tracked, truth, user, tmp_path):
 def test_file_formats_change_nothing(suffix, tracked, capture, user, labeler, tmp_path):
     path = tmp_path / f"take{suffix}"
     write_capture(path, capture)
-    again = track(read_capture(path), Tracker(user, labeler))
+    again = track_capture(read_capture(path), Tracker(user, labeler))
     np.testing.assert_array_equal(again.labels, tracked.labels)
     np.testing.assert_allclose(again.qpos, tracked.qpos, atol=1e-4)
 
@@ -109,31 +109,31 @@ def test_a_column_is_an_id_until_its_point_is_lost(capture):
 def test_progress_is_told_frame_by_frame(capture, user, labeler):
     short = Capture(capture.names, capture.positions[:5], capture.rate)
     told = []
-    track(short, Tracker(user, labeler), progress=lambda *done: told.append(done))
+    track_capture(short, Tracker(user, labeler), progress=lambda *done: told.append(done))
     assert told == [(n, 5) for n in range(1, 6)]
 
 
 def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler, rng):
     positions = np.full((4, 3, 3), np.nan)
     positions[2] = rng.normal(size=(3, 3))
-    take = track(Capture(("a", "b", "c"), positions, 120.0), Tracker(user, labeler))
+    take = track_capture(Capture(("a", "b", "c"), positions, 120.0), Tracker(user, labeler))
     assert (take.status == LOST).all() and (take.labels == -1).all()
     assert np.isnan(take.qpos).all() and np.isnan(take.markers).all()
-    nothing = track(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), Tracker(user, labeler))
+    nothing = track_capture(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), Tracker(user, labeler))
     assert nothing.num_frames == 2
 
 
 def test_millimeters_are_told(capture, user, labeler):
     large = Capture(capture.names, 1e3 * capture.positions, capture.rate)
     with pytest.raises(ArgumentError, match="millimeters"):
-        track(large, Tracker(user, labeler))
+        track_capture(large, Tracker(user, labeler))
 
 
 def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
     tracker = Tracker(user, labeler)
     recorder = TakeRecorder(tracker)
     with ReplayServer.of_take(truth) as server, open_stream(server.url, silence=0.4) as stream:
-        for frame, one in follow(stream, tracker):
+        for frame, one in track_stream(stream, tracker):
             recorder.add(frame, one)
             if frame.silent:
                 break
@@ -162,7 +162,7 @@ def test_time_goes_on_when_a_recording_begins_anew():
         return StreamedFrame(0, time, np.zeros((0, 3)), np.zeros(0, dtype=int))
 
     frames = map(frame, [5.0, 5.1, 5.2, 0.1, 0.2, 0.1])
-    times = [told for _, told in follow(frames, Echo())]
+    times = [told for _, told in track_stream(frames, Echo())]
     np.testing.assert_allclose(times, [5.0, 5.1, 5.2, 5.21, 5.31, 5.32])
 
 
@@ -171,7 +171,7 @@ def test_too_few_frames_have_no_rate(user, capture, labeler):
     recorder = TakeRecorder(tracker)
     with pytest.raises(CaptureError, match="0 frames came, expected two or more"):
         recorder.take()
-    for frame, one in itertools.islice(follow(capture_frames(capture), tracker), 2):
+    for frame, one in itertools.islice(track_stream(capture_frames(capture), tracker), 2):
         recorder.add(frame, one)
         if recorder.num_frames == 1:
             with pytest.raises(CaptureError, match="1 frames came"):
@@ -185,7 +185,7 @@ def test_bodies_are_kept_beside_the_hands(user, labeler, capture, truth):
     first = truth.hand_labels[-1].stop
     positions[:2][truth.labels[:2] >= first] = np.nan
     part = Capture(capture.names, positions, capture.rate)
-    take = track(part, Tracker(user, labeler, (thing,)))
+    take = track_capture(part, Tracker(user, labeler, (thing,)))
     names = [STATUSES[status] for status in take.body_status[:, 0]]
     assert names == ["lost"] * 2 + ["found"] + ["tracked"] * (FRAMES - 3)
     assert np.isnan(take.body_poses[:2]).all() and np.isnan(take.body_rms[:2]).all()

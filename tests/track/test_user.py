@@ -10,7 +10,7 @@ import pytest
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
-from handsim.errors import HandSimError
+from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
@@ -43,11 +43,11 @@ def test_hands_come_back_exactly(hands, tmp_path):
 
 
 def test_what_cannot_be_saved_is_told(hands, tmp_path):
-    with pytest.raises(UserError, match="expected a left hand, a right hand, or one of each"):
+    with pytest.raises(ArgumentError, match="expected a left hand, a right hand, or one of each"):
         save_user(tmp_path / "user.json", (hands[0], hands[0]))
-    with pytest.raises(UserError, match="expected a left hand"):
+    with pytest.raises(ArgumentError, match="expected a left hand"):
         save_user(tmp_path / "user.json", ())
-    with pytest.raises(UserError, match="different gloves"):
+    with pytest.raises(ArgumentError, match="different gloves"):
         save_user(tmp_path / "user.json", (hands[0], nominal_fit(load_layout("sparse13"), "M", "right")))
     with pytest.raises(UserError, match="cannot be written"):
         save_user(tmp_path, hands)

@@ -17,7 +17,7 @@ from render.cameras.viewpoints import ViewConfig
 from render.keypoints import hand_keypoints
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
-from track.capture_tracking import track
+from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.data.shards import Dataset
@@ -107,7 +107,7 @@ def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)
     tracker = Tracker(true_users(truth), load_labeler(run / "run"))
-    save_tracked_take(run / "tracked.npz", track(capture, tracker))
+    save_tracked_take(run / "tracked.npz", track_capture(capture, tracker))
     shown, true = load_shown_take(run / "tracked.npz"), load_shown_take(run / "one.truth.npz").hands[0]
     mine = shown.hands[0].qpos
     there = np.isfinite(mine[:, 0])

@@ -1,4 +1,4 @@
-"""Points cut into clusters that may be a hand each (Han et al. 2018, section 4.2)."""
+"""Clusters of points that may be one hand each (Han et al. 2018, section 4.2)."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-REACH: Final = 0.2
-"""Distance between the centers of two clusters that are joined, at most [m]."""
+RADIUS: Final = 0.2
+"""Largest distance between the centers of two clusters that are joined [m]."""
 
 
 def cluster_points(
-    points: Float[np.ndarray, "N 3"], *, most: int, reach: float = REACH
+    points: Float[np.ndarray, "N 3"], *, most: int, radius: float = RADIUS
 ) -> list[Int[np.ndarray, "K"]]:
-    """Join single points and then clusters, those with the nearest centers first.
+    """Agglomerative clustering: join the two clusters with the nearest centers, starting from single points.
 
     Args:
         points: Points of a frame [m].
-        most: Points of a cluster, at most; the paper has 22.
-        reach: Distance of centers that are joined, at most [m].
+        most: Largest number of points in a cluster; 22 in the paper.
+        radius: Largest distance of centers that are joined [m].
 
     Returns:
-        Places of each cluster's points, in order of the first of them.
+        Indices of each cluster's points, in order of the first of them.
     """
-    centers, members = points.copy(), [np.array([place]) for place in range(len(points))]
+    centers, members = points.copy(), [np.array([index]) for index in range(len(points))]
     sizes = np.ones(len(points))
-    apart = np.linalg.norm(centers[:, None] - centers, axis=-1)
-    np.fill_diagonal(apart, np.inf)
+    distances = np.linalg.norm(centers[:, None] - centers, axis=-1)
+    np.fill_diagonal(distances, np.inf)
     while len(points) > 1:
-        allowed = np.where(sizes[:, None] + sizes <= most, apart, np.inf)
+        allowed = np.where(sizes[:, None] + sizes <= most, distances, np.inf)
         one, other = np.sort(np.unravel_index(allowed.argmin(), allowed.shape))
-        if not allowed[one, other] <= reach:
+        if not allowed[one, other] <= radius:
             break
         members[one] = np.concatenate([members[one], members[other]])
         members[other] = members[other][:0]
         centers[one] = points[members[one]].mean(axis=0)
         sizes[one], sizes[other] = len(members[one]), np.inf
-        apart[one] = apart[:, one] = np.linalg.norm(centers - centers[one], axis=-1)
-        apart[one, one] = apart[other] = apart[:, other] = np.inf
+        distances[one] = distances[:, one] = np.linalg.norm(centers - centers[one], axis=-1)
+        distances[one, one] = distances[other] = distances[:, other] = np.inf
     return [np.sort(group) for group in members if len(group)]

@@ -1,23 +1,23 @@
-"""The tracking loop of Han et al. 2018, section 4, as it is written: what ours is compared with.
+"""The tracking loop of Han et al. 2018, section 4, as it is written: the baseline for our tracker.
 
-Where the paper is silent:
+Where the paper gives no details:
 
-- Its numbers are for 19 markers: clusters of at most 22 points, of which 14 to 21 are a hand. Another glove
-  has its number of markers plus 3, minus 5 and plus 2.
-- More clusters than hands, or fewer: hands and clusters are paired at random, the rest go without. A cluster
-  is looked for among the points that no tracked hand has.
-- Markers are named anew in a frame in which a hand lacks a marker and a point without a name is there whose
-  ID was not there in the frame before.
-- The expected location of a missing marker is where the pose of the frame before has it, without any speed.
-  Pairs closer than 15 mm are made nearest first, over all hands at once.
-- The labeler is asked about the hand's points and the points without a name within 200 mm of their center,
-  the nearest first, 22 in all: the bounds of the clusters.
-- Of proposals with as many labeled markers the one with the least RMS distance wins.
-- A hand whose proposals all fail has no pose in this frame, its names are forgotten, and it is looked for
-  from the next frame on. Four named points make a pose.
-- The pose solver and the labeler are ours. The solver draws hinges that markers leave open weakly to rest,
-  and without a pose to start from tries several; the labeler does not tell left from right, so that only the
-  RMS distance does.
+- Its numbers are for 19 markers: clusters of at most 22 points, of which 14 to 21 are a hand. For another
+  glove these are its number of markers plus 3, minus 5 and plus 2.
+- If there are more clusters than hands, or fewer, hands and clusters are paired at random and the rest stay
+  without. Clusters are formed of the points that no tracked hand has.
+- Labels are assigned again in a frame in which a hand lacks a marker and an unlabeled point has an ID that
+  was not there in the previous frame.
+- The expected position of a missing marker is that of the previous pose, without velocity. Pairs closer than
+  15 mm are made nearest first, over all hands at once.
+- The labeler is queried with the hand's points and the unlabeled points within 200 mm of their center, the
+  nearest first, 22 in all: the bounds of the clusters.
+- Of proposals with the same number of labeled markers, the one with the least RMS distance wins.
+- A hand whose proposals all fail has no pose in this frame, its labels are dropped, and it is initialized
+  again from the next frame on. Four labeled points determine a pose.
+- The pose solver and the labeler are ours. The solver draws joint angles that markers leave open weakly to
+  rest and, without a pose to start from, tries several; the labeler does not tell left from right, so only
+  the RMS distance does.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.fit import GloveFit
-from track.baselines.clustering import REACH, cluster_points
+from track.baselines.clustering import RADIUS, cluster_points
 from track.baselines.plain_hand import MOST_RMS, PlainHand
-from track.baselines.proposals import cloud_of, name_by_proximity
+from track.baselines.proposals import label_by_proximity, labeler_cloud
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
 
@@ -39,134 +39,136 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 GATE: Final = 0.015
-"""Distance [m] of a point from where a missing marker is expected, less than this."""
-_LACKING, _EXTRA, _TOO_MANY = 5, 2, 3  # markers less or more than a glove has: 14, 21 and 22 for 19
+"""Largest distance [m] of a point from the expected position of a missing marker."""
+_LACKING, _EXTRA, _TOO_MANY = 5, 2, 3  # points less or more than a glove has markers: 14, 21 and 22 for 19
 
 
 class PaperTracker:
-    """Follows the user's hands as the paper does.
+    """Tracks the user's hands as the paper does.
 
     Args:
         hands: The user's hands, each side at most once.
-        labeler: Knows the markers of the hands' glove.
-        rng: Decides which hand a cluster is taken for.
+        labeler: Labeler of the hands' glove.
+        rng: Pairs hands with clusters.
     """
 
     def __init__(self, hands: Sequence[GloveFit], labeler: Labeler, *, rng: np.random.Generator) -> None:
         self._hands = [PlainHand(hand) for hand in hands]
-        self._first = np.cumsum([0, *(hand.num_markers for hand in self._hands)])
+        self._first_label = np.cumsum([0, *(hand.num_markers for hand in self._hands)])
         self._labeler, self._rng = labeler, rng
         markers = len(labeler.marker_names)
-        self._fewest, self._most = markers - _LACKING, markers + _EXTRA
-        self._cap = markers + _TOO_MANY
+        self._fewest_points, self._most = markers - _LACKING, markers + _EXTRA
+        self._most_points = markers + _TOO_MANY
         self._labels: dict[int, int] = {}
-        self._before: set[int] = set()
+        self._last_ids: set[int] = set()
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
         """Take in the next frame.
 
         Args:
-            points: Points [m], none of them missing.
-            ids: The system's IDs: a point keeps its own for as long as it is seen; -1 where there is none.
+            points: Points [m], all finite.
+            ids: The system's IDs: a point keeps its ID for as long as it is seen; -1 where it has none.
             time: Time of the frame [s].
 
         Returns:
-            Labels are as sure as their hand's pose: the loop has no other measure.
+            The tracked frame; every label has confidence 1, as the loop has no measure of it.
         """
         known = ids.tolist()
         labels = np.array([self._labels.get(point, -1) for point in known], dtype=np.int64)
-        new = np.array([point not in self._before for point in known], dtype=bool)
+        new = np.array([point not in self._last_ids for point in known], dtype=bool)
         lost = [number for number, hand in enumerate(self._hands) if hand.qpos is None]
         hands = [hand.lost() for hand in self._hands]
-        nearby = self._nearby(points, labels) if (new & (labels < 0)).any() else None
+        by_proximity = self._proximity_labels(points, labels) if (new & (labels < 0)).any() else None
         for number, hand in enumerate(self._hands):
             if hand.qpos is not None:
-                hands[number] = self._follow(number, points, labels, nearby)
-        self._begin(lost, points, labels, hands)
+                hands[number] = self._track(number, points, labels, by_proximity)
+        self._initialize(lost, points, labels, hands)
         self._labels = {
             point: label
             for point, label in zip(known, labels.tolist(), strict=True)
             if min(point, label) >= 0
         }
-        self._before = set(known) - {-1}
+        self._last_ids = set(known) - {-1}
         return TrackedFrame(time, tuple(hands), labels, np.ones(len(points)))
 
-    def _names(self, number: int, labels: NDArray[np.int64]) -> NDArray[np.int64]:
-        """A hand's part of the labels, counted from its first marker."""
-        first, last = self._first[number : number + 2]
+    def _labels_of(self, number: int, labels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Labels of one hand's points, counted from its first marker; -1 for all others."""
+        first, last = self._first_label[number : number + 2]
         return np.where((labels >= first) & (labels < last), labels - first, -1)
 
-    def _nearby(self, points: NDArray[np.float64], labels: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Labels of points without one that lie where a tracked hand lacks a marker; -1 for all others."""
+    def _proximity_labels(self, points: NDArray[np.float64], labels: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Labels (N,) of unlabeled points near an expected missing marker; -1 for all others."""
         free = np.flatnonzero(labels < 0)
-        places = np.full((self._first[-1], 3), np.inf)
+        positions = np.full((self._first_label[-1], 3), np.inf)
         for number, hand in enumerate(self._hands):
             if hand.qpos is not None:
-                places[self._first[number] : self._first[number + 1]] = hand.solver.place(hand.qpos)
-        places[labels[labels >= 0]] = np.inf
-        found = np.full(len(points), -1)
-        found[free] = name_by_proximity(points[free], places, GATE)
-        return found
+                positions[self._first_label[number] : self._first_label[number + 1]] = hand.solver.place(
+                    hand.qpos
+                )
+        positions[labels[labels >= 0]] = np.inf
+        proposed = np.full(len(points), -1)
+        proposed[free] = label_by_proximity(points[free], positions, GATE)
+        return proposed
 
-    def _follow(
+    def _track(
         self,
         number: int,
         points: NDArray[np.float64],
         labels: NDArray[np.int64],
-        nearby: NDArray[np.int64] | None,
+        by_proximity: NDArray[np.int64] | None,
     ) -> TrackedHand:
-        """Choose among the proposals for a hand that was there before; its labels are overwritten."""
-        hand, own = self._hands[number], self._names(number, labels)
+        """Choose among the label proposals for a tracked hand; its `labels` are overwritten."""
+        hand, own = self._hands[number], self._labels_of(number, labels)
         proposals = [own]
-        if nearby is not None and (own >= 0).any() and (own >= 0).sum() < hand.num_markers:
+        if by_proximity is not None and (own >= 0).any() and (own >= 0).sum() < hand.num_markers:
             free = labels < 0
-            proposals.append(np.where(free, self._names(number, nearby), own))
-            proposals.append(self._ask(points, own, free))
+            proposals.append(np.where(free, self._labels_of(number, by_proximity), own))
+            proposals.append(self._query_labeler(points, own, free))
         proposals, fit = hand.fit(points, proposals)
         labels[own >= 0] = -1
-        counts = np.array([(names >= 0).sum() for names in proposals])
+        counts = np.array([(own_labels >= 0).sum() for own_labels in proposals])
         passed = np.zeros(0, dtype=int) if fit is None else np.flatnonzero(fit.rms <= MOST_RMS)
         if fit is None or not len(passed):
             hand.qpos = None
             return hand.lost()
         best = passed[np.lexsort((fit.rms[passed], -counts[passed]))[0]]
-        names = proposals[best]
-        labels[names >= 0] = names[names >= 0] + self._first[number]
+        own_labels = proposals[best]
+        labels[own_labels >= 0] = own_labels[own_labels >= 0] + self._first_label[number]
         hand.qpos = fit.qpos[best]
-        return hand.tracked(Status.TRACKED, points, names, fit, int(best))
+        return hand.tracked(Status.TRACKED, points, own_labels, fit, int(best))
 
-    def _ask(
+    def _query_labeler(
         self, points: NDArray[np.float64], own: NDArray[np.int64], free: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
-        """What the labeler makes of a hand's points and the free ones around it."""
-        cloud = cloud_of(points, own >= 0, free, most=self._cap, reach=REACH)
-        names = np.full(len(points), -1)
-        names[cloud] = self._labeler.label_frames([points[cloud]])[0].labels
-        return names
+        """Labels (N,) by the labeler of a hand's points and the free ones around it."""
+        cloud = labeler_cloud(points, own >= 0, free, most=self._most_points, radius=RADIUS)
+        own_labels = np.full(len(points), -1)
+        own_labels[cloud] = self._labeler.label_frames([points[cloud]])[0].labels
+        return own_labels
 
-    def _begin(
+    def _initialize(
         self,
         lost: list[int],
         points: NDArray[np.float64],
         labels: NDArray[np.int64],
         hands: list[TrackedHand],
     ) -> None:
-        """Take clusters for hands that had no pose, at random, and keep what fits."""
+        """Pair hands without a pose with clusters at random, and keep poses that fit."""
         free = np.flatnonzero(labels < 0)
-        if not lost or len(free) < self._fewest:
+        if not lost or len(free) < self._fewest_points:
             return
-        clusters = [free[group] for group in cluster_points(points[free], most=self._cap)]
-        clusters = [group for group in clusters if self._fewest <= len(group) <= self._most]
-        chosen = [clusters[place] for place in self._rng.permutation(len(clusters))]
+        clusters = [free[group] for group in cluster_points(points[free], most=self._most_points)]
+        clusters = [group for group in clusters if self._fewest_points <= len(group) <= self._most]
+        chosen = [clusters[index] for index in self._rng.permutation(len(clusters))]
         pairs = list(zip(self._rng.permutation(lost), chosen, strict=False))
         labelings = self._labeler.label_frames([points[group] for _, group in pairs])
         for (number, group), labeling in zip(pairs, labelings, strict=True):
-            hand, names = self._hands[number], np.full(len(points), -1)
-            names[group] = labeling.labels
-            if (names >= 0).sum() < self._fewest:
+            hand, own_labels = self._hands[number], np.full(len(points), -1)
+            own_labels[group] = labeling.labels
+            if (own_labels >= 0).sum() < self._fewest_points:
                 continue
-            _, fit = hand.fit(points, [names])
+            _, fit = hand.fit(points, [own_labels])
             if fit is not None and fit.rms[0] <= MOST_RMS:
-                labels[names >= 0] = names[names >= 0] + self._first[number]
+                labels[own_labels >= 0] = own_labels[own_labels >= 0] + self._first_label[number]
                 hand.qpos = fit.qpos[0]
-                hands[number] = hand.tracked(Status.FOUND, points, names, fit)
+                hands[number] = hand.tracked(Status.FOUND, points, own_labels, fit)

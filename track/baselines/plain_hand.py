@@ -1,4 +1,4 @@
-"""One of the user's hands with nothing to it but its last pose: what simple tracking loops are made of."""
+"""A hand whose only state is its last pose, for the baseline trackers."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_RMS: Final = 0.008
-"""RMS distance [m] beyond which a pose is thrown away; Han et al. 2018, section 4.4."""
+"""RMS distance [m] above which a pose is rejected; Han et al. 2018, section 4.4."""
 FEWEST: Final = 4
-"""Named points without which no pose is solved; the paper gives no number, the solver wants this one."""
+"""Labeled points that a pose needs; the paper gives no number, our solver needs this one."""
 
 
 class PlainHand:
-    """A hand that loops without memory follow.
+    """A hand tracked without any state but its last pose.
 
     Args:
         hand: The hand and its glove.
@@ -34,26 +34,27 @@ class PlainHand:
         self.solver = PoseSolver(hand)
         self.num_markers = hand.attachment.layout.num_markers
         self.qpos: NDArray[np.float64] | None = None
-        """The pose of the frame before; None where there is none."""
+        """The pose of the previous frame; None if there is none."""
 
     def fit(
         self, points: Float[np.ndarray, "N 3"], proposals: Sequence[Int[np.ndarray, "N"]]
     ) -> tuple[list[Int[np.ndarray, "N"]], PoseFit | None]:
-        """Solve the pose of every way to name points, from the pose before where there is one.
+        """Solve the pose of every proposal, starting from the previous pose if there is one.
 
         Args:
             points: Points of a frame [m].
-            proposals: Marker of each point, -1 for none of this hand's.
+            proposals: Labels of the points: index of the marker, -1 for points that are not of this hand.
 
         Returns:
-            The proposals with at least `FEWEST` names, and their poses in this order; None without any.
+            The proposals with at least `FEWEST` labeled points, and their poses in this order; None without
+            any.
         """
-        usable = [names for names in proposals if (names >= 0).sum() >= FEWEST]
+        usable = [labels for labels in proposals if (labels >= 0).sum() >= FEWEST]
         if not usable:
             return [], None
         targets = np.full((len(usable), self.num_markers, 3), np.nan)
-        for row, names in enumerate(usable):
-            targets[row, names[names >= 0]] = points[names >= 0]
+        for row, labels in enumerate(usable):
+            targets[row, labels[labels >= 0]] = points[labels >= 0]
         initial = None if self.qpos is None else np.tile(self.qpos, (len(usable), 1))
         return usable, self.solver.solve(targets, initial)
 
@@ -61,20 +62,28 @@ class PlainHand:
         self,
         status: Status,
         points: Float[np.ndarray, "N 3"],
-        names: Int[np.ndarray, "N"],
+        labels: Int[np.ndarray, "N"],
         fit: PoseFit,
         row: int = 0,
     ) -> TrackedHand:
-        """What is said of this hand in a frame: one of the poses that were solved and its names."""
-        there = names >= 0
+        """The hand in a tracked frame, by one of the solved poses.
+
+        Args:
+            status: Its status.
+            points: Points of the frame [m].
+            labels: Marker of each point, -1 for none.
+            fit: Solved poses.
+            row: Which of them.
+        """
+        present = labels >= 0
         markers = self.solver.place(fit.qpos[row])
-        markers[names[there]] = points[there]
-        filled = np.setdiff1d(np.arange(self.num_markers), names[there])
+        markers[labels[present]] = points[present]
+        filled = np.setdiff1d(np.arange(self.num_markers), labels[present])
         return TrackedHand(self.hand.side, status, fit.qpos[row], float(fit.rms[row]), markers, filled)
 
     def lost(self) -> TrackedHand:
-        """What is said of this hand in a frame that has no pose of it."""
-        nowhere = np.full((self.num_markers, 3), np.nan)
+        """The hand in a frame without a pose of it."""
+        missing = np.full((self.num_markers, 3), np.nan)
         return TrackedHand(
-            self.hand.side, Status.LOST, np.full(NUM_QPOS, np.nan), np.nan, nowhere, np.arange(0)
+            self.hand.side, Status.LOST, np.full(NUM_QPOS, np.nan), np.nan, missing, np.arange(0)
         )

@@ -1,4 +1,4 @@
-"""Ways to name the points of a hand anew when markers come back (Han et al. 2018, sections 4.2 and 4.4)."""
+"""Label proposals for new points of a hand (Han et al. 2018, sections 4.2 and 4.4)."""
 
 from __future__ import annotations
 
@@ -10,47 +10,47 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
 
 
-def name_by_proximity(
-    points: Float[np.ndarray, "P 3"], places: Float[np.ndarray, "K 3"], reach: float
+def label_by_proximity(
+    points: Float[np.ndarray, "P 3"], positions: Float[np.ndarray, "K 3"], radius: float
 ) -> Int[np.ndarray, "P"]:
-    """Give each place the point near it, the nearest pair first, one to one.
+    """Assign points to expected positions one to one, the nearest pair first.
 
     Args:
-        points: Points without a name [m].
-        places: Where they are expected [m].
-        reach: Distance of a pair, less than this [m].
+        points: Points without a label [m].
+        positions: Expected positions of markers [m].
+        radius: Upper bound of the distance of a pair [m].
 
     Returns:
-        Place of each point, -1 for none.
+        Index of each point's position, -1 for none.
     """
-    names, apart = np.full(len(points), -1), np.linalg.norm(points[:, None] - places, axis=-1)
+    labels, apart = np.full(len(points), -1), np.linalg.norm(points[:, None] - positions, axis=-1)
     while apart.size:
-        point, place = np.unravel_index(apart.argmin(), apart.shape)
-        if not apart[point, place] < reach:
+        point, position = np.unravel_index(apart.argmin(), apart.shape)
+        if not apart[point, position] < radius:
             break
-        names[point] = place
-        apart[point], apart[:, place] = np.inf, np.inf
-    return names
+        labels[point] = position
+        apart[point], apart[:, position] = np.inf, np.inf
+    return labels
 
 
-def cloud_of(
+def labeler_cloud(
     points: Float[np.ndarray, "N 3"],
-    named: Bool[np.ndarray, "N"],
+    labeled: Bool[np.ndarray, "N"],
     free: Bool[np.ndarray, "N"],
     *,
     most: int,
-    reach: float,
+    radius: float,
 ) -> Int[np.ndarray, "K"]:
-    """The points of a hand and those around it that are free: what a labeler is asked about.
+    """Indices of the points for a labeler query: those of a hand and the free ones around it.
 
     Args:
         points: Points of a frame [m].
-        named: Those that this hand has; at least one.
-        free: Those that no hand has.
-        most: Points of the cloud, at most; of the free ones the nearest to the hand's center are taken.
-        reach: Their distance from that center, at most [m].
+        labeled: Points with a label of this hand; at least one.
+        free: Points without a label.
+        most: Largest number of points; of the free ones those nearest to the hand's center are taken.
+        radius: Largest distance of a free point from that center [m].
     """
-    own, others = np.flatnonzero(named), np.flatnonzero(free)
+    own, others = np.flatnonzero(labeled), np.flatnonzero(free)
     away = np.linalg.norm(points[others] - points[own].mean(axis=0), axis=-1)
-    near = others[away <= reach][np.argsort(away[away <= reach], kind="stable")]
+    near = others[away <= radius][np.argsort(away[away <= radius], kind="stable")]
     return np.concatenate([own, near[: max(0, most - len(own))]])

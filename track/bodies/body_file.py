@@ -1,4 +1,4 @@
-"""Rigid bodies as TOML files: a name, and the markers' places in millimeters in the body's own frame."""
+"""Rigid bodies as TOML files: a name, and the markers' positions in millimeters in the body's own frame."""
 
 from __future__ import annotations
 
@@ -21,11 +21,16 @@ _BODY_KEYS: Final = ("name", "description", "marker")
 _MARKER_KEYS: Final = ("name", "place_mm")
 
 
+class BodyError(HandSimError):
+    """A body's file that cannot be read or written."""
+
+
 def load_body(name_or_path: str | Path) -> RigidTemplate:
-    """The markers of one of handsim's objects by its name, or of anybody's by the path of a `.toml` file.
+    """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
 
     Raises:
-        ArgumentError: No such object or file, or the file describes no body that can be tracked; the sentence
+        ArgumentError: There is no such object, or it has too few markers.
+        BodyError: There is no such file, or it does not describe a body that can be tracked; the sentence
             names the file.
     """
     path = Path(name_or_path)
@@ -35,18 +40,19 @@ def load_body(name_or_path: str | Path) -> RigidTemplate:
         ours = [name for name in object_names() if len(named_object(name).markers) >= FEWEST]
         unknown = choices(str(name_or_path), ours, noun="body")
         raise ArgumentError(f"{unknown}, or the path of a .toml file")
-    table = read_toml(path, error=ArgumentError)
+    table = read_toml(path, error=BodyError)
     try:
         return _parse_body(table)
     except HandSimError as error:
-        raise ArgumentError(f"{path}: {error}") from error
+        raise BodyError(f"{path}: {error}") from error
 
 
 def load_bodies(names_or_paths: Iterable[str | Path]) -> tuple[RigidTemplate, ...]:
     """Bodies that are tracked together.
 
     Raises:
-        ArgumentError: One cannot be loaded, or its name is another's, or a hand's.
+        ArgumentError: An object is unknown, or a body has the name of another body or of a hand.
+        BodyError: A file cannot be loaded.
     """
     bodies: list[RigidTemplate] = []
     for name_or_path in names_or_paths:
@@ -65,17 +71,17 @@ def save_body(path: str | Path, body: RigidTemplate) -> None:
     """Write a body as TOML, numbers to nine decimals; `load_body` gives the same body again.
 
     Raises:
-        ArgumentError: The file cannot be written.
+        BodyError: The file cannot be written.
     """
     lines = [f"name = {quoted(body.name)}"]
-    for name, place in zip(body.marker_names, 1e3 * body.places, strict=True):
-        places = ", ".join(written(value) for value in place.tolist())
-        lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{places}]"]
+    for name, position in zip(body.marker_names, 1e3 * body.positions, strict=True):
+        numbers_mm = ", ".join(written(value) for value in position.tolist())
+        lines += ["", "[[marker]]", f"name = {quoted(name)}", f"place_mm = [{numbers_mm}]"]
     try:
         with atomic_write(path) as temporary:
             temporary.write_text("\n".join(lines) + "\n", "utf-8")
     except OSError as error:
-        raise ArgumentError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise BodyError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
@@ -83,8 +89,8 @@ def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
     text_of(table, "description", default="")
     name = _printable("the body's name", text_of(table, "name"))
     markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
-    places = np.array([place for _, place in markers]).reshape(-1, 3)
-    return RigidTemplate(name, tuple(marker for marker, _ in markers), 1e-3 * places)
+    positions = np.array([position for _, position in markers]).reshape(-1, 3)
+    return RigidTemplate(name, tuple(marker for marker, _ in markers), 1e-3 * positions)
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:
@@ -92,12 +98,12 @@ def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[f
     owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
     check_keys(table, owner, _MARKER_KEYS)
     name = _printable("marker name", text_of(table, "name", f"{owner}: "))
-    wanted = "three numbers [x, y, z] in millimeters"
-    return name, numbers(f"{owner}: place_mm", table["place_mm"], (3,), wanted).tolist()
+    expected = "three numbers [x, y, z] in millimeters"
+    return name, numbers(f"{owner}: place_mm", table["place_mm"], (3,), expected).tolist()
 
 
 def _printable(what: str, name: str) -> str:
-    """A name that can stand in a marker file."""
+    """A name that marker files can hold."""
     if not name or name != name.strip() or not name.isprintable():
         raise ArgumentError(f"{what} {name!r}: expected printable characters without outer blanks")
     return name

@@ -1,36 +1,33 @@
-"""Rigid bodies with markers of their own, tracked beside the hands: which points are theirs, and their pose.
+"""Rigid bodies with markers, tracked beside the hands: labels of their points, and their pose.
 
-IDs carry labels from frame to frame; points with new IDs are taken where the pose puts a marker that is
-missing; a body that is lost is looked for among all points, by the distances between its markers. A body of
-more than three markers is found by four or more, and followed by three or more; near where it was a moment
-ago three find it again.
+Labels go from frame to frame by ID. A point with a new ID is assigned where the pose predicts a missing
+marker. A lost body is searched among all points by the distances between its markers. A body of more than
+three markers is initialized from four or more, and tracked by three or more; near its last pose three are
+enough.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.space.objects import RigidObject
+from track.bodies.body_pose import predict_pose, transform_markers, velocity_between, write_transform
 from track.bodies.constellation import (
     FEWEST,
-    advance,
-    carry,
-    complete,
-    follow,
-    lean_on,
-    put,
-    search,
-    settle,
-    velocity_between,
+    assign_by_id,
+    assign_remaining,
+    fit_inliers,
+    shift_to_points,
+    track_by_ids,
     write_labels,
-    write_transform,
 )
+from track.bodies.constellation_search import search_constellation
 from track.tracked_frame import Status
 
 if TYPE_CHECKING:
@@ -38,21 +35,21 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 GATE: Final = 0.003
-"""How far a labeled point may be from its marker [m], ten times the noise of a good system."""
-_TIGHT: Final = 0.001  # [m], the same for those that make the pose, and for a body that is looked for
-_TIGHTEST: Final = 0.0005  # and for three that are looked for, where chance is at work
-_THINNEST: Final = 0.005  # [m] RMS off the line that runs best through the markers
-_CLOSEST: Final = 2.0 * GATE  # markers nearer to each other than this change labels unseen
-_COASTING: Final = 0.026  # [s] without three markers, three frames at 120 Hz, before a body is lost
-_FITS: Final = 5  # in a row that tell how fast it moves
-_EASE: Final = 0.4  # weight of the newest velocity: a fit to three markers wobbles
-_NEARBY: Final = 0.25  # [s] after which it may be anywhere
-_SPREAD, _PACE = 0.005, 1.5  # [m], [m/s]: how far off a marker may be when it is not known how fast it moves
-_ERROR, _HASTE = 0.002, 30.0  # [m], [m/s^2]: and when it is
-_NEAR: Final = 0.03  # [m]: so near to where it was, three markers are believed at once
-_STILL: Final = 0.02  # [m] a frame that a candidate may move while it waits to be believed
-_MOST_POINTS: Final = 250  # among which it is looked for: some 30 ms, and it grows with their third power
-_FARTHEST: Final = 1e3  # [m]: beyond it there is no room
+"""Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""
+_TIGHT: Final = 0.001  # [m], the same for points that determine the pose, and in a search
+_TIGHTEST: Final = 0.0005  # [m], the same in a search that finds three points, which may fit by chance
+_THINNEST: Final = 0.005  # [m] RMS distance of the markers from their best line, at least
+_CLOSEST: Final = 2.0 * GATE  # [m]: markers nearer to each other than this could exchange labels
+_LONGEST_COAST: Final = 0.026  # [s] without three markers (three frames at 120 Hz), before a body is lost
+_VELOCITY_FITS: Final = 5  # consecutive fits from which the velocity is known
+_SMOOTHING: Final = 0.4  # weight of the newest velocity; fits to three markers are noisy
+_LONGEST_PREDICTION: Final = 0.25  # [s] without a fit, after which the body may be anywhere
+_FIRST_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s]: search radius without a known velocity
+_RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with one
+_CONFIDENT_RADIUS: Final = 0.03  # [m]: search radius within which three markers are accepted at once
+_MOST_CANDIDATE_MOTION: Final = 0.02  # [m] per frame that a candidate may move before it is accepted
+_MOST_POINTS: Final = 250  # in a search: some 30 ms, which grows with their third power
+_FARTHEST: Final = 1e3  # [m] from the origin; points beyond are ignored
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,45 +57,20 @@ class RigidTemplate:
     """The markers of a rigid body in its own frame.
 
     Raises:
-        ArgumentError: There are fewer than three, names and places do not fit, two are too close together,
-            all
-            lie on one line, or the body looks the same from two sides.
+        ArgumentError: `positions` have another shape, or `template_fault` finds a fault.
     """
 
     name: str
     marker_names: tuple[str, ...]
-    places: Float[np.ndarray, "Q 3"]
-    """[m] in the body's frame."""
+    positions: Float[np.ndarray, "Q 3"]
+    """In the body's frame [m]."""
 
     def __post_init__(self) -> None:
-        places = np.array(check_array("places", self.places, (len(self.marker_names), 3)), order="C")
-        object.__setattr__(self, "places", places)
-        if places.ndim != 2 or len(places) < FEWEST:
-            raise ArgumentError(
-                f"{self.name}: {places.shape[-2]} markers, expected at least {FEWEST} to tell a pose"
-            )
-        if len(set(self.marker_names)) < len(self.marker_names):
-            raise ArgumentError(f"{self.name}: a marker name is there twice: {', '.join(self.marker_names)}")
-        apart = self.sides + np.where(np.eye(len(places), dtype=bool), np.inf, 0.0)
-        if apart.min() < _CLOSEST:
-            first, second = (self.marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
-            raise ArgumentError(
-                f"{self.name}: {first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
-                f"{1e3 * _CLOSEST:.0f} mm"
-            )
-        off_line = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1]
-        if off_line < _THINNEST * np.sqrt(len(places)):
-            raise ArgumentError(f"{self.name}: its markers lie on one line, expected three that do not")
-        order = _look_alike(places, self.sides)
-        if order is not None:
-            moved = [
-                f"{self.marker_names[i]} at {self.marker_names[k]}" for i, k in enumerate(order) if i != k
-            ]
-            raise ArgumentError(
-                f"{self.name}: its markers look the same from two sides ({', '.join(moved)}), "
-                "expected a place "
-                "for each that tells them apart by some millimeters"
-            )
+        positions = np.array(check_array("positions", self.positions, (len(self.marker_names), 3)), order="C")
+        object.__setattr__(self, "positions", positions)
+        fault = template_fault(self.name, self.marker_names, positions)
+        if fault is not None:
+            raise ArgumentError(fault)
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidTemplate:
@@ -110,18 +82,57 @@ class RigidTemplate:
         return cls(thing.name, thing.marker_names, thing.markers)
 
     @property
-    def sides(self) -> Float[np.ndarray, "Q Q"]:
+    def distances(self) -> Float[np.ndarray, "Q Q"]:
         """Distances between markers [m]."""
-        sides: np.ndarray = np.linalg.norm(self.places[:, None] - self.places, axis=2)
-        return sides
+        return _distances_between(self.positions)
 
 
-def _look_alike(places: NDArray[np.float64], sides: NDArray[np.float64]) -> tuple[int, ...] | None:
-    """Another order of all markers that a turned body cannot be told from, if there is one.
+def template_fault(
+    name: str, marker_names: tuple[str, ...], positions: Float[np.ndarray, "Q 3"]
+) -> str | None:
+    """Why these markers are not a body that can be tracked, as a sentence; None if they are.
 
-    Some of the markers may still look like others; then the body is not found while only those are seen.
+    Args:
+        name: Name of the body.
+        marker_names: Names of its Q markers.
+        positions: Markers in the body's frame [m].
     """
-    count = len(places)
+    if positions.ndim != 2 or len(positions) < FEWEST:
+        return f"{name}: {positions.shape[-2]} markers, expected at least {FEWEST}, which determine a pose"
+    if len(set(marker_names)) < len(marker_names):
+        return f"{name}: a marker name is there twice: {', '.join(marker_names)}"
+    distances = _distances_between(positions)
+    apart = distances + np.where(np.eye(len(positions), dtype=bool), np.inf, 0.0)
+    if apart.min() < _CLOSEST:
+        first, second = (marker_names[i] for i in np.unravel_index(apart.argmin(), apart.shape))
+        return (
+            f"{name}: {first} and {second} are {1e3 * apart.min():.1f} mm apart, expected at least "
+            f"{1e3 * _CLOSEST:.0f} mm"
+        )
+    off_line = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[1]
+    if off_line < _THINNEST * np.sqrt(len(positions)):
+        return f"{name}: its markers lie on one line, expected three that do not"
+    order = _symmetry(positions, distances)
+    if order is not None:
+        moved = [f"{marker_names[i]} at {marker_names[k]}" for i, k in enumerate(order) if i != k]
+        return (
+            f"{name}: its markers look the same from two sides ({', '.join(moved)}), expected positions "
+            "whose distances differ by some millimeters"
+        )
+    return None
+
+
+def _distances_between(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    distances: NDArray[np.float64] = np.linalg.norm(positions[:, None] - positions, axis=2)
+    return distances
+
+
+def _symmetry(positions: NDArray[np.float64], distances: NDArray[np.float64]) -> tuple[int, ...] | None:
+    """Another order of all markers that fits the body after a rotation, if there is one.
+
+    A part of the markers may still be symmetric; then the body is not found while only these are seen.
+    """
+    count = len(positions)
     orders: list[tuple[int, ...]] = [()]
     for marker in range(count):  # orders that keep all distances so far
         orders = [
@@ -129,55 +140,55 @@ def _look_alike(places: NDArray[np.float64], sides: NDArray[np.float64]) -> tupl
             for order in orders
             for to in range(count)
             if to not in order
-            and all(abs(sides[marker, k] - sides[to, order[k]]) < 2.0 * _TIGHT for k in range(marker))
+            and all(abs(distances[marker, k] - distances[to, order[k]]) < 2.0 * _TIGHT for k in range(marker))
         ]
     for order in orders:
         if order != tuple(range(count)):
-            agree, _ = settle(places, places, np.array(order), np.empty(7), _TIGHT, _TIGHT)
-            if agree == count:  # turned, not mirrored
+            agree, _ = fit_inliers(positions, positions, np.array(order), np.empty(7), _TIGHT, _TIGHT)
+            if agree == count:  # rotated, not mirrored
                 return order
     return None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyFrame:
-    """What is known of a body in a frame."""
+    """Status, pose and labels of a body in one frame."""
 
     status: Status
-    """`found` after it was lost, `tracked` from then on, `coasting` for a few frames where fewer than three
-    markers are seen and the pose is a prediction, `lost`."""
+    """`found` in the first frame after it was lost, `tracked` from then on, `coasting` for a few frames where
+    fewer than three markers are seen and the pose is a prediction, `lost`."""
     T_world_body: Float[np.ndarray, "4 4"] | None
-    """The body's frame seen from the world [m]; None when lost."""
+    """The body's frame in the world [m]; None when lost."""
     labels: Int[np.ndarray, "N"]
-    """Place of each point's marker in the template, -1 for all others."""
+    """Index of each point's marker in the template, -1 for all others."""
     rms: float
     """RMS distance of the labeled points from their markers [m]; NaN without any."""
 
 
 class BodyTracker:
-    """Follows one rigid body through a stream of points.
+    """Tracks one rigid body through a stream of points.
 
     Args:
-        template: Its markers.
+        template: The body's markers.
     """
 
     def __init__(self, template: RigidTemplate) -> None:
         self.template = template
-        self._places, self._sides = template.places, template.sides
-        self._forget()
-        for number in range(18):  # so that no kernel is loaded while somebody waits for a frame
-            there = self._places if number < 17 else self._places[:0]
+        self._positions, self._distances = template.positions, template.distances
+        self._reset()
+        for number in range(18):  # loads all kernels before the first frame of a stream
+            there = self._positions if number < 17 else self._positions[:0]
             self.step(there, np.arange(len(there)), number / 120.0)
-        self._forget()
+        self._reset()
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
-        """One frame; whatever a stream may bring ends in a status.
+        """Track the body in the next frame; any content of a stream ends in a status.
 
         Args:
-            points: All points of the frame [m], in any order; those of hands and ghosts among them. Points
-                that are no finite places are left alone.
-            ids: The system's ID of each, negative where it gives none.
-            time: Of the frame [s].
+            points: All points of the frame [m], in any order, with those of hands and ghosts. Points with
+                coordinates that are not finite are ignored.
+            ids: The system's ID of each point, negative where it gives none.
+            time: Time of the frame [s].
 
         Raises:
             ArgumentError: `points` and `ids` do not fit together.
@@ -197,118 +208,161 @@ class BodyTracker:
         labels[usable] = frame.labels
         return dataclasses.replace(frame, labels=labels)
 
-    def _step(self, points: Any, ids: Any, time: float) -> BodyFrame:
+    def _step(self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float) -> BodyFrame:
         elapsed = time - self._time
         if self._status != Status.LOST:
-            frame = self._follow(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
+            frame = self._track(points, ids, time, elapsed) or self._coast(points, ids, elapsed)
             if frame is not None:
                 return frame
             self._lose()
-        return self._find(points, ids, time, elapsed)
+        return self._initialize(points, ids, time, elapsed)
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
-        self._most, self._fits = 0, 0  # since it was found: markers that agreed at once, frames fitted
+        self._most_markers, self._fits = 0, 0  # since initialization: most markers in one fit, number of fits
         self._lose()
 
     def _lose(self) -> None:
         self._status: Status = Status.LOST
-        self._known = np.full(len(self._places), -1)  # IDs of the last frame
-        self._candidate, self._waited = np.full(7, np.nan), 0
+        self._last_ids = np.full(len(self._positions), -1)  # IDs of the markers' points in the last frame
+        self._candidate, self._confirmed = np.full(7, np.nan), 0
 
-    def _follow(self, points: Any, ids: Any, time: float, elapsed: float) -> BodyFrame | None:
-        """The body where IDs or its motion say that it is."""
-        pose, owners = np.empty(7), np.empty(len(self._places), dtype=np.int64)
-        count, rms = follow(self._places, points, ids, self._known, pose, _TIGHT, GATE, owners)
-        if count < FEWEST and 0.0 < elapsed <= _NEARBY:
-            predicted = advance(self._pose, self._velocity, elapsed)
-            count, rms = self._search(points, predicted, self._reach(elapsed), owners, pose)
+    def _track(
+        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
+    ) -> BodyFrame | None:
+        """The body by the IDs of its points, or near its predicted pose."""
+        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
+        count, rms = track_by_ids(
+            self._positions, points, ids, self._last_ids, pose, _TIGHT, GATE, assignment
+        )
+        if count < FEWEST and 0.0 < elapsed <= _LONGEST_PREDICTION:
+            predicted = predict_pose(self._pose, self._velocity, elapsed)
+            count, rms = self._match(points, predicted, self._search_radius(elapsed), assignment, pose)
         if count < FEWEST:
             return None
-        if max(self._most, count) <= FEWEST < len(self._places):
-            # Three points may lie as three markers do by chance: more of them elsewhere are the body.
-            other, others = np.empty(7), np.empty_like(owners)
-            more, spread = self._search(points, None, np.inf, others, other)
+        if max(self._most_markers, count) <= FEWEST < len(self._positions):
+            # Three points may match three markers by chance: a larger match elsewhere is the body.
+            other, other_assignment = np.empty(7), np.empty_like(assignment)
+            more, spread = self._match(points, None, np.inf, other_assignment, other)
             if more > FEWEST:
-                return self._keep(Status.FOUND, other, spread, others, ids, time)
-        return self._keep(Status.TRACKED, pose, rms, owners, ids, time)
+                return self._accept(Status.FOUND, other, spread, other_assignment, ids, time)
+        return self._accept(Status.TRACKED, pose, rms, assignment, ids, time)
 
-    def _coast(self, points: Any, ids: Any, elapsed: float) -> BodyFrame | None:
-        """The body where its motion says that it is, for as long as that may be trusted."""
-        if not 0.0 < elapsed <= _COASTING or self._fits < _FITS:
+    def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
+        """The body at its predicted pose, for `_LONGEST_COAST` seconds at most."""
+        if not 0.0 < elapsed <= _LONGEST_COAST or self._fits < _VELOCITY_FITS:
             return None
-        pose = advance(self._pose, self._velocity, elapsed)
-        owners = np.empty(len(self._places), dtype=np.int64)
-        carry(points, ids, self._known, owners)
-        _, rms = lean_on(points, owners, pose, put(self._places, pose), GATE)
+        pose = predict_pose(self._pose, self._velocity, elapsed)
+        assignment = np.empty(len(self._positions), dtype=np.int64)
+        assign_by_id(points, ids, self._last_ids, assignment)
+        _, rms = shift_to_points(points, assignment, pose, transform_markers(self._positions, pose), GATE)
         self._status = Status.COASTING
-        return self._frame(pose, rms, owners, ids)
+        return self._result(pose, rms, assignment, ids)
 
-    def _find(self, points: Any, ids: Any, time: float, elapsed: float) -> BodyFrame:
-        """The body where it was a moment ago, or anywhere."""
-        pose, owners = np.empty(7), np.empty(len(self._places), dtype=np.int64)
-        if 0.0 < elapsed <= _NEARBY:
-            reach, predicted = self._reach(elapsed), advance(self._pose, self._velocity, elapsed)
-            count, rms = self._search(points, predicted, reach, owners, pose)
-            if count > FEWEST or (count == FEWEST and reach <= _NEAR):
-                return self._keep(Status.FOUND, pose, rms, owners, ids, time)
-        count, rms = self._search(points, None, np.inf, owners, pose)
+    def _initialize(
+        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float, elapsed: float
+    ) -> BodyFrame:
+        """The body near its predicted pose, or anywhere."""
+        pose, assignment = np.empty(7), np.empty(len(self._positions), dtype=np.int64)
+        if 0.0 < elapsed <= _LONGEST_PREDICTION:
+            radius, predicted = (
+                self._search_radius(elapsed),
+                predict_pose(self._pose, self._velocity, elapsed),
+            )
+            count, rms = self._match(points, predicted, radius, assignment, pose)
+            if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
+                return self._accept(Status.FOUND, pose, rms, assignment, ids, time)
+        count, rms = self._match(points, None, np.inf, assignment, pose)
         if count >= FEWEST:
-            moved = np.linalg.norm(put(self._places, pose) - put(self._places, self._candidate), axis=1).max()
-            self._waited = self._waited + 1 if moved < _STILL else 1
+            there = transform_markers(self._positions, pose)
+            before = transform_markers(self._positions, self._candidate)
+            moved = np.linalg.norm(there - before, axis=1).max()
+            self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
             self._candidate = pose
-            if self._waited >= _frames_to_wait(count, len(self._places)):
-                return self._keep(Status.FOUND, pose, rms, owners, ids, time)
+            if self._confirmed >= _frames_to_confirm(count, len(self._positions)):
+                return self._accept(Status.FOUND, pose, rms, assignment, ids, time)
         else:
-            self._waited = 0
+            self._confirmed = 0
         return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
 
-    def _reach(self, elapsed: float) -> float:
-        """How far a marker may be from where the last fit and its motion put it [m]."""
-        if self._fits < _FITS:
-            return _SPREAD + _PACE * elapsed
-        return _ERROR + 0.5 * _HASTE * elapsed**2
+    def _search_radius(self, elapsed: float) -> float:
+        """Largest distance of a marker from its predicted position [m]."""
+        if self._fits < _VELOCITY_FITS:
+            return _FIRST_RADIUS + _MOST_SPEED * elapsed
+        return _RADIUS + 0.5 * _MOST_ACCELERATION * elapsed**2
 
-    def _search(self, points: Any, near: Any, reach: float, owners: Any, pose: Any) -> tuple[int, float]:
-        """The one place where the markers fit, within reach of a pose; how many do and their RMS distance."""
+    def _match(
+        self,
+        points: NDArray[np.float64],
+        near: NDArray[np.float64] | None,
+        radius: float,
+        assignment: NDArray[np.int64],
+        pose: NDArray[np.float64],
+    ) -> tuple[int, float]:
+        """The unique match of the markers within a radius of a pose.
+
+        Args:
+            points: Points of the frame (N, 3) [m].
+            near: Pose (7,) around which to search; None for everywhere.
+            radius: Largest distance of a point from its marker at that pose [m].
+            assignment: Overwritten by the point of each marker (Q,), -1 for none.
+            pose: Overwritten by the pose (7,).
+
+        Returns:
+            Number of markers that match, 0 if there is no unique match, and their RMS distance [m].
+        """
         if len(points) > _MOST_POINTS:
             return 0, np.nan
-        wanted = self._places if near is None else put(self._places, near)
-        count, _, rival = search(self._places, self._sides, points, wanted, reach, _TIGHT, owners, pose)
+        expected = self._positions if near is None else transform_markers(self._positions, near)
+        count, _, rival = search_constellation(
+            self._positions, self._distances, points, expected, radius, _TIGHT, assignment, pose
+        )
         if count < FEWEST or rival >= count:
             return 0, np.nan
-        if count == FEWEST and settle(self._places, points, owners, pose, _TIGHTEST, _TIGHTEST)[0] < FEWEST:
-            return 0, np.nan
-        fitted: tuple[int, float] = complete(self._places, points, owners, pose, _TIGHT, GATE)
+        if count == FEWEST:
+            kept, _ = fit_inliers(self._positions, points, assignment, pose, _TIGHTEST, _TIGHTEST)
+            if kept < FEWEST:
+                return 0, np.nan
+        fitted: tuple[int, float] = assign_remaining(self._positions, points, assignment, pose, _TIGHT, GATE)
         return fitted
 
-    def _keep(self, status: Status, pose: Any, rms: float, owners: Any, ids: Any, time: float) -> BodyFrame:
-        """Remember a fit."""
+    def _accept(
+        self,
+        status: Status,
+        pose: NDArray[np.float64],
+        rms: float,
+        assignment: NDArray[np.int64],
+        ids: NDArray[np.int64],
+        time: float,
+    ) -> BodyFrame:
+        """Update pose and velocity by a fit."""
         elapsed = time - self._time
         if status == Status.FOUND:
-            self._velocity, self._most, self._fits = np.zeros(6), 0, 0
-        elif 0.0 < elapsed <= _NEARBY:
-            ease = _EASE if self._fits > 1 else 1.0
-            self._velocity += ease * (velocity_between(self._pose, pose, elapsed) - self._velocity)
+            self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
+        elif 0.0 < elapsed <= _LONGEST_PREDICTION:
+            weight = _SMOOTHING if self._fits > 1 else 1.0
+            self._velocity += weight * (velocity_between(self._pose, pose, elapsed) - self._velocity)
         self._fits += 1
         self._pose, self._time, self._status = pose, time, status
-        self._most = max(self._most, int((owners >= 0).sum()))
-        return self._frame(pose, rms, owners, ids)
+        self._most_markers = max(self._most_markers, int((assignment >= 0).sum()))
+        return self._result(pose, rms, assignment, ids)
 
-    def _frame(self, pose: Any, rms: float, owners: Any, ids: Any) -> BodyFrame:
-        """What a user sees of a fit; the IDs are remembered."""
+    def _result(
+        self, pose: NDArray[np.float64], rms: float, assignment: NDArray[np.int64], ids: NDArray[np.int64]
+    ) -> BodyFrame:
+        """The result of a fit; the IDs are kept for the next frame."""
         labels, transform = np.full(len(ids), -1), np.eye(4)
-        write_labels(owners, ids, labels, self._known)
+        write_labels(assignment, ids, labels, self._last_ids)
         write_transform(pose, transform)
         return BodyFrame(self._status, transform, labels, rms)
 
 
-def _frames_to_wait(count: int, markers: int) -> float:
-    """Frames that so few markers have to stay together before they are believed anywhere in the room.
+def _frames_to_confirm(count: int, markers: int) -> float:
+    """Frames that a match of `count` of a body's markers must last before it is accepted without a pose.
 
-    Three of more never are: the back of a hand has markers that keep their distances for minutes, and in up
-    to one of twenty frames some three of two hands' lie as three of an object's do. Four do in one of a
-    thousand.
+    Three markers of a larger body are never accepted: markers on the back of a hand keep their distances for
+    minutes, and in up to one of twenty frames some three markers of two hands match three of an object. Four
+    match in one of a thousand.
     """
     if count == FEWEST:
         return 10 if markers == FEWEST else np.inf

@@ -1,11 +1,12 @@
-"""The energy of a calibration, and its Gauss-Newton equations.
+"""The energy of a calibration and its Gauss-Newton normal equations.
 
-That of Han et al. 2018, section 4.5, with a shape that is solved too, all in units of the markers' noise:
+The energy is that of Han et al. 2018, section 4.5, with the hand's shape as a further unknown. Its unit is
+the variance of the markers' noise:
 
-    E = E_data + E_prior(M) + E_contact + what people differ by + hinges' ranges
+    E = E_data + E_prior(M) + E_contact + prior of hand shapes + prior and limits of joint angles
 
-Contact points slide after each step; what is left of a contact is then its gap along the normal, exact to
-first order, as sliding changes it no more.
+Contact points slide on the skin after each step. What remains of a contact is its gap along the normal, which
+sliding does not change to first order.
 """
 
 from __future__ import annotations
@@ -22,76 +23,86 @@ from handsim.hand.shape import HandShape
 from handsim.hand.skin.surface import build_surface
 from handsim.hand.topology import NUM_BONES
 from handsim.kernels.integration import move
-from track.calibration.contacts import PRESS, Contacts, Meeting, meet, trust
+from track.calibration.contacts import (
+    PAD_COMPRESSION,
+    ContactGeometry,
+    Contacts,
+    contact_geometry,
+    contact_weights,
+)
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
     shape_at,
+    shape_jacobian,
     shape_precision,
-    skeleton_numbers,
-    skinned,
-    skinned_shape_slopes,
-    slopes_of,
+    skeleton_parameters,
+    skinned_shape_jacobian,
+    skinning_terms,
 )
-from track.calibration.skin_walk import (
+from track.calibration.skin_coordinates import (
     Corners,
+    SkinCoordinates,
     SkinPatch,
-    SkinPlaces,
-    place_points,
-    place_weights,
-    skin_of,
-    slide,
-    weight_slopes,
+    build_skin,
+    project_onto_skin,
+    skin_points,
+    skin_weight_jacobian,
+    skin_weights,
 )
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
     from numpy.typing import NDArray
 
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
-"""Of E_prior, along the normal and in the skin (Han et al. 2018)."""
-PLACE_SPREAD: Final = 0.006
-"""How far markers slip along the skin [m]; noise over this, squared, is the paper's lambda_1."""
+"""Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
+POSITION_SPREAD: Final = 0.006
+"""Standard deviation of a marker's slip along the skin [m]; (noise / spread)^2 is the paper's lambda_1."""
 HEIGHT_SPREAD: Final = 0.0004
-"""How far a marker's center is off one radius above the skin [m]."""
+"""Standard deviation of a marker center's height around one radius above the skin [m]."""
 CONTACT_SPREAD: Final = 0.0007
-"""How far pads are from giving way by `contacts.PRESS` [m]; noise over this, squared, is lambda_2."""
-_LIMIT_SPREAD: Final = np.deg2rad(2.0)
-_REST_SPREAD: Final = np.deg2rad(90.0)
-_STALE: Final = 0.005  # log lengths, radians, meters
-_STEP: Final = 1e-5
+"""Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
+_LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
+_REST_SPREAD: Final = np.deg2rad(90.0)  # of an angle around the resting hand's
+_RELINEARIZE: Final = 0.005  # change of a parameter (log lengths, [rad], [m]) that renews the skin's jacobian
+_STEP: Final = 1e-5  # of finite differences
 _REST: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
-    """One place in the space that is searched."""
+class Estimate:
+    """All unknowns of a calibration at one iteration."""
 
     parameters: Float[np.ndarray, "53"]
+    """Hand shape, see `hand_parameters`."""
     points: Float[np.ndarray, "M 3"]
-    """Marker centers on the rest hand of this shape [m]."""
-    places: SkinPlaces
-    """The same on its skin."""
+    """Marker centers on the rest hand of this shape, in the wrist's frame [m]."""
+    coordinates: SkinCoordinates
+    """The same points in coordinates of its skin."""
     qpos: Float[np.ndarray, "F 27"]
     contacts: Contacts | None = None
-    """Frames count in `qpos`."""
+    """Their frames count in `qpos`."""
 
 
 class Fit(NamedTuple):
-    """What a guess amounts to."""
+    """Residuals and energy of an estimate."""
 
     model: HandModel
     bones: Float[np.ndarray, "F L 4 4"]
-    misses: Float[np.ndarray, "F M 3"]
+    """`T_world_bone` in every frame."""
+    residuals: Float[np.ndarray, "F M 3"]
     """Model minus marker [m], zero where a marker is missing."""
-    off_design: Float[np.ndarray, "M 3"]
-    """Marker minus where the glove as designed has it on this hand [m]."""
+    design_residuals: Float[np.ndarray, "M 3"]
+    """Marker minus its position by the glove's design on this hand, in the wrist's frame [m]."""
     normals: Float[np.ndarray, "M 3"]
-    meeting: Meeting | None
+    """Unit normals of the rest skin under the markers."""
+    geometry: ContactGeometry | None
+    """How the pads of the contacts lie to each other."""
     cost: float
 
 
-class Equations(NamedTuple):
-    """Normal equations: of each pose (P), between poses and what is shared (S), and of what is shared."""
+class NormalEquations(NamedTuple):
+    """Gauss-Newton matrix and gradient in blocks: the poses of each frame, and the S shared unknowns."""
 
     pose: Float[np.ndarray, "F 26 26"]
     mixed: Float[np.ndarray, "F 26 S"]
@@ -101,83 +112,86 @@ class Equations(NamedTuple):
 
 
 class Problem:
-    """What a hand is calibrated with; only the reach is narrowed, once a hand nearly fits.
+    """The data of a calibration; only `robust_scale` changes, once a hand nearly fits.
 
     Args:
-        shape: The right hand to begin with.
-        design: Where the glove as designed sits on its skin.
-        radius: Of the markers [m].
-        targets: Labeled markers of the chosen frames (F, M, 3) [m]; NaN where missing.
+        shape: Right hand that the parameters start from.
+        design: Skin coordinates of the markers by the glove's design.
+        radius: Radius of the markers [m].
+        targets: Labeled markers of the chosen frames [m]; NaN where missing.
         noise: Standard deviation of a marker's coordinates [m].
-        reach: Distance from which a marker loses its say [m].
+        robust_scale: Distance [m] at which a residual has half the cost of a quadratic one
+            (Geman and McClure 1987).
     """
 
     def __init__(
         self,
         shape: HandShape,
-        design: SkinPlaces,
+        design: SkinCoordinates,
         radius: float,
         targets: Float[np.ndarray, "F M 3"],
         *,
         noise: float,
-        reach: float,
+        robust_scale: float,
     ) -> None:
         self.shape, self.design, self.radius = shape, design, radius
-        self.there = np.isfinite(targets).all(axis=2)
-        self.targets = np.where(self.there[..., None], targets, 0.0)
-        self.noise, self.reach = noise, reach
+        self.present: Bool[np.ndarray, "F M"] = np.isfinite(targets).all(axis=2)
+        """Markers that are not missing."""
+        self.targets = np.where(self.present[..., None], targets, 0.0)
+        self.noise, self.robust_scale = noise, robust_scale
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
-        self._grown: NDArray[np.float64] | None = None
-        self._grown_at = np.zeros(NUM_PARAMETERS)
+        self._surface_jacobian: NDArray[np.float64] | None = None
+        self._linearized_at = np.zeros(NUM_PARAMETERS)
 
-    def fit(self, guess: Guess) -> Fit:
-        """Residuals and energy of a guess."""
-        model = HandModel(shape_at(self.shape, guess.parameters))
-        bones = model.forward_kinematics(guess.qpos)
-        weights = place_weights(guess.places)
-        _, carried = skinned(model, bones, guess.points, weights)
-        placed = np.einsum("ml,tmli->tmi", weights, carried, optimize=True)
-        misses = np.where(self.there[..., None], placed - self.targets, 0.0)
-        faces, count = self._faces(guess), len(guess.points)
+    def fit(self, estimate: Estimate) -> Fit:
+        """Residuals and energy of an estimate."""
+        model = HandModel(shape_at(self.shape, estimate.parameters))
+        bones = model.forward_kinematics(estimate.qpos)
+        weights = skin_weights(estimate.coordinates)
+        _, by_bone = skinning_terms(model, bones, estimate.points, weights)
+        predicted = np.einsum("ml,tmli->tmi", weights, by_bone, optimize=True)
+        residuals = np.where(self.present[..., None], predicted - self.targets, 0.0)
+        faces, count = self._faces(estimate), len(estimate.points)
         corners = SkinPatch(faces).corners(model.surface.vertices)
-        _, normals = place_points(guess.places, _part(corners, 0, count))
-        design, _ = place_points(self.design, _part(corners, count, 2 * count))
-        meeting = None
-        if guess.contacts is not None:
+        _, normals = skin_points(estimate.coordinates, _part(corners, 0, count))
+        design, _ = skin_points(self.design, _part(corners, count, 2 * count))
+        geometry = None
+        if estimate.contacts is not None:
             pads = _part(corners, 2 * count, len(faces))
-            meeting = meet(guess.contacts, pads, model, bones[guess.contacts.frames])
-        fit = Fit(model, bones, misses, guess.points - design, normals, meeting, 0.0)
-        return fit._replace(cost=self._cost(guess, fit))
+            geometry = contact_geometry(estimate.contacts, pads, model, bones[estimate.contacts.frames])
+        fit = Fit(model, bones, residuals, estimate.points - design, normals, geometry, 0.0)
+        return fit._replace(cost=self._cost(estimate, fit))
 
-    def _faces(self, guess: Guess) -> NDArray[np.int64]:
-        faces = [guess.places.faces, self.design.faces]
-        if guess.contacts is not None:
-            faces += [guess.contacts.thumb_places.faces, guess.contacts.finger_places.faces]
+    def _faces(self, estimate: Estimate) -> NDArray[np.int64]:
+        """Triangles of the markers, of their design, and of the contacts on thumb and fingers."""
+        faces = [estimate.coordinates.faces, self.design.faces]
+        if estimate.contacts is not None:
+            faces += [estimate.contacts.thumb_coordinates.faces, estimate.contacts.finger_coordinates.faces]
         return np.concatenate(faces)
 
-    def _cost(self, guess: Guess, fit: Fit) -> float:
-        squares = (fit.misses**2).sum(axis=2)
-        cost = (squares / (1.0 + squares / self.reach**2)).sum() / self.noise**2
-        cost += guess.parameters @ self.precision @ guess.parameters
-        cost += (fit.off_design * self._place_pull(fit, fit.off_design)).sum()
-        cost += ((guess.places.heights - self.radius) ** 2).sum() / HEIGHT_SPREAD**2
-        values, weights = self._angle_pulls(guess)
+    def _cost(self, estimate: Estimate, fit: Fit) -> float:
+        squares = (fit.residuals**2).sum(axis=2)
+        cost = (squares / (1.0 + squares / self.robust_scale**2)).sum() / self.noise**2
+        cost += estimate.parameters @ self.precision @ estimate.parameters
+        cost += (fit.design_residuals * self._apply_position_precision(fit, fit.design_residuals)).sum()
+        cost += ((estimate.coordinates.heights - self.radius) ** 2).sum() / HEIGHT_SPREAD**2
+        values, weights = self._joint_angle_residuals(estimate)
         cost += (weights * values**2).sum()
-        if fit.meeting is not None and guess.contacts is not None:
-            weights = trust(fit.meeting, guess.contacts.fingers)
-            cost += (weights * fit.meeting.gaps**2).sum() / CONTACT_SPREAD**2
+        if fit.geometry is not None and estimate.contacts is not None:
+            weights = contact_weights(fit.geometry, estimate.contacts.fingers)
+            cost += (weights * fit.geometry.gaps**2).sum() / CONTACT_SPREAD**2
         return float(cost)
 
-    def _place_pull(self, fit: Fit, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """E_prior's matrix times vectors (M, 3)."""
+    def _apply_position_precision(self, fit: Fit, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """E_prior's precision matrix of each marker [1/m^2] times vectors (M, 3)."""
         along = (vectors * fit.normals).sum(axis=1, keepdims=True) * fit.normals
-        pull: NDArray[np.float64] = ALPHA_ALONG * vectors + (ALPHA_NORMAL - ALPHA_ALONG) * along
-        return pull / PLACE_SPREAD**2
+        product: NDArray[np.float64] = ALPHA_ALONG * vectors + (ALPHA_NORMAL - ALPHA_ALONG) * along
+        return product / POSITION_SPREAD**2
 
-    def _angle_pulls(self, guess: Guess) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What shall be small of the hinges (F, 40), and how much each counts."""
-        angles = guess.qpos[:, 7:]
+    def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Residuals of the joint angles (F, 40) [rad] to their limits and to rest, and their weights."""
+        angles = estimate.qpos[:, 7:]
         low, high = self._ranges.T
         beyond = np.maximum(angles - high, 0.0) + np.minimum(angles - low, 0.0)
         values = np.concatenate([beyond, angles - _REST], axis=1)
@@ -186,137 +200,171 @@ class Problem:
         )
         return values, weights
 
-    def equations(self, guess: Guess, fit: Fit) -> Equations:
-        """Gauss-Newton's equations, unknowns shared by all frames in the order parameters, markers."""
-        count = len(guess.points)
+    def normal_equations(self, estimate: Estimate, fit: Fit) -> NormalEquations:
+        """Gauss-Newton's equations; the shared unknowns are the parameters, then three per marker [m]."""
+        count = len(estimate.points)
         skin = fit.model.surface.vertices
-        patch = SkinPatch(self._faces(guess))
-        corners, rest = patch.corners(skin), self._rest_slopes(guess, patch, skin)
-        raw = slopes_of(self.shape, guess.parameters, skeleton_numbers)
-        by_pose, by_shared = self._marker_slopes(guess, fit, _part(corners, 0, count), rest[:count], raw)
-        squares = (fit.misses**2).sum(axis=2)
-        weights = self.there / (1.0 + squares / self.reach**2) ** 2 / self.noise**2
+        patch = SkinPatch(self._faces(estimate))
+        corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
+        skeleton = shape_jacobian(self.shape, estimate.parameters, skeleton_parameters)
+        by_pose, by_shared = self._marker_jacobians(
+            estimate, fit, _part(corners, 0, count), rest[:count], skeleton
+        )
+        squares = (fit.residuals**2).sum(axis=2)
+        weights = self.present / (1.0 + squares / self.robust_scale**2) ** 2 / self.noise**2
         rows = np.repeat(weights, 3, axis=1)[..., None]
-        residual = fit.misses.reshape(len(fit.misses), -1, 1)
+        residual = fit.residuals.reshape(len(fit.residuals), -1, 1)
         pose = by_pose.swapaxes(1, 2) @ (rows * by_pose)
         mixed = by_pose.swapaxes(1, 2) @ (rows * by_shared)
         flat = (np.sqrt(rows) * by_shared).reshape(-1, by_shared.shape[2])
         shared = flat.T @ flat
         pose_gradient = (by_pose.swapaxes(1, 2) @ (rows * residual))[..., 0]
         shared_gradient = np.einsum("fns,fn->s", by_shared, (rows * residual)[..., 0])
-        result = Equations(pose, mixed, shared, pose_gradient, shared_gradient)
-        self._add_priors(guess, fit, rest[:count] - rest[count : 2 * count], result)
-        if guess.contacts is not None and fit.meeting is not None:
-            self._add_contacts(guess, fit, rest[2 * count :], raw, result)
+        result = NormalEquations(pose, mixed, shared, pose_gradient, shared_gradient)
+        self._add_priors(estimate, fit, rest[:count] - rest[count : 2 * count], result)
+        if estimate.contacts is not None and fit.geometry is not None:
+            self._add_contacts(estimate, fit, rest[2 * count :], skeleton, result)
         return result
 
-    def _rest_slopes(self, guess: Guess, patch: SkinPatch, skin: NDArray[np.float64]) -> NDArray[np.float64]:
-        """How places on the rest skin move by the parameters (P, 3, 53).
+    def _rest_jacobian(
+        self, estimate: Estimate, patch: SkinPatch, skin: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Derivative of points at fixed skin coordinates on the rest hand by the parameters (P, 3, 53).
 
-        The skin is built anew for every guess, its derivative only where a parameter has changed by 0.005 or
-        more: that moves the end by less than a micrometer, while four times as much is felt.
+        The skin is built for every estimate, its derivative only when a parameter has changed by 0.005 or
+        more: that changes the result by less than a micrometer, while four times as much is noticeable.
         """
-        if self._grown is None or np.abs(guess.parameters - self._grown_at).max() > _STALE:
-            self._grown = slopes_of(self.shape, guess.parameters, lambda shape: build_surface(shape).vertices)
-            self._grown_at = guess.parameters
-        places = self._all_places(guess)
-        here, _ = place_points(places, patch.corners(skin))
+        if (
+            self._surface_jacobian is None
+            or np.abs(estimate.parameters - self._linearized_at).max() > _RELINEARIZE
+        ):
+            self._surface_jacobian = shape_jacobian(
+                self.shape, estimate.parameters, lambda shape: build_surface(shape).vertices
+            )
+            self._linearized_at = estimate.parameters
+        coordinates = self._all_coordinates(estimate)
+        here, _ = skin_points(coordinates, patch.corners(skin))
         columns = []
         for number in range(NUM_PARAMETERS):
-            grown = skin + _STEP * self._grown[..., number]
-            columns.append((place_points(places, patch.corners(grown))[0] - here) / _STEP)
+            grown = skin + _STEP * self._surface_jacobian[..., number]
+            columns.append((skin_points(coordinates, patch.corners(grown))[0] - here) / _STEP)
         return np.stack(columns, axis=-1)
 
-    def _all_places(self, guess: Guess) -> SkinPlaces:
-        parts = [guess.places, self.design]
-        if guess.contacts is not None:
+    def _all_coordinates(self, estimate: Estimate) -> SkinCoordinates:
+        """Of the markers, of their design, and of compressed pads at the contacts, as in `_faces`."""
+        parts = [estimate.coordinates, self.design]
+        if estimate.contacts is not None:
             parts += [
-                side._replace(heights=np.full(len(guess.contacts.frames), -PRESS))
-                for side in (guess.contacts.thumb_places, guess.contacts.finger_places)
+                side._replace(heights=np.full(len(estimate.contacts.frames), -PAD_COMPRESSION))
+                for side in (estimate.contacts.thumb_coordinates, estimate.contacts.finger_coordinates)
             ]
-        return SkinPlaces(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        return SkinCoordinates(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
-    def _marker_slopes(
-        self, guess: Guess, fit: Fit, corners: Corners, rest: NDArray[np.float64], raw: NDArray[np.float64]
+    def _marker_jacobians(
+        self,
+        estimate: Estimate,
+        fit: Fit,
+        corners: Corners,
+        rest: NDArray[np.float64],
+        skeleton: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Derivatives of all markers by the poses (F, 3 M, 26) and by what is shared (F, 3 M, S)."""
-        frames, count = len(guess.qpos), len(guess.points)
-        weights = place_weights(guess.places)
-        everywhere = np.tile(np.arange(NUM_BONES), (count, 1))
-        by_pose = skinned_jacobian(fit.model, fit.bones, guess.points, everywhere, weights)
-        by_shape = skinned_shape_slopes(fit.model, fit.bones, guess.points, weights) @ raw
-        turns, carried = skinned(fit.model, fit.bones, guess.points, weights)
-        by_shape += turns @ rest
-        turns += np.einsum("tmli,mlj->tmij", carried, weight_slopes(guess.places, corners), optimize=True)
+        """Jacobians of all markers by the poses (F, 3 M, 26) and by the shared unknowns (F, 3 M, S)."""
+        frames, count = len(estimate.qpos), len(estimate.points)
+        weights = skin_weights(estimate.coordinates)
+        all_bones = np.tile(np.arange(NUM_BONES), (count, 1))
+        by_pose = skinned_jacobian(fit.model, fit.bones, estimate.points, all_bones, weights)
+        by_shape = skinned_shape_jacobian(fit.model, fit.bones, estimate.points, weights) @ skeleton
+        by_point, by_bone = skinning_terms(fit.model, fit.bones, estimate.points, weights)
+        by_shape += by_point @ rest
+        weight_jacobian = skin_weight_jacobian(estimate.coordinates, corners)
+        by_point += np.einsum("tmli,mlj->tmij", by_bone, weight_jacobian, optimize=True)
         by_shared = np.zeros((frames, count, 3, NUM_PARAMETERS + 3 * count))
         by_shared[..., :NUM_PARAMETERS] = by_shape
         for marker in range(count):
             first = NUM_PARAMETERS + 3 * marker
-            by_shared[:, marker, :, first : first + 3] = turns[:, marker]
+            by_shared[:, marker, :, first : first + 3] = by_point[:, marker]
         return by_pose.reshape(frames, 3 * count, -1), by_shared.reshape(frames, 3 * count, -1)
 
-    def _add_priors(self, guess: Guess, fit: Fit, off_slopes: NDArray[np.float64], result: Equations) -> None:
-        count = len(guess.points)
+    def _add_priors(
+        self, estimate: Estimate, fit: Fit, design_jacobian: NDArray[np.float64], result: NormalEquations
+    ) -> None:
+        """Add the priors; `design_jacobian` (M, 3, 53): marker minus design, at fixed skin coordinates."""
+        count = len(estimate.points)
         first = NUM_PARAMETERS
         result.shared[:first, :first] += self.precision
-        result.shared_gradient[:first] += self.precision @ guess.parameters
-        slopes = np.concatenate([off_slopes, np.zeros((count, 3, 3 * count))], axis=2)
+        result.shared_gradient[:first] += self.precision @ estimate.parameters
+        jacobian = np.concatenate([design_jacobian, np.zeros((count, 3, 3 * count))], axis=2)
         heights = np.zeros((count, result.shared.shape[0]))
         for marker in range(count):
             mine = slice(first + 3 * marker, first + 3 * marker + 3)
-            slopes[marker, :, mine] = np.eye(3)
+            jacobian[marker, :, mine] = np.eye(3)
             heights[marker, mine] = fit.normals[marker]
-        pulled = np.stack([self._place_pull(fit, slopes[..., s]) for s in range(slopes.shape[2])], axis=-1)
-        result.shared[:] += np.einsum("mis,mir->sr", slopes, pulled, optimize=True)
-        result.shared_gradient[:] += np.einsum("mi,mis->s", fit.off_design, pulled)
+        columns = [self._apply_position_precision(fit, jacobian[..., s]) for s in range(jacobian.shape[2])]
+        weighted = np.stack(columns, axis=-1)
+        result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
+        result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
         result.shared[:] += heights.T @ heights / HEIGHT_SPREAD**2
-        result.shared_gradient[:] += (guess.places.heights - self.radius) @ heights / HEIGHT_SPREAD**2
-        values, weights = self._angle_pulls(guess)
-        hinge = np.arange(6, 26)
-        result.pose[:, hinge, hinge] += weights[:, :20] + weights[:, 20:]
+        result.shared_gradient[:] += (estimate.coordinates.heights - self.radius) @ heights / HEIGHT_SPREAD**2
+        values, weights = self._joint_angle_residuals(estimate)
+        angles = np.arange(6, 26)
+        result.pose[:, angles, angles] += weights[:, :20] + weights[:, 20:]
         result.pose_gradient[:, 6:] += (weights * values)[:, :20] + (weights * values)[:, 20:]
 
     def _add_contacts(
-        self, guess: Guess, fit: Fit, rest: NDArray[np.float64], raw: NDArray[np.float64], result: Equations
+        self,
+        estimate: Estimate,
+        fit: Fit,
+        rest: NDArray[np.float64],
+        skeleton: NDArray[np.float64],
+        result: NormalEquations,
     ) -> None:
-        contacts, meeting = guess.contacts, fit.meeting
+        """Add each contact's gap; `rest` (2 K, 3, 53): jacobian of the pads' rest points."""
+        contacts, geometry = estimate.contacts, fit.geometry
         assert contacts is not None
-        assert meeting is not None
+        assert geometry is not None
         count = len(contacts.frames)
-        places = self._all_places(guess)
-        pads = SkinPlaces(*(values[len(values) - 2 * count :] for values in places))
-        points, _ = place_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
-        weights = place_weights(pads)
-        say = trust(meeting, contacts.fingers) / CONTACT_SPREAD**2
-        everywhere = np.tile(np.arange(NUM_BONES), (2, 1))
+        coordinates = self._all_coordinates(estimate)
+        pads = SkinCoordinates(*(values[len(values) - 2 * count :] for values in coordinates))
+        points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
+        weights = skin_weights(pads)
+        precision = contact_weights(geometry, contacts.fingers) / CONTACT_SPREAD**2
+        all_bones = np.tile(np.arange(NUM_BONES), (2, 1))
         for number, frame in enumerate(contacts.frames):
             both = [number, count + number]
             bones, share = fit.bones[frame : frame + 1], weights[both]
-            by_pose = skinned_jacobian(fit.model, bones, points[both], everywhere, share)[0]
-            by_shape = skinned_shape_slopes(fit.model, bones, points[both], share)[0] @ raw
-            by_shape += skinned(fit.model, bones, points[both], share)[0][0] @ rest[both]
-            way = meeting.directions[number]
-            pose = way @ (by_pose[1] - by_pose[0])
+            by_pose = skinned_jacobian(fit.model, bones, points[both], all_bones, share)[0]
+            by_shape = skinned_shape_jacobian(fit.model, bones, points[both], share)[0] @ skeleton
+            by_shape += skinning_terms(fit.model, bones, points[both], share)[0][0] @ rest[both]
+            direction = geometry.directions[number]
+            pose = direction @ (by_pose[1] - by_pose[0])
             shared = np.zeros(result.shared.shape[0])
-            shared[:NUM_PARAMETERS] = way @ (by_shape[1] - by_shape[0])
-            result.pose[frame] += say[number] * np.outer(pose, pose)
-            result.mixed[frame] += say[number] * np.outer(pose, shared)
-            result.shared[:] += say[number] * np.outer(shared, shared)
-            result.pose_gradient[frame] += say[number] * meeting.gaps[number] * pose
-            result.shared_gradient[:] += say[number] * meeting.gaps[number] * shared
+            shared[:NUM_PARAMETERS] = direction @ (by_shape[1] - by_shape[0])
+            result.pose[frame] += precision[number] * np.outer(pose, pose)
+            result.mixed[frame] += precision[number] * np.outer(pose, shared)
+            result.shared[:] += precision[number] * np.outer(shared, shared)
+            result.pose_gradient[frame] += precision[number] * geometry.gaps[number] * pose
+            result.shared_gradient[:] += precision[number] * geometry.gaps[number] * shared
 
-    def moved(
-        self, guess: Guess, pose_step: Float[np.ndarray, "F 26"], shared_step: Float[np.ndarray, "S"]
-    ) -> Guess:
-        """The guess after a step, its markers found again on the new hand's skin."""
-        parameters = guess.parameters + shared_step[:NUM_PARAMETERS]
+    def apply_step(
+        self, estimate: Estimate, pose_step: Float[np.ndarray, "F 26"], shared_step: Float[np.ndarray, "S"]
+    ) -> Estimate:
+        """The estimate after a step, with new coordinates of its markers on the new hand's skin.
+
+        Args:
+            estimate: The estimate before the step.
+            pose_step: Change of each pose [m, rad], in tangent coordinates of qpos; clipped at 0.5.
+            shared_step: Change of the parameters, then of each marker's rest position [m].
+        """
+        parameters = estimate.parameters + shared_step[:NUM_PARAMETERS]
         shape = shape_at(self.shape, parameters)
-        skin = skin_of(shape)
-        carried, _ = place_points(guess.places, skin.corners(guess.places.faces))
+        skin = build_skin(shape)
+        carried, _ = skin_points(estimate.coordinates, skin.corners(estimate.coordinates.faces))
         points = carried + shared_step[NUM_PARAMETERS:].reshape(-1, 3)
-        qpos = move(guess.qpos, np.clip(pose_step, -0.5, 0.5))
-        places = slide(guess.places, points, skin)
-        return dataclasses.replace(guess, parameters=parameters, points=points, places=places, qpos=qpos)
+        qpos = move(estimate.qpos, np.clip(pose_step, -0.5, 0.5))
+        coordinates = project_onto_skin(estimate.coordinates, points, skin)
+        return dataclasses.replace(
+            estimate, parameters=parameters, points=points, coordinates=coordinates, qpos=qpos
+        )
 
 
 def _part(corners: Corners, first: int, last: int) -> Corners:

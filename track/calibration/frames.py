@@ -1,4 +1,4 @@
-"""Frames of a capture: which a calibration can use, their poses, and which of them tell most."""
+"""Frames of a capture: those that a calibration can use, their poses, and the most informative of them."""
 
 from __future__ import annotations
 
@@ -14,31 +14,35 @@ from track.calibration.report import ENOUGH_RANGE, still_joints
 from track.kinematics.pose_solver import PoseSolver
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
     from numpy.typing import NDArray
 
 NUM_FRAMES: Final = 160
+"""Frames that a calibration is solved on."""
 FEWEST_FRAMES: Final = 100
-_CANDIDATES: Final = 800
-_SOLVABLE: Final = 6  # markers at least
-_SHARE: Final = 0.75  # of the markers
-_STEADY: Final = 3.0  # times the usual RMS
+"""Usable frames without which a capture is refused."""
+_INITIAL_FRAMES: Final = 800
+_FEWEST_MARKERS: Final = 6  # that a frame must have
+_MARKER_SHARE: Final = 0.75  # of the markers that a frame must have
+_MOST_RMS: Final = 3.0  # times the median RMS, up to which a frame is used
 
 
 class CalibrationError(HandSimError):
-    """A capture that says too little of the hand."""
+    """A capture that does not determine what is calibrated from it."""
 
 
-class Track(NamedTuple):
-    """Poses of some frames."""
+class PoseTrack(NamedTuple):
+    """Poses of K frames of a capture."""
 
-    frames: NDArray[np.int64]
-    qpos: NDArray[np.float64]
-    rms: NDArray[np.float64]
+    frames: Int[np.ndarray, "K"]
+    """Their numbers in the capture."""
+    qpos: Float[np.ndarray, "K 27"]
+    rms: Float[np.ndarray, "K"]
+    """3D RMS distance of the markers from the model's [m]."""
 
 
 def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float) -> NDArray[np.float64]:
-    """A copy in which a marker is there or NaN.
+    """A copy of the markers [m] in which a marker has three finite coordinates or three NaN.
 
     Raises:
         ArgumentError: `markers` do not fit the glove, or `rate` is not positive.
@@ -54,13 +58,13 @@ def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: fl
 
 
 def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArray[np.int64]:
-    """Frames with enough markers to be looked at.
+    """Numbers of the frames with enough markers for a pose.
 
     Raises:
-        CalibrationError: They are too few.
+        CalibrationError: There are fewer than `FEWEST_FRAMES`.
     """
     count = markers.shape[1]
-    needed = min(count, max(_SOLVABLE, round(_SHARE * count)))
+    needed = min(count, max(_FEWEST_MARKERS, round(_MARKER_SHARE * count)))
     usable = np.flatnonzero(np.isfinite(markers[..., 0]).sum(axis=1) >= needed)
     if len(usable) < FEWEST_FRAMES:
         raise CalibrationError(
@@ -70,51 +74,63 @@ def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArra
     return usable
 
 
-def follow(
+def solve_poses(
     markers: Float[np.ndarray, "T M 3"],
     hand: GloveFit,
     frames: NDArray[np.int64],
     initial: NDArray[np.float64] | None = None,
-) -> Track:
-    """Poses of some frames."""
-    found = PoseSolver(hand).solve(markers[frames], initial)
-    return Track(frames, found.qpos, found.rms)
+) -> PoseTrack:
+    """Solve the poses of some frames.
+
+    Args:
+        markers: All markers of the capture [m]; NaN where missing.
+        hand: The hand and its glove.
+        frames: Numbers of the frames (K,).
+        initial: Poses to start from (K, 27).
+    """
+    solved = PoseSolver(hand).solve(markers[frames], initial)
+    return PoseTrack(frames, solved.qpos, solved.rms)
 
 
-def first_look(markers: Float[np.ndarray, "T M 3"], hand: GloveFit, usable: NDArray[np.int64]) -> Track:
-    """Poses of frames all along the capture, on the hand that a calibration begins with."""
-    return follow(markers, hand, usable[:: max(1, len(usable) // _CANDIDATES)])
+def initial_poses(
+    markers: Float[np.ndarray, "T M 3"], hand: GloveFit, usable: NDArray[np.int64]
+) -> PoseTrack:
+    """Poses of frames spread over the capture, on the hand that a calibration begins with."""
+    return solve_poses(markers, hand, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
 
 
-def check_motion(track: Track, whole: Bool[np.ndarray, "T 5"], hand: GloveFit) -> None:
-    """See that the hand moves.
+def check_motion(track: PoseTrack, complete: Bool[np.ndarray, "T 5"], hand: GloveFit) -> None:
+    """Check that the hand moves.
 
     Raises:
-        CalibrationError: More than half of its hinges are still.
+        CalibrationError: More than half of its joints are still.
     """
-    still = still_joints(track.qpos[:, 7:], whole[track.frames], hand.model)
+    still = still_joints(track.qpos[:, 7:], complete[track.frames], hand.model)
     if 2 * len(still) > NUM_JOINTS:
         raise CalibrationError(
-            f"{len(still)} of the {hand.side} hand's {NUM_JOINTS} hinges cover less than {ENOUGH_RANGE:.0%} "
-            "of their range while their digit's markers are all there, expected a capture in which all move"
+            f"{len(still)} of the {hand.side} hand's {NUM_JOINTS} joints cover less than {ENOUGH_RANGE:.0%} "
+            "of their range while all markers of their digit are seen, expected a capture in which all move"
         )
 
 
-def whole_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
-    """Whether all markers of a digit are there."""
-    there = np.isfinite(markers[..., 0])
+def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:
+    """Whether all markers of a digit are seen."""
+    present = np.isfinite(markers[..., 0])
     bones = attachment.main_bones
     digits = np.array([BONES[bone].digit for bone in bones])
-    return np.stack([there[:, digits == digit].all(axis=1) for digit in range(len(DIGITS))], axis=1)
+    return np.stack([present[:, digits == digit].all(axis=1) for digit in range(len(DIGITS))], axis=1)
 
 
-def telling_frames(track: Track, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
-    """Places in a track of frames as unlike each other as can be, those that lack no marker first."""
-    lacking = np.isnan(markers[track.frames, :, 0]).sum(axis=1)
-    steady = track.rms <= _STEADY * np.median(track.rms)
+def informative_frames(track: PoseTrack, markers: Float[np.ndarray, "T M 3"]) -> NDArray[np.int64]:
+    """Indices into a track of up to `NUM_FRAMES` frames with poses as different as possible.
+
+    Frames without missing markers are preferred; frames with an unusual RMS are left out.
+    """
+    missing = np.isnan(markers[track.frames, :, 0]).sum(axis=1)
+    well_fitted = track.rms <= _MOST_RMS * np.median(track.rms)
     for allowed in range(markers.shape[1]):
-        candidates = np.flatnonzero((lacking <= allowed) & steady)
-        if len(candidates) >= min(3 * NUM_FRAMES, steady.sum()):
+        candidates = np.flatnonzero((missing <= allowed) & well_fitted)
+        if len(candidates) >= min(3 * NUM_FRAMES, well_fitted.sum()):
             break
     angles = track.qpos[candidates, 7:]
     distance = np.full(len(candidates), np.inf)

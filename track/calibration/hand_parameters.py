@@ -1,13 +1,13 @@
-"""A hand's shape as a short vector around a first guess, what people differ by, and how points follow.
+"""A hand's shape as 53 parameters around an initial shape: their prior, and jacobians of skinned points.
 
-Everything is a right hand's. Lengths and breadth scale the whole hand; bones, knuckles, directions of the
-digits, girths and the palm's thickness vary on top, as `handsim.hand.shape.sample_shape` has it.
+All shapes are of right hands. Length and breadth scale the whole hand; bone lengths, knuckles, directions of
+the digits, girths and the palm's thickness vary in addition, as in `handsim.hand.shape.sample_shape`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numba
 import numpy as np
@@ -23,23 +23,23 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-LENGTH, BREADTH = 0, 1
-BONE_LENGTHS: Final = slice(2, 17)
-KNUCKLES: Final = slice(17, 32)
-DIRECTIONS: Final = slice(32, 47)
-GIRTHS: Final = slice(47, 52)
-THICKNESS: Final = 52
+LENGTH, BREADTH = 0, 1  # log factors
+BONE_LENGTHS: Final = slice(2, 17)  # log factors, three per digit
+KNUCKLES: Final = slice(17, 32)  # [m], three per digit
+DIRECTIONS: Final = slice(32, 47)  # base angles [rad], three per digit
+GIRTHS: Final = slice(47, 52)  # log factors, one per digit
+THICKNESS: Final = 52  # log factor
 NUM_PARAMETERS: Final = 53
-# Standard deviations. The nearest of five sizes may be a size off and more; length and breadth go together
-# (ANSUR II). Real knuckles are taken to vary twice as much as the simulated population's.
+# Standard deviations. The nearest of five sizes may be a size off and more; length and breadth are correlated
+# (ANSUR II). Real knuckles are assumed to vary twice as much as the simulated population's.
 _SIZE_SPREAD: Final = 0.09
 _SIZE_CORRELATION: Final = 0.6
 _KNUCKLE_SPREAD: Final = 2.0 * ADULTS.knuckle_spread
-_STEP: Final = 1e-5
+_STEP: Final = 1e-5  # of finite differences
 
 
 def shape_at(start: HandShape, parameters: Float[np.ndarray, "53"]) -> HandShape:
-    """The hand of these parameters, which are zero for `start`."""
+    """The shape of these parameters; zeros give `start`."""
     along, across = np.exp(parameters[LENGTH]), np.exp(parameters[BREADTH])
     return dataclasses.replace(
         start,
@@ -54,7 +54,7 @@ def shape_at(start: HandShape, parameters: Float[np.ndarray, "53"]) -> HandShape
 
 
 def shape_precision() -> Float[np.ndarray, "53 53"]:
-    """Inverse covariance of the parameters among people."""
+    """Information matrix of the prior: inverse covariance of the parameters among people."""
     covariance = np.zeros((NUM_PARAMETERS, NUM_PARAMETERS))
     covariance[:2, :2] = _SIZE_SPREAD**2 * np.array([[1.0, _SIZE_CORRELATION], [_SIZE_CORRELATION, 1.0]])
     a_digit = np.kron(np.eye(len(DIGITS)), np.ones((3, 3)))
@@ -68,12 +68,18 @@ def shape_precision() -> Float[np.ndarray, "53 53"]:
     return np.linalg.inv(covariance)
 
 
-def slopes_of(
+def shape_jacobian(
     start: HandShape,
     parameters: Float[np.ndarray, "53"],
     function: Callable[[HandShape], NDArray[np.float64]],
 ) -> Float[np.ndarray, "*shape 53"]:
-    """Derivative of whatever a shape decides by the parameters, by finite differences."""
+    """Derivative of a function of the shape by the parameters, by finite differences.
+
+    Args:
+        start: Shape of zero parameters.
+        parameters: Where to differentiate.
+        function: Any array that depends on the shape.
+    """
     here = function(shape_at(start, parameters))
     columns = []
     for number in range(NUM_PARAMETERS):
@@ -83,38 +89,38 @@ def slopes_of(
     return np.stack(columns, axis=-1)
 
 
-def skeleton_numbers(shape: HandShape) -> Float[np.ndarray, "45"]:
-    """What of a shape the skeleton knows: bone lengths, knuckles, directions."""
+def skeleton_parameters(shape: HandShape) -> Float[np.ndarray, "45"]:
+    """The part of a shape that determines the skeleton: bone lengths [m], knuckles [m], base angles [rad]."""
     return np.concatenate([shape.bone_lengths.ravel(), shape.knuckles.ravel(), shape.base_angles.ravel()])
 
 
-def skinned_shape_slopes(
+def skinned_shape_jacobian(
     model: HandModel,
     T_world_bone: Float[np.ndarray, "T L 4 4"],
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> Float[np.ndarray, "T M 3 45"]:
-    """Derivative of skinned points by `skeleton_numbers`, the rest points and the poses held.
+    """Derivative of skinned points by `skeleton_parameters`, with rest points and poses held fixed.
 
-    A longer bone carries all beyond it outwards, in the pose and at rest alike; what is seen is the
-    difference, as the rest transform is undone first.
+    A longer bone moves all bones beyond it, in the pose and at rest. Skinning undoes the rest transform, so
+    the derivative is the difference of the two.
 
     Args:
         model: A right hand.
-        T_world_bone: Its bones.
-        points: Rest positions [m].
-        weights: Shares of all bones.
+        T_world_bone: Its bones [m].
+        points: Rest positions in the wrist's frame [m].
+        weights: Skinning weights of all bones.
     """
     rest = model.rest_transforms
-    slopes = np.zeros((len(T_world_bone), len(points), 3, 45))
-    _fill_slopes(
-        np.ascontiguousarray(T_world_bone), rest, points, weights, _turning_axes(model.shape), slopes
+    jacobian = np.zeros((len(T_world_bone), len(points), 3, 45))
+    _fill_jacobian(
+        np.ascontiguousarray(T_world_bone), rest, points, weights, _base_angle_axes(model.shape), jacobian
     )
-    return slopes
+    return jacobian
 
 
-def _turning_axes(shape: HandShape) -> Float[np.ndarray, "5 3 3"]:
-    """Axes (the last index) in the palm about which a digit turns when each of its base angles grows."""
+def _base_angle_axes(shape: HandShape) -> Float[np.ndarray, "5 3 3"]:
+    """Axes (the last index) in the palm about which a digit rotates when one of its base angles grows."""
     here = build_skeleton(shape).rotations[1::3]
     axes = np.empty((5, 3, 3))
     for angle in range(3):
@@ -130,54 +136,107 @@ def _turning_axes(shape: HandShape) -> Float[np.ndarray, "5 3 3"]:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _fill_slopes(bones: Any, rest: Any, points: Any, weights: Any, axes: Any, slopes: Any) -> None:
-    turn = np.empty((3, 3))
+def _fill_jacobian(
+    bones: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    points: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    jacobian: NDArray[np.float64],
+) -> None:
+    """Kernel of `skinned_shape_jacobian`.
+
+    Args:
+        bones: `T_world_bone` (T, L, 4, 4) [m].
+        rest: Rest transforms of the bones in the wrist's frame (L, 4, 4) [m].
+        points: Rest positions (M, 3) [m].
+        weights: Skinning weights (M, L).
+        axes: Axes of the base angles in the palm (5, 3, 3).
+        jacobian: Added to (T, M, 3, 45).
+    """
+    rotation = np.empty((3, 3))
     for frame in range(len(bones)):
         for bone in range(1, NUM_BONES):
             own = bones[frame, bone]
             for i in range(3):
                 for j in range(3):
-                    turn[i, j] = 0.0
+                    rotation[i, j] = 0.0
                     for k in range(3):
-                        turn[i, j] += own[i, k] * rest[bone, j, k]
+                        rotation[i, j] += own[i, k] * rest[bone, j, k]
             for point in range(len(points)):
                 share = weights[point, bone]
                 if share != 0.0:
-                    _add_share(
-                        slopes[frame, point], bone, share, points[point], bones[frame], rest, turn, axes
+                    _add_bone(
+                        jacobian[frame, point], bone, share, points[point], bones[frame], rest, rotation, axes
                     )
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _add_share(
-    row: Any, bone: Any, share: Any, point: Any, bones: Any, rest: Any, turn: Any, axes: Any
+def _add_bone(
+    row: NDArray[np.float64],
+    bone: int,
+    share: float,
+    point: NDArray[np.float64],
+    bones: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    axes: NDArray[np.float64],
 ) -> None:
-    """What one bone's share adds to a point's slopes; `turn` is how it is turned from rest."""
-    digit, place, first = (bone - 1) // 3, (bone - 1) % 3, bone - (bone - 1) % 3
+    """Add one bone's share of a point's jacobian.
+
+    Args:
+        row: Jacobian of the point (3, 45), added to.
+        bone: Index of the bone, not the palm.
+        share: Its skinning weight.
+        point: Rest position (3,) [m].
+        bones: `T_world_bone` of one frame (L, 4, 4) [m].
+        rest: Rest transforms of the bones in the wrist's frame (L, 4, 4) [m].
+        rotation: The bone's rotation from rest to the world (3, 3).
+        axes: Axes of the base angles in the palm (5, 3, 3).
+    """
+    digit, index, first = (bone - 1) // 3, (bone - 1) % 3, bone - (bone - 1) % 3
     carried, arm = np.empty(3), np.empty(3)
     for i in range(3):
         carried[i] = bones[bone, i, 3] - bones[first, i, 3]
         arm[i] = point[i] - rest[first, i, 3]
         for j in range(3):
-            carried[i] += turn[i, j] * (point[j] - rest[bone, j, 3])
-    for segment in range(place):  # the bones before this one
+            carried[i] += rotation[i, j] * (point[j] - rest[bone, j, 3])
+    for segment in range(index):  # the bones before this one
         other = first + segment
         for i in range(3):
             moved = bones[other, i, 0]
             for j in range(3):
-                moved -= turn[i, j] * rest[other, j, 0]
+                moved -= rotation[i, j] * rest[other, j, 0]
             row[i, 3 * digit + segment] += share * moved
     for axis in range(3):
         for i in range(3):
-            row[i, 15 + 3 * digit + axis] += share * (bones[0, i, axis] - turn[i, axis])
-        _add_turn(row, 30 + 3 * digit + axis, share, bones[0], turn, axes[digit, axis], carried, arm)
+            row[i, 15 + 3 * digit + axis] += share * (bones[0, i, axis] - rotation[i, axis])
+        _add_rotation(row, 30 + 3 * digit + axis, share, bones[0], rotation, axes[digit, axis], carried, arm)
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _add_turn(
-    row: Any, column: Any, share: Any, wrist: Any, turn: Any, axis: Any, carried: Any, arm: Any
+def _add_rotation(
+    row: NDArray[np.float64],
+    column: int,
+    share: float,
+    wrist: NDArray[np.float64],
+    rotation: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    carried: NDArray[np.float64],
+    arm: NDArray[np.float64],
 ) -> None:
-    """A digit's new direction turns the posed point about the knuckle; the rest transform turns it back."""
+    """Add the derivative by one base angle: a rotation of the digit about its knuckle, posed minus at rest.
+
+    Args:
+        row: Jacobian of the point (3, 45), added to.
+        column: The base angle's column.
+        share: The bone's skinning weight.
+        wrist: `T_world_wrist` (4, 4) [m].
+        rotation: The bone's rotation from rest to the world (3, 3).
+        axis: Axis of the base angle in the palm (3,).
+        carried: Posed point minus knuckle, in the world (3,) [m].
+        arm: Rest point minus knuckle, in the wrist's frame (3,) [m].
+    """
     x = wrist[0, 0] * axis[0] + wrist[0, 1] * axis[1] + wrist[0, 2] * axis[2]
     y = wrist[1, 0] * axis[0] + wrist[1, 1] * axis[1] + wrist[1, 2] * axis[2]
     z = wrist[2, 0] * axis[0] + wrist[2, 1] * axis[1] + wrist[2, 2] * axis[2]
@@ -185,25 +244,36 @@ def _add_turn(
     b = axis[2] * arm[0] - axis[0] * arm[2]
     c = axis[0] * arm[1] - axis[1] * arm[0]
     row[0, column] += share * (
-        y * carried[2] - z * carried[1] - turn[0, 0] * a - turn[0, 1] * b - turn[0, 2] * c
+        y * carried[2] - z * carried[1] - rotation[0, 0] * a - rotation[0, 1] * b - rotation[0, 2] * c
     )
     row[1, column] += share * (
-        z * carried[0] - x * carried[2] - turn[1, 0] * a - turn[1, 1] * b - turn[1, 2] * c
+        z * carried[0] - x * carried[2] - rotation[1, 0] * a - rotation[1, 1] * b - rotation[1, 2] * c
     )
     row[2, column] += share * (
-        x * carried[1] - y * carried[0] - turn[2, 0] * a - turn[2, 1] * b - turn[2, 2] * c
+        x * carried[1] - y * carried[0] - rotation[2, 0] * a - rotation[2, 1] * b - rotation[2, 2] * c
     )
 
 
-def skinned(
+def skinning_terms(
     model: HandModel,
     T_world_bone: Float[np.ndarray, "T L 4 4"],
     points: Float[np.ndarray, "M 3"],
     weights: Float[np.ndarray, "M 16"],
 ) -> tuple[Float[np.ndarray, "T M 3 3"], Float[np.ndarray, "T M L 3"]]:
-    """How each rest point is turned as a whole, and where each bone alone would carry it [m]."""
+    """The terms of linear blend skinning.
+
+    Args:
+        model: A right hand.
+        T_world_bone: Its bones [m].
+        points: Rest positions in the wrist's frame [m].
+        weights: Skinning weights of all bones.
+
+    Returns:
+        Derivative of each skinned point by its rest position (the blended rotation), and the position that
+        each bone alone would give it [m].
+    """
     motion = (T_world_bone @ np.linalg.inv(model.rest_transforms))[:, :, :3]
-    turns = np.einsum("ml,tlij->tmij", weights, motion[..., :3], optimize=True)
-    carried = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
-    carried += motion[:, None, ..., 3]
-    return turns, carried
+    rotations = np.einsum("ml,tlij->tmij", weights, motion[..., :3], optimize=True)
+    by_bone = np.einsum("tlij,mj->tmli", motion[..., :3], points, optimize=True)
+    by_bone += motion[:, None, ..., 3]
+    return rotations, by_bone

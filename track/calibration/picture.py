@@ -1,6 +1,6 @@
-"""A calibration drawn: the hand and its markers before and after, and where the touches are.
+"""A picture of a calibration: the hand and its markers before and after, and the contact points.
 
-matplotlib is imported when a picture is drawn, and pyplot never.
+matplotlib is imported when a picture is drawn; pyplot is not used.
 """
 
 from __future__ import annotations
@@ -30,6 +30,10 @@ _VIEWS: Final = ("from the back", "from the palm")
 def save_picture(path: str | Path, calibration: Calibration) -> None:
     """Draw a calibration into a PNG file.
 
+    Args:
+        path: The file.
+        calibration: A calibrated hand.
+
     Raises:
         OSError: The file cannot be written.
     """
@@ -37,7 +41,7 @@ def save_picture(path: str | Path, calibration: Calibration) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    with style.context("default"):  # whatever the user's own settings are
+    with style.context("default"):  # independent of the user's settings
         figure = Figure(figsize=_SIZE, facecolor=_CARD, layout="constrained")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 2)
@@ -53,12 +57,12 @@ def save_picture(path: str | Path, calibration: Calibration) -> None:
 
 def _headline(calibration: Calibration) -> str:
     before, after = 1e3 * calibration.gaps()
-    told = f"{calibration.hand.side} hand: markers off by {1e3 * calibration.rms_before:.1f} mm before, "
-    told += f"{1e3 * calibration.rms_after:.2f} mm after"
+    text = f"{calibration.hand.side} hand: markers off by {1e3 * calibration.rms_before:.1f} mm before, "
+    text += f"{1e3 * calibration.rms_after:.2f} mm after"
     return (
-        told
+        text
         if np.isnan(before)
-        else f"{told}; thumb to fingertip {before:.1f} mm before, {after:.1f} mm after"
+        else f"{text}; thumb to fingertip {before:.1f} mm before, {after:.1f} mm after"
     )
 
 
@@ -77,13 +81,13 @@ def _draw(panel: Axes, calibration: Calibration, sign: float) -> None:
     )
     panel.plot(*new[seen].T, "o", color=_AFTER, markersize=6, zorder=6, label="markers after")
     if sign > 0.0:
-        for name, place in zip(hand.attachment.layout.names, new, strict=True):
+        for name, spot in zip(hand.attachment.layout.names, new, strict=True):
             panel.annotate(
-                name, (place[0], place[1]), (5, 4), textcoords="offset points", fontsize=6.5, color=_INK,
+                name, (spot[0], spot[1]), (5, 4), textcoords="offset points", fontsize=6.5, color=_INK,
                 zorder=7, parse_math=False,
             )  # fmt: skip
-    if sign < 0.0:  # touches are of pads
-        points = [touch.points for touch in calibration.trusted_touches]
+    if sign < 0.0:  # contact points are on the pads
+        points = [touch.points for touch in calibration.significant_touches]
         touched = np.concatenate(points) if points else np.empty((0, 3))
         panel.plot(*_flat(touched, sign).T, "o", color=_TOUCH, markersize=3.5, zorder=8, label="touches")
     panel.set_aspect("equal")
@@ -91,7 +95,7 @@ def _draw(panel: Axes, calibration: Calibration, sign: float) -> None:
 
 
 def _draw_skin(panel: Axes, hand: GloveFit, sign: float) -> None:
-    """The triangles that look this way, the farther ones first."""
+    """The triangles that face the viewer, the farthest first."""
     from matplotlib.collections import PolyCollection
 
     surface = hand.model.surface
@@ -110,15 +114,15 @@ def _draw_skin(panel: Axes, hand: GloveFit, sign: float) -> None:
 def _draw_bones(panel: Axes, hand: GloveFit, sign: float, color: str, label: str) -> None:
     rest = hand.model.rest_transforms
     ends = rest[:, :3, 3] + hand.model.skeleton.lengths[:, None] * rest[:, :3, 0]
-    told: str | None = label
+    legend: str | None = label
     for number in range(len(BONES)):
         if number == PALM:
             continue
         line = _flat(np.stack([rest[number, :3, 3], ends[number]]), sign)
-        panel.plot(*line.T, color=color, linewidth=1.4, marker=".", markersize=4, zorder=3, label=told)
-        told = None
+        panel.plot(*line.T, color=color, linewidth=1.4, marker=".", markersize=4, zorder=3, label=legend)
+        legend = None
 
 
 def _flat(points: Float[np.ndarray, "*N 3"], sign: float) -> NDArray[np.float64]:
-    """Places as they look with fingers up, from the back (1) or the palm (-1)."""
+    """Positions (N, 2) [m] in the picture, fingers up, from the back (1) or the palm (-1)."""
     return np.stack([-sign * points[..., 1], points[..., 0]], axis=-1)

@@ -1,4 +1,4 @@
-"""What a calibration can say about itself: its noise, its standard errors, its touches, what did not move."""
+"""Diagnostics of a calibration: noise, standard errors, contact gaps and joints that did not move."""
 
 from __future__ import annotations
 
@@ -9,93 +9,99 @@ import numpy as np
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS
-from track.calibration.contacts import meet, place_contacts
-from track.calibration.energy import Fit, Guess, Problem
-from track.calibration.hand_parameters import BONE_LENGTHS, LENGTH, NUM_PARAMETERS, slopes_of
-from track.calibration.skin_walk import SkinPatch, place_points, place_weights
-from track.calibration.solver import eliminate
+from track.calibration.contacts import contact_geometry, initialize_contacts
+from track.calibration.energy import Estimate, Fit, Problem
+from track.calibration.hand_parameters import BONE_LENGTHS, LENGTH, NUM_PARAMETERS, shape_jacobian
+from track.calibration.skin_coordinates import SkinPatch, skin_points, skin_weights
+from track.calibration.solver import eliminate_poses
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from numpy.typing import NDArray
 
 ENOUGH_RANGE: Final = 0.3
-"""Share of a hinge's range that the user has to cover."""
+"""Share of a joint's range that the user has to cover."""
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
-_OPTICS: Final = 0.00015  # [m] what an optical system alone may leave a coordinate off by
-_MIDDLE: Final = 2.366  # median of a chi-squared variable of three degrees of freedom
-_WORTH: Final = 4.0  # frames that tell different things about flesh
+_OPTICAL_NOISE: Final = 0.00015  # [m] of a coordinate, from the optical system alone
+_CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
+_INDEPENDENT_POSES: Final = 4.0  # frames whose deformation of the flesh is independent
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
-    """Standard deviation of a marker's coordinates [m], from the middle one and what was fitted to all."""
-    squares = (fit.misses**2).sum(axis=2)[problem.there]
-    freedom = 3 * len(squares) - 26 * len(fit.misses) - NUM_PARAMETERS - 3 * fit.misses.shape[1]
-    left = max(freedom, 1) / (3 * len(squares))
-    return float(np.clip(np.sqrt(np.median(squares) / (_MIDDLE * left)), _LEAST_NOISE, _MOST_NOISE))
+    """Standard deviation of a marker's coordinates [m] by the median residual and its degrees of freedom."""
+    squares = (fit.residuals**2).sum(axis=2)[problem.present]
+    freedom = 3 * len(squares) - 26 * len(fit.residuals) - NUM_PARAMETERS - 3 * fit.residuals.shape[1]
+    remaining = max(freedom, 1) / (3 * len(squares))
+    return float(np.clip(np.sqrt(np.median(squares) / (_CHI2_MEDIAN * remaining)), _LEAST_NOISE, _MOST_NOISE))
 
 
-def weighing_noise(noise: float, num_frames: int) -> float:
-    """The noise that a capture's frames are weighed by, so that they count for no more than they tell [m].
+def effective_noise(noise: float, num_frames: int) -> float:
+    """Noise [m] for the weights of the residuals, so that correlated frames do not count as independent ones.
 
-    Optical noise is new in every frame. What markers are off beyond it is flesh that moves with the pose: as
-    much again in every like pose, so that many frames tell of it what a few do.
+    Optical noise is independent from frame to frame. The rest of a residual is flesh that moves with the
+    pose: it repeats in every similar pose, so that many frames carry the information of a few.
 
     Args:
         noise: Standard deviation of a marker's coordinates [m].
-        num_frames: Frames that are weighed.
+        num_frames: Frames that are weighted.
     """
-    flesh = max(noise**2 - _OPTICS**2, 0.0)
-    return float(np.sqrt(noise**2 + flesh * max(num_frames / _WORTH - 1.0, 0.0)))
+    flesh = max(noise**2 - _OPTICAL_NOISE**2, 0.0)
+    return float(np.sqrt(noise**2 + flesh * max(num_frames / _INDEPENDENT_POSES - 1.0, 0.0)))
 
 
 def standard_errors(
-    problem: Problem, guess: Guess, fit: Fit
+    problem: Problem, estimate: Estimate, fit: Fit
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Standard errors [m] of marker places on their bones, and of bone lengths."""
-    reduced, _ = eliminate(problem.equations(guess, fit), 0.0)
+    """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m]."""
+    reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
     covariance = np.linalg.inv(reduced[:, :-1])
-    weights = place_weights(guess.places)
-    bones, patch = weights.argmax(axis=1), SkinPatch(guess.places.faces)
+    weights = skin_weights(estimate.coordinates)
+    bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
 
     def on_bones(shape: HandShape) -> NDArray[np.float64]:
         model = HandModel(shape)
         rest = model.rest_transforms[bones]
-        points = place_points(guess.places, patch.corners(model.surface.vertices))[0]
+        points = skin_points(estimate.coordinates, patch.corners(model.surface.vertices))[0]
         local: NDArray[np.float64] = np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3])
         return local
 
     count = len(bones)
-    slopes = np.zeros((count, 3, len(covariance)))
-    slopes[..., :NUM_PARAMETERS] = slopes_of(problem.shape, guess.parameters, on_bones)
-    turns = fit.model.rest_transforms[bones][:, :3, :3].swapaxes(1, 2)
+    jacobian = np.zeros((count, 3, len(covariance)))
+    jacobian[..., :NUM_PARAMETERS] = shape_jacobian(problem.shape, estimate.parameters, on_bones)
+    rotations = fit.model.rest_transforms[bones][:, :3, :3].swapaxes(1, 2)
     for marker in range(count):
         first = NUM_PARAMETERS + 3 * marker
-        slopes[marker, :, first : first + 3] = turns[marker]
-    places = np.sqrt(np.einsum("mis,st,mit->m", slopes, covariance, slopes, optimize=True))
+        jacobian[marker, :, first : first + 3] = rotations[marker]
+    positions = np.sqrt(np.einsum("mis,st,mit->m", jacobian, covariance, jacobian, optimize=True))
     own = covariance[BONE_LENGTHS, BONE_LENGTHS].diagonal()
     logs = own + covariance[LENGTH, LENGTH] + 2.0 * covariance[BONE_LENGTHS, LENGTH]
-    return places, fit.model.shape.bone_lengths * np.sqrt(logs).reshape(5, 3)
+    return positions, fit.model.shape.bone_lengths * np.sqrt(logs).reshape(5, 3)
 
 
-def gaps_on(
+def contact_gaps(
     model: HandModel, touches: list[tuple[int, str]], qpos: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """How far thumb and finger are from touching on a hand in these poses [m]."""
+    """Gaps between thumb and finger (K,) [m] of touches on a hand.
+
+    Args:
+        model: A right hand.
+        touches: Frame and finger of each.
+        qpos: Poses of these frames (K, 27).
+    """
     bones = model.forward_kinematics(qpos)
-    contacts = place_contacts(model, touches, bones)
-    faces = np.concatenate([contacts.thumb_places.faces, contacts.finger_places.faces])
-    return meet(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
+    contacts = initialize_contacts(model, touches, bones)
+    faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])
+    return contact_geometry(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones).gaps
 
 
 def still_joints(
-    angles: Float[np.ndarray, "T 20"], whole: Bool[np.ndarray, "T 5"], model: HandModel
+    angles: Float[np.ndarray, "T 20"], complete: Bool[np.ndarray, "T 5"], model: HandModel
 ) -> tuple[str, ...]:
-    """Hinges that covered too little of their range, while their digit's markers were all there."""
+    """Joints that covered too little of their range while all markers of their digit were seen."""
     ranges = model.skeleton.ranges
     still = []
     for joint in range(NUM_JOINTS):
-        seen = angles[whole[:, joint // 4], joint]
+        seen = angles[complete[:, joint // 4], joint]
         covered = np.ptp(np.quantile(seen, [0.02, 0.98])) if len(seen) else 0.0
         if covered < ENOUGH_RANGE * (ranges[joint, 1] - ranges[joint, 0]):
             still.append(JOINT_NAMES[joint])

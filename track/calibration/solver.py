@@ -1,7 +1,7 @@
-"""Levenberg-Marquardt over poses, marker places, contact points and one hand shape together.
+"""Levenberg-Marquardt over all poses, marker positions, contact points and one hand shape.
 
-A frame's pose meets no other frame's, so poses are eliminated frame by frame (Schur complement), which leaves
-one system for shape and markers.
+A frame's pose shares no residual with another frame's pose. Poses are therefore eliminated frame by frame
+(Schur complement), which leaves one system for shape and markers.
 """
 
 from __future__ import annotations
@@ -12,59 +12,77 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from track.calibration.contacts import slide_contacts, trust
-from track.calibration.energy import Equations, Fit, Guess, Problem
+from track.calibration.contacts import contact_weights, slide_contacts
+from track.calibration.energy import Estimate, Fit, NormalEquations, Problem
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Progress = Callable[[int, float, float], None]
-"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no touches yet)."""
+"""Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-8
-_MORE, _LESS, _LEAST_RAISED = 10.0, 0.2, 1e-6  # what a step that failed and one that worked make of it
+_MORE, _LESS, _LEAST_RAISED = 10.0, 0.2, 1e-6  # factors of the damping after a failed step and a good one
 _MOST_TRIALS: Final = 8
-_SMALL_GAIN: Final = 1e-4  # of the energy, after which steps end
+_SMALL_GAIN: Final = 1e-4  # share of the energy; a step that gains less is the last one
 
 
-def descend(
-    problem: Problem, guess: Guess, steps: int, most: int, progress: Progress | None
-) -> tuple[Guess, Fit, int]:
-    """Step until the energy hardly falls any more, or there have been `most` steps.
+def levenberg_marquardt(
+    problem: Problem, estimate: Estimate, steps: int, most: int, progress: Progress | None
+) -> tuple[Estimate, Fit, int]:
+    """Minimize the energy until it hardly falls, or `most` steps have been made.
+
+    Args:
+        problem: The data.
+        estimate: Where to start.
+        steps: Number of steps made before.
+        most: Number of the last step, at most.
+        progress: Called after each step.
 
     Returns:
-        The guess, its fit, and the number of the last step.
+        The estimate, its fit, and the number of the last step.
     """
-    fit, damping, better = problem.fit(guess), _FIRST_DAMPING, True
+    fit, damping, better = problem.fit(estimate), _FIRST_DAMPING, True
     while better and steps < most:
         before = fit.cost
-        guess, fit, damping, better = _step(problem, guess, fit, damping)
+        estimate, fit, damping, better = _step(problem, estimate, fit, damping)
         steps += 1
         if progress is not None:
-            progress(steps, marker_rms(problem, fit), contact_gap(guess, fit))
+            progress(steps, marker_rms(problem, fit), contact_gap(estimate, fit))
         if abs(before - fit.cost) < _SMALL_GAIN * before:
             break
-    return guess, fit, steps
+    return estimate, fit, steps
 
 
 def marker_rms(problem: Problem, fit: Fit) -> float:
-    """Median over frames of the markers' RMS distance [m], which wrong labels hardly change."""
-    squares = (fit.misses**2).sum(axis=(1, 2)) / problem.there.sum(axis=1)
+    """Median over frames of the markers' RMS distance [m]; wrong labels hardly change it."""
+    squares = (fit.residuals**2).sum(axis=(1, 2)) / problem.present.sum(axis=1)
     return float(np.sqrt(np.median(squares)))
 
 
-def contact_gap(guess: Guess, fit: Fit) -> float:
-    """RMS gap of the trusted touches [m], NaN without any."""
-    if guess.contacts is None or fit.meeting is None:
+def contact_gap(estimate: Estimate, fit: Fit) -> float:
+    """Weighted RMS gap of the contacts [m], NaN without any."""
+    if estimate.contacts is None or fit.geometry is None:
         return float("nan")
-    say = trust(fit.meeting, guess.contacts.fingers)
-    return float(np.sqrt((say * fit.meeting.gaps**2).sum() / max(say.sum(), 1e-12)))
+    weights = contact_weights(fit.geometry, estimate.contacts.fingers)
+    return float(np.sqrt((weights * fit.geometry.gaps**2).sum() / max(weights.sum(), 1e-12)))
 
 
-def eliminate(equations: Equations, damping: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Equations of what is shared (S, S + 1), the poses eliminated, and how poses follow (F, 26, S + 1)."""
+def eliminate_poses(
+    equations: NormalEquations, damping: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Schur complement of the poses.
+
+    Args:
+        equations: Normal equations of all unknowns.
+        damping: Added to the diagonal of the poses' blocks, as a share of it.
+
+    Returns:
+        The reduced system with its gradient as the last column (S, S + 1), and the poses' blocks solved for
+        the shared unknowns and the gradient (F, 26, S + 1).
+    """
     pose = equations.pose.copy()
-    every = np.arange(pose.shape[1])
-    pose[:, every, every] *= 1.0 + damping
+    diagonal = np.arange(pose.shape[1])
+    pose[:, diagonal, diagonal] *= 1.0 + damping
     right = np.concatenate([equations.mixed, equations.pose_gradient[..., None]], axis=2)
     solved = np.linalg.solve(pose, right)
     flat = equations.mixed.reshape(-1, equations.mixed.shape[2])
@@ -73,28 +91,30 @@ def eliminate(equations: Equations, damping: float) -> tuple[NDArray[np.float64]
     return reduced, solved
 
 
-def _step(problem: Problem, guess: Guess, fit: Fit, damping: float) -> tuple[Guess, Fit, float, bool]:
-    """One step down: the new guess, its fit, the damping to go on with, and whether it is any better."""
-    equations = problem.equations(guess, fit)
+def _step(
+    problem: Problem, estimate: Estimate, fit: Fit, damping: float
+) -> tuple[Estimate, Fit, float, bool]:
+    """One step: the new estimate, its fit, the next damping, and whether the energy fell."""
+    equations = problem.normal_equations(estimate, fit)
     for _ in range(_MOST_TRIALS):
-        reduced, solved = eliminate(equations, damping)
+        reduced, solved = eliminate_poses(equations, damping)
         system, gradient = reduced[:, :-1].copy(), reduced[:, -1]
-        every = np.arange(len(system))
-        system[every, every] += damping * equations.shared[every, every]
+        diagonal = np.arange(len(system))
+        system[diagonal, diagonal] += damping * equations.shared[diagonal, diagonal]
         shared = -np.linalg.solve(system, gradient)
         poses = -solved[..., -1] - solved[..., :-1] @ shared
-        trial = problem.moved(guess, poses, shared)
+        trial = problem.apply_step(estimate, poses, shared)
         trial_fit = problem.fit(trial)
         if trial_fit.cost < fit.cost:
-            return *_slid(problem, trial, trial_fit), max(_LESS * damping, _LEAST_DAMPING), True
+            return *_with_slid_contacts(problem, trial, trial_fit), max(_LESS * damping, _LEAST_DAMPING), True
         damping = max(_MORE * damping, _LEAST_RAISED)
-    return guess, fit, damping, False
+    return estimate, fit, damping, False
 
 
-def _slid(problem: Problem, guess: Guess, fit: Fit) -> tuple[Guess, Fit]:
-    """The guess with its contact points slid."""
-    if guess.contacts is None:
-        return guess, fit
-    contacts = slide_contacts(guess.contacts, fit.model, fit.bones[guess.contacts.frames])
-    slid = dataclasses.replace(guess, contacts=contacts)
+def _with_slid_contacts(problem: Problem, estimate: Estimate, fit: Fit) -> tuple[Estimate, Fit]:
+    """The estimate after its contact points have slid on the skin, and its fit."""
+    if estimate.contacts is None:
+        return estimate, fit
+    contacts = slide_contacts(estimate.contacts, fit.model, fit.bones[estimate.contacts.frames])
+    slid = dataclasses.replace(estimate, contacts=contacts)
     return slid, problem.fit(slid)

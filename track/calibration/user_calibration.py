@@ -1,12 +1,12 @@
-"""User calibration: marker places, hand shape and touches from a minute of labeled markers.
+"""User calibration: marker positions, hand shape and contacts from a minute of labeled markers.
 
-After Han et al. 2018, section 4.5: poses of some frames, marker places on the rest hand and contact points
-are solved together. Beyond the paper the hand's shape is solved too, touches are found instead of annotated,
-and the result says how sure it is and what the user should have moved more.
+After Han et al. 2018, section 4.5: poses of some frames, marker positions on the rest hand and contact points
+are solved together. In addition to the paper the hand's shape is solved, touches are detected instead of
+annotated, and the result has standard errors and suggestions for a better capture.
 
-The paper leaves its lambdas open. Here they follow from spreads in millimeters: lambda_1 is
-(noise / PLACE_SPREAD)^2 and lambda_2 (noise / CONTACT_SPREAD)^2, the noise being what the markers are left
-off by; the spreads were chosen on simulated people (docs/calibration.md).
+The paper gives no values for its lambdas. Here they result from standard deviations: lambda_1 is
+(noise / POSITION_SPREAD)^2 and lambda_2 is (noise / CONTACT_SPREAD)^2, where the noise is that of the
+markers' residuals. The spreads were chosen on simulated people (docs/calibration.md).
 """
 
 from __future__ import annotations
@@ -23,23 +23,29 @@ from gloves.fit import GloveFit
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, Side
 from handsim.space.transforms import MIRROR
-from track.calibration.contacts import find_touches, place_contacts, trust
-from track.calibration.energy import Fit, Guess, Problem
+from track.calibration.contacts import contact_weights, find_touches, initialize_contacts
+from track.calibration.energy import Estimate, Fit, Problem
 from track.calibration.frames import (
     CalibrationError,
-    Track,
+    PoseTrack,
     check_markers,
     check_motion,
-    first_look,
-    follow,
-    telling_frames,
+    complete_digits,
+    informative_frames,
+    initial_poses,
+    solve_poses,
     usable_frames,
-    whole_digits,
 )
 from track.calibration.hand_parameters import NUM_PARAMETERS, shape_at
-from track.calibration.report import gaps_on, marker_noise, standard_errors, still_joints, weighing_noise
-from track.calibration.skin_walk import SkinPatch, nearest_places, place_points, wear_at
-from track.calibration.solver import Progress, descend
+from track.calibration.report import (
+    contact_gaps,
+    effective_noise,
+    marker_noise,
+    standard_errors,
+    still_joints,
+)
+from track.calibration.skin_coordinates import SkinPatch, attachment_at, nearest_coordinates, skin_points
+from track.calibration.solver import Progress, levenberg_marquardt
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -47,32 +53,34 @@ if TYPE_CHECKING:
 
 __all__ = ["Calibration", "CalibrationError", "Touch", "calibrate", "calibrate_hands"]
 
-_WIDE_STEPS: Final = 6  # of which none gives up a marker that is far off
-_CONTACTS_FROM: Final = 10  # steps at most without contacts, as in the paper
-_MOST_STEPS: Final = 30
-_FIRST_NOISE, _FIRST_REACH = 0.001, 0.03  # [m]
-_REACH_IN_NOISES: Final = 8.0
-_COUNTS: Final = 0.25  # trust from which a touch counts for one
+_WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
+_STEPS_WITHOUT_CONTACTS: Final = 10  # steps, as in the paper
+_MOST_STEPS: Final = 30  # in all
+_FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
+_SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
+_SIGNIFICANT: Final = 0.25  # weight above which a touch is significant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Touch:
-    """The thumb at another finger's tip, as found in the data."""
+    """A contact of the thumb with a fingertip, detected in the data."""
 
     frame: int
+    """Its number in the capture."""
     finger: str
     gap_before: float
-    """Between the pads of the hand that the calibration began with, each having given way a little [m]."""
+    """Gap between the compressed pads of the hand that the calibration began with [m]."""
     gap_after: float
-    trust: float
-    """How much it counted, 0 to 1."""
+    """The same on the calibrated hand [m]."""
+    weight: float
+    """Its weight in the energy, 0 to 1."""
     points: Float[np.ndarray, "2 3"]
-    """Where thumb and finger touch, on the calibrated rest hand [m]."""
+    """Contact points of thumb and finger on the calibrated rest hand, in the wrist's frame [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A calibrated hand, and how far it may be trusted."""
+    """A calibrated hand and the diagnostics of its calibration."""
 
     hand: GloveFit
     start: GloveFit
@@ -80,38 +88,39 @@ class Calibration:
     rms_before: float
     """Median over frames of the markers' RMS distance from the tracked hand [m]."""
     rms_after: float
+    """The same with the calibrated hand [m]."""
     shifts: Float[np.ndarray, "M"]
-    """How far each marker sits from where the glove as designed has it on this hand [m]."""
-    place_errors: Float[np.ndarray, "M"]
-    """Standard error of each marker's place on its bone [m]."""
+    """Distance of each marker from its position by the glove's design on this hand [m]."""
+    position_errors: Float[np.ndarray, "M"]
+    """Standard error of each marker's position on its bone [m]."""
     length_errors: Float[np.ndarray, "5 3"]
     """Standard error of each bone's length [m]."""
     touches: tuple[Touch, ...]
     still_joints: tuple[str, ...]
-    """Hinges that moved too little to tell what lies on either side of them."""
+    """Joints that moved too little to determine the bones on either side."""
 
     @property
-    def trusted_touches(self) -> tuple[Touch, ...]:
-        """Those that counted for more than a little."""
-        return tuple(touch for touch in self.touches if touch.trust > _COUNTS)
+    def significant_touches(self) -> tuple[Touch, ...]:
+        """Touches with a weight above 0.25."""
+        return tuple(touch for touch in self.touches if touch.weight > _SIGNIFICANT)
 
     def gaps(self) -> Float[np.ndarray, "2"]:
-        """Mean distance from touching [m], before and after, of trusted touches; NaN without any."""
-        if not self.trusted_touches:
+        """Mean distance from touching [m], before and after, of the significant touches; NaN without any."""
+        if not self.significant_touches:
             return np.full(2, np.nan)
-        pairs = np.abs([[touch.gap_before, touch.gap_after] for touch in self.trusted_touches])
+        pairs = np.abs([[touch.gap_before, touch.gap_after] for touch in self.significant_touches])
         means: NDArray[np.float64] = pairs.mean(axis=0)
         return means
 
-    def advice(self) -> tuple[str, ...]:
-        """What a better capture would have, in plain sentences; empty when nothing is missing."""
+    def suggestions(self) -> tuple[str, ...]:
+        """What to do in a better capture, as sentences; empty when nothing is missing."""
         sentences = []
         for digit in DIGITS:
-            hinges = [name.removeprefix(f"{digit}_") for name in self.still_joints if name.startswith(digit)]
-            if hinges:
-                told = ", ".join(hinge.replace("_", " ") for hinge in hinges)
-                sentences.append(f"move the {digit} more: {told} covered too little of its range")
-        touched = {touch.finger for touch in self.trusted_touches}
+            still = [name.removeprefix(f"{digit}_") for name in self.still_joints if name.startswith(digit)]
+            if still:
+                joints = ", ".join(joint.replace("_", " ") for joint in still)
+                sentences.append(f"move the {digit} more: {joints} covered too little of its range")
+        touched = {touch.finger for touch in self.significant_touches}
         missing = [finger for finger in DIGITS[1:] if finger not in touched]
         if missing:
             sentences.append(f"touch the thumb to the tip of the {', '.join(missing)} finger and hold still")
@@ -129,9 +138,9 @@ def calibrate(
 
     Args:
         markers: The markers of one hand in the glove's order [m]; NaN where missing. Half a minute or more in
-            which every joint moves, and the thumb touches each fingertip, holding still for a moment.
+            which every joint moves and the thumb touches each fingertip and holds still for a moment.
         start: Where to begin: `nominal_fit` of the nearest size, or an earlier calibration.
-        rate: Frames a second [Hz].
+        rate: Frames per second [Hz].
         progress: Called after each step.
 
     Raises:
@@ -141,30 +150,30 @@ def calibrate(
     mirror = MIRROR if start.side == "left" else np.eye(3)
     markers, right = check_markers(markers, start, rate) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
-    whole = whole_digits(markers, right.attachment)
-    track = first_look(markers, right, usable)
-    check_motion(track, whole, start)
-    problem, guess = _begin(markers, right, track)
-    guess, fit, steps = _descend_without_touches(problem, guess, progress)
-    rough = _user_hand(right, problem, guess)
-    rough_track = follow(markers, rough, usable)
-    touches = find_touches(rough.model, rough_track.qpos[:, 7:], whole[usable], rate)
-    problem, guess = _with_touches(problem, guess, fit, markers, rough_track, touches)
-    guess, fit, steps = descend(problem, guess, steps, _MOST_STEPS, progress)
-    done = _user_hand(right, problem, guess)
+    complete = complete_digits(markers, right.attachment)
+    track = initial_poses(markers, right, usable)
+    check_motion(track, complete, start)
+    problem, estimate = _initial_problem(markers, right, track)
+    estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
+    rough = _user_hand(right, problem, estimate)
+    rough_track = solve_poses(markers, rough, usable)
+    touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
+    problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
+    estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _MOST_STEPS, progress)
+    done = _user_hand(right, problem, estimate)
     before = _gaps_before(right, markers, touches, usable)
-    final = follow(markers, done, usable, rough_track.qpos)
-    place_errors, length_errors = standard_errors(problem, guess, fit)
+    final = solve_poses(markers, done, usable, rough_track.qpos)
+    position_errors, length_errors = standard_errors(problem, estimate, fit)
     return Calibration(
         hand=done.with_side(start.side),
         start=start,
         rms_before=float(np.median(track.rms)),
         rms_after=float(np.median(final.rms)),
-        shifts=np.linalg.norm(fit.off_design, axis=1),
-        place_errors=place_errors,
+        shifts=np.linalg.norm(fit.design_residuals, axis=1),
+        position_errors=position_errors,
         length_errors=length_errors,
-        touches=_touches(guess, fit, touches, rough_track.frames, before, mirror),
-        still_joints=still_joints(final.qpos[:, 7:], whole[usable], done.model),
+        touches=_touches(estimate, fit, touches, rough_track.frames, before, mirror),
+        still_joints=still_joints(final.qpos[:, 7:], complete[usable], done.model),
     )
 
 
@@ -175,24 +184,24 @@ def calibrate_hands(
     *,
     progress: Callable[[Side, int, float, float], None] | None = None,
 ) -> tuple[Calibration, ...]:
-    """Calibrate each of a user's hands that a capture shows.
+    """Calibrate each of a user's hands that is in a capture.
 
     Args:
         markers: For each side the markers in the glove's order [m]; NaN where missing, everywhere for a hand
-            that is not there.
+            that is not in the capture.
         start: Where to begin, each side at most once; sides that `markers` lacks are left out.
-        rate: Frames a second [Hz].
-        progress: Called after each step with the side and what `calibrate` tells.
+        rate: Frames per second [Hz].
+        progress: Called after each step with the side and the values that `calibrate` gives.
 
     Raises:
-        CalibrationError: No hand is there, or one that is shows too little.
+        CalibrationError: The capture has no hand, or determines too little of one.
         ArgumentError: Markers do not fit a glove, or `rate` is not positive.
     """
     shown = [hand for hand in start if np.isfinite(markers.get(hand.side, np.nan)).any()]
     if not shown:
-        wanted = " or ".join(hand.side for hand in start) or "any"
+        sides = " or ".join(hand.side for hand in start) or "any"
         raise CalibrationError(
-            f"the capture has no marker of the {wanted} hand, expected half a minute of one"
+            f"the capture has no marker of the {sides} hand, expected half a minute of one"
         )
     return tuple(
         calibrate(
@@ -205,44 +214,47 @@ def calibrate_hands(
     )
 
 
-def _begin(markers: NDArray[np.float64], right: GloveFit, track: Track) -> tuple[Problem, Guess]:
-    chosen = telling_frames(track, markers)
+def _initial_problem(
+    markers: NDArray[np.float64], right: GloveFit, track: PoseTrack
+) -> tuple[Problem, Estimate]:
+    """The problem without contacts, and the estimate that the first poses give."""
+    chosen = informative_frames(track, markers)
     shape, worn = right.model.shape, right.attachment
-    places = nearest_places(worn.points, shape)
+    coordinates = nearest_coordinates(worn.points, shape)
     problem = Problem(
         shape,
-        places,
+        coordinates,
         worn.layout.radius,
         markers[track.frames[chosen]],
         noise=_FIRST_NOISE,
-        reach=_FIRST_REACH,
+        robust_scale=_FIRST_SCALE,
     )
-    return problem, Guess(np.zeros(NUM_PARAMETERS), worn.points, places, track.qpos[chosen])
+    return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, track.qpos[chosen])
 
 
-def _descend_without_touches(
-    problem: Problem, guess: Guess, progress: Progress | None
-) -> tuple[Guess, Fit, int]:
-    """The first steps; markers that are far off are given up only when the hand nearly fits."""
-    guess, fit, steps = descend(problem, guess, 0, _WIDE_STEPS, progress)
-    problem.reach = _REACH_IN_NOISES * marker_noise(problem, fit)
-    return descend(problem, guess, steps, _CONTACTS_FROM, progress)
+def _solve_without_touches(
+    problem: Problem, estimate: Estimate, progress: Progress | None
+) -> tuple[Estimate, Fit, int]:
+    """The first steps; distant markers lose their weight only when the hand nearly fits."""
+    estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
+    problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
+    return levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
 
 
 def _with_touches(
     problem: Problem,
-    guess: Guess,
+    estimate: Estimate,
     fit: Fit,
     markers: NDArray[np.float64],
-    track: Track,
+    track: PoseTrack,
     touches: list[tuple[int, str]],
-) -> tuple[Problem, Guess]:
-    """The problem with the touches' frames, at its own noise.
+) -> tuple[Problem, Estimate]:
+    """The problem with the frames of the touches, at the noise of the first fit.
 
-    The other frames are chosen anew: on a hand that nearly fits, one with a wrong label stands out.
+    The other frames are selected again: on a hand that nearly fits, a wrong label gives a large RMS.
     """
     noise = marker_noise(problem, fit)
-    chosen = telling_frames(track, markers)
+    chosen = informative_frames(track, markers)
     touching = np.array([frame for frame, _ in touches], dtype=np.int64)
     frames = np.concatenate([chosen, touching])
     larger = Problem(
@@ -250,25 +262,26 @@ def _with_touches(
         problem.design,
         problem.radius,
         markers[track.frames[frames]],
-        noise=weighing_noise(noise, len(frames)),
-        reach=_REACH_IN_NOISES * noise,
+        noise=effective_noise(noise, len(frames)),
+        robust_scale=_SCALE_IN_NOISES * noise,
     )
-    guess = dataclasses.replace(guess, qpos=track.qpos[frames])
+    estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])
     if not touches:
-        return larger, guess
-    model = HandModel(shape_at(problem.shape, guess.parameters))
-    contacts = place_contacts(model, touches, model.forward_kinematics(track.qpos[touching]))
+        return larger, estimate
+    model = HandModel(shape_at(problem.shape, estimate.parameters))
+    contacts = initialize_contacts(model, touches, model.forward_kinematics(track.qpos[touching]))
     contacts = contacts._replace(frames=len(chosen) + np.arange(len(touches)))
-    return larger, dataclasses.replace(guess, contacts=contacts)
+    return larger, dataclasses.replace(estimate, contacts=contacts)
 
 
-def _user_hand(right: GloveFit, problem: Problem, guess: Guess) -> GloveFit:
-    shape = shape_at(problem.shape, guess.parameters)
-    return GloveFit(HandModel(shape), wear_at(right.attachment.layout, guess.places, shape))
+def _user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
+    """The right hand of an estimate in its glove."""
+    shape = shape_at(problem.shape, estimate.parameters)
+    return GloveFit(HandModel(shape), attachment_at(right.attachment.layout, estimate.coordinates, shape))
 
 
 def _touches(
-    guess: Guess,
+    estimate: Estimate,
     fit: Fit,
     touches: list[tuple[int, str]],
     frames: NDArray[np.int64],
@@ -276,17 +289,18 @@ def _touches(
     mirror: NDArray[np.float64],
 ) -> tuple[Touch, ...]:
     """The touches with their gaps on the first and on the calibrated hand."""
-    if guess.contacts is None or fit.meeting is None:
+    if estimate.contacts is None or fit.geometry is None:
         return ()
-    say = trust(fit.meeting, guess.contacts.fingers)
+    weights = contact_weights(fit.geometry, estimate.contacts.fingers)
     sides: list[NDArray[np.float64]] = []
-    for places in (guess.contacts.thumb_places, guess.contacts.finger_places):
+    for coordinates in (estimate.contacts.thumb_coordinates, estimate.contacts.finger_coordinates):
         sides.append(
-            place_points(places, SkinPatch(places.faces).corners(fit.model.surface.vertices))[0] @ mirror
+            skin_points(coordinates, SkinPatch(coordinates.faces).corners(fit.model.surface.vertices))[0]
+            @ mirror
         )
-    points, after = np.stack(sides, axis=1), fit.meeting.gaps
+    points, after = np.stack(sides, axis=1), fit.geometry.gaps
     return tuple(
-        Touch(int(frames[frame]), finger, float(before[k]), float(after[k]), float(say[k]), points[k])
+        Touch(int(frames[frame]), finger, float(before[k]), float(after[k]), float(weights[k]), points[k])
         for k, (frame, finger) in enumerate(touches)
     )
 
@@ -294,8 +308,8 @@ def _touches(
 def _gaps_before(
     right: GloveFit, markers: NDArray[np.float64], touches: list[tuple[int, str]], frames: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """How far from touching the hand was that the calibration began with [m]."""
+    """Gaps of the touches (K,) [m] on the hand that the calibration began with."""
     if not touches:
         return np.empty(0)
-    there = frames[[frame for frame, _ in touches]]
-    return gaps_on(right.model, touches, follow(markers, right, there).qpos)
+    touching = frames[[frame for frame, _ in touches]]
+    return contact_gaps(right.model, touches, solve_poses(markers, right, touching).qpos)

@@ -10,39 +10,38 @@ import tyro
 
 from gloves.captures.formats import read_capture
 from gloves.takes.take import SUFFIX, load_take
-from handsim.errors import HandSimError
+from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from track.bodies.body_file import SUFFIX as TOML
 from track.bodies.body_file import save_body
 from track.bodies.rigid_body import RigidTemplate
 from track.calibration.body_learning import learn_body
-from track.evaluation.take_summary import say
+from track.evaluation.take_summary import print_line
 
 
 def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
-    """Write the markers of a rigid body, from a capture in which it moves and nothing else is.
+    """Write the markers of a rigid body, from a capture of the moving body and nothing else.
 
-    The body is called as the file is, and its markers Marker1, Marker2, ...; both may be changed there.
+    The body has the name of the file, and its markers are Marker1, Marker2, ...; both may be changed there.
 
     Args:
         source: A .trc, .c3d or Motive .csv file, whose names are not used; or the .truth.npz of a simulated
-            capture, whose object it is then.
+            capture, for its object.
         out: The body's file, .toml.
     """
     if out.suffix.lower() != TOML:
-        raise HandSimError(f"--out is {out}, expected a file name that ends in {TOML}")
-    found = _held(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
+        raise ArgumentError(f"--out is {out}, expected a file name that ends in {TOML}")
+    found = _take_body(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
     save_body(out, found)
-    widest = 1e3 * np.max(found.sides)
-    say(f"{out}: {found.name}, {len(found.places)} markers, at most {widest:.1f} mm apart")
+    widest = 1e3 * np.max(found.distances)
+    print_line(f"{out}: {found.name}, {len(found.positions)} markers, at most {widest:.1f} mm apart")
 
 
-def _held(truth: Path) -> RigidTemplate:
+def _take_body(truth: Path) -> RigidTemplate:
     """The object of a simulated take."""
     held = load_take(truth).body
     if held is None:
-        raise HandSimError(
-            f"{truth}: nobody holds anything in it, "
-            "expected a take of handsim simulate --kind hand-controller"
+        raise ArgumentError(
+            f"{truth}: the take has no object, expected one of handsim simulate --kind hand-controller"
         )
     return RigidTemplate.of(named_object(held.name))

@@ -1,4 +1,4 @@
-"""The command `handsim reproduce`: the tables of tracking, joined to those of labeling."""
+"""The command `handsim reproduce`: the paper's tables of tracking, and all tables by name."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from rich.console import Console
 
 from handsim.app.progress import progress_bar
 from handsim.files.json_files import save_json
-from train.commands.reproduce import REPRODUCE as LABELING
+from train.commands.labeling_tables import LABELING_TABLES
 from train.labelers.storage import labeler_for_glove
 from train.simulation.twins import KINDS, TwinConfig, simulate_twin
 
 if TYPE_CHECKING:
     from gloves.takes.take import Take
-    from track.evaluation.comparison import Measured
+    from track.evaluation.comparison import Measurement
 
 _PAPERS_GLOVE: Final = "dense19"
 _WITH_BODY: Final = "hand-controller"
@@ -26,7 +26,7 @@ _WITH_BODY: Final = "hand-controller"
 
 @dataclass(frozen=True, slots=True)
 class TableConfig:
-    """What a table of tracking is measured on."""
+    """Settings of a table of tracking."""
 
     glove: str = _PAPERS_GLOVE
     """Marker layout: a shipped name or the path of a .toml file."""
@@ -35,9 +35,9 @@ class TableConfig:
     num_frames: int | None = None
     """Frames of each capture; the paper's numbers when not given."""
     seed: int = 0
-    """Seed of the captures and of what is drawn while tracking; 0 gives the twins."""
+    """Seed of the captures and of random choices in tracking; 0 gives the twins."""
     json: Path | None = None
-    """File for the figures."""
+    """File for the results."""
 
 
 _Config = Annotated[TableConfig, tyro.conf.arg(name="")]
@@ -47,7 +47,7 @@ def table5(config: _Config) -> None:
     """Trackers on the twins of the paper's captures: frames all of whose labels are right; errors and time.
 
     Args:
-        config: What to measure on.
+        config: Settings of the measurement.
     """
     from track.evaluation.comparison import TRIALS
     from track.evaluation.tables import print_errors, print_table5, print_times, print_trials
@@ -64,7 +64,7 @@ def table7(config: _Config) -> None:
     """Trackers with calibrated hands and without: frames whose poses fit, and those of them that are right.
 
     Args:
-        config: What to measure on.
+        config: Settings of the measurement.
     """
     from track.evaluation.tables import print_table7
 
@@ -77,7 +77,7 @@ def cameras(config: _Config, rig: str = "six") -> None:
     """Trackers on hands in the air before fewer cameras: the paper switches off more than half of its 16.
 
     Args:
-        config: What to measure on; the paper has 2875 frames.
+        config: Settings of the measurement; the paper has 2875 frames.
         rig: Camera rig: a shipped name or the path of a .toml file.
     """
     from track.evaluation.paper import CAMERAS_FRAMES
@@ -92,12 +92,12 @@ def cameras(config: _Config, rig: str = "six") -> None:
     _save("cameras", config, measured, rig=rig, missing=float(missing))
 
 
-REPRODUCE: Final = dict(sorted({**LABELING, "table5": table5, "table7": table7}.items())) | {
+REPRODUCE: Final = dict(sorted({**LABELING_TABLES, "table5": table5, "table7": table7}.items())) | {
     "cameras": cameras
 }
 
 
-def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], list[Measured]]:
+def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures of all kinds, and run all trackers over them."""
     twins: dict[str, TwinConfig] = {
         kind: TwinConfig(kind, config.num_frames, config.glove, seed=config.seed) for kind in KINDS
@@ -107,8 +107,8 @@ def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], 
 
 def _measure_on(
     twins: Mapping[str, TwinConfig], config: TableConfig, *, trials: int = 0
-) -> tuple[dict[str, Take], list[Measured]]:
-    """Simulate captures, and run all trackers over them without their bodies, which most know nothing of."""
+) -> tuple[dict[str, Take], list[Measurement]]:
+    """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
     from track.evaluation.comparison import USERS, compare_trackers, trackers
     from track.evaluation.trials import without_body
 
@@ -129,8 +129,8 @@ def _measure_on(
     return takes, measured
 
 
-def _measure_with_body(take: Take, config: TableConfig) -> list[Measured]:
-    """Our tracker on the capture whose object has markers of its own, which it follows too."""
+def _measure_with_body(take: Take, config: TableConfig) -> list[Measurement]:
+    """Our tracker on the capture whose object has markers, with the object tracked as well."""
     from track.evaluation.comparison import USERS, measure_with_body
 
     network = labeler_for_glove(config.glove, config.labeler)
@@ -139,7 +139,7 @@ def _measure_with_body(take: Take, config: TableConfig) -> list[Measured]:
         return measure_with_body(_WITH_BODY, take, network, done=lambda: bar.advance(task))
 
 
-def _save(table: str, config: TableConfig, measured: list[Measured], **more: Any) -> None:
+def _save(table: str, config: TableConfig, measured: list[Measurement], **more: Any) -> None:
     if config.json is not None:
         records = [one.record() for one in measured]
         content = {"table": table, "glove": config.glove, "seed": config.seed, **more, "figures": records}

@@ -21,14 +21,13 @@ from gloves.takes.take import SUFFIX
 from gloves.takes.tracked_take import TrackedTake, save_tracked_take
 from handsim.app.interrupts import interrupt_told
 from handsim.app.progress import progress_bar
-from handsim.errors import CaptureError, HandSimError
+from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import TakeRecorder, follow, warm_up
-from track.capture_tracking import track as track_capture
-from track.commands.user_options import BOTH, Size, calibrated_users, users
-from track.evaluation.take_summary import say, summary
+from track.capture_tracking import TakeRecorder, track_capture, track_stream, warm_up
+from track.commands.user_options import BOTH, Size, calibrated_users, uncalibrated_users
+from track.evaluation.take_summary import print_line, summarize
 from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
@@ -38,7 +37,7 @@ from train.labelers.storage import labeler_for_glove
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_REFRESH: Final = 0.2  # [s] between words about a live stream
+_REFRESH: Final = 0.2  # [s] between updates of a live stream's status
 
 
 def track(
@@ -55,27 +54,27 @@ def track(
     labeler: str | None = None,
     labeled: Path | None = None,
 ) -> None:
-    """Follow hands through a marker capture or a live stream; writes motion, labels and status.
+    """Track hands in a marker capture or a live stream; writes motion, labels and status.
 
     Args:
         capture: A .trc, .c3d or Motive .csv file; its names are not used.
         out: The tracked take, a .npz file.
         live: Address of a NatNet server instead of a capture: natnet://host or natnet://host:port. Ctrl-C
-            ends it, and what came until then is written.
-        seconds: How long to listen to it.
+            ends it, and the frames until then are written.
+        seconds: How long to record a live stream [s].
         glove: Marker layout: a shipped name or the path of a .toml file; its labeler is used.
         size: Size of the hands; M when neither this nor --shape is given.
         shape: The user's file from handsim calibrate: hands and gloves.
-        hands: Which hands there are; both, or those of --shape, when not given.
-        body: A rigid body to follow beside the hands, as often as there are some: a .toml file, see handsim
-            body, or one of handsim's own objects.
+        hands: Which hands to track; both, or those of --shape, when not given.
+        body: A rigid body to track beside the hands, once per body: a .toml file, see handsim body, or one of
+            handsim's own objects.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
-        labeled: File for the labeled points, .trc or .c3d; markers are called right:ThumbTip and so on,
-            points that are no markers Unlabeled1, Unlabeled2, ...
+        labeled: File for the labeled points, .trc or .c3d; markers are called right:ThumbTip and so on, other
+            points Unlabeled1, Unlabeled2, ...
     """
     _check_options(capture, live, seconds, out, labeled)
     if shape is None:
-        user = users(glove, size or "M", BOTH if hands is None else hands)
+        user = uncalibrated_users(glove, size or "M", BOTH if hands is None else hands)
     else:
         user = calibrated_users(shape, glove, size, hands)
     bodies = load_bodies(body)
@@ -83,52 +82,49 @@ def track(
     network = labeler_for_glove(glove, labeler)
     with Console(stderr=True).status("getting ready"):
         warm_up(user, network)
-        watch = Stopwatch(user, network, bodies)
-    if source is not None:
-        with progress_bar("frames") as (bar, task):
-            take = track_capture(
-                source,
-                watch,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
-            )
-        notes: tuple[str, ...] = ()
-    else:
-        take, notes = _track_live(str(live), seconds, watch)
-    made = {
+        timed = TimedTracker(user, network, bodies)
+    take, notes = _track_live(str(live), seconds, timed) if source is None else _track_file(source, timed)
+    settings = {
         "capture": live if capture is None else capture.name,
         "glove": glove,
         "user": size or "M" if shape is None else shape.name,
         "labeler": labeler or glove,
     }
-    take = dataclasses.replace(take, settings=made)
+    take = dataclasses.replace(take, settings=settings)
     save_tracked_take(out, take)
     if labeled is not None:
         write_capture(labeled, labeled_points(take))
-    say(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
-    for line in (*summary(take), *notes, f"{1e3 * np.median(watch.spent):.2f} ms a frame"):
-        say(line)
+    print_line(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
+    for line in (*summarize(take), *notes, f"{1e3 * np.median(timed.seconds):.2f} ms per frame"):
+        print_line(line)
 
 
-class Stopwatch(Tracker):
-    """A tracker that knows how long it took for each frame."""
+class TimedTracker(Tracker):
+    """A tracker that measures its computing time.
+
+    Args:
+        hands: The user's hands, each side at most once.
+        labeler: Labeler of the hands' glove.
+        bodies: Rigid bodies beside the hands.
+    """
 
     def __init__(
         self, hands: Sequence[GloveFit], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
     ) -> None:
         super().__init__(hands, labeler, bodies)
-        self.spent: list[float] = []
-        """[s], one a frame."""
+        self.seconds: list[float] = []
+        """Computing time of each frame [s]."""
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Take in the next frame."""
-        began = perf_counter()
+        """Track the next frame, see `Tracker.step`."""
+        start = perf_counter()
         frame = super().step(points, ids, time)
-        self.spent.append(perf_counter() - began)
+        self.seconds.append(perf_counter() - start)
         return frame
 
 
 def labeled_points(take: TrackedTake) -> Capture:
-    """The labeled points of a take as a capture: a column a marker, then columns for the others."""
+    """The labeled points of a take as a capture: one column per marker, then columns for the other points."""
     there = np.isfinite(take.points[..., 0])
     frames = [points[seen] for points, seen in zip(take.points, there, strict=True)]
     labels = [row[seen] for row, seen in zip(take.labels, there, strict=True)]
@@ -142,35 +138,46 @@ def _check_options(
         given = (
             "neither a capture nor --live" if capture is None else f"a capture, {capture}, and --live {live}"
         )
-        raise HandSimError(f"given {given}, expected a capture or --live natnet://host")
+        raise ArgumentError(f"given {given}, expected a capture or --live natnet://host")
     if seconds is not None and live is None:
-        raise HandSimError(f"--seconds is {seconds:g} without --live, expected both or neither")
+        raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
     if seconds is not None and not 0.0 < seconds < np.inf:
-        raise HandSimError(f"--seconds is {seconds:g}, expected a positive number")
+        raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
     if out.suffix.lower() != ".npz" or out.name.endswith(SUFFIX):
-        raise HandSimError(f"--out is {out}, expected a file name that ends in .npz and not in {SUFFIX}")
+        raise ArgumentError(f"--out is {out}, expected a file name that ends in .npz and not in {SUFFIX}")
     if labeled is not None:
         check_suffix(labeled, WRITABLE)
 
 
-def _track_live(url: str, seconds: float | None, watch: Stopwatch) -> tuple[TrackedTake, tuple[str, ...]]:
-    """What a stream brings until it ends, time is up or somebody interrupts."""
-    recorder = TakeRecorder(watch)
+def _track_file(source: Capture, timed: TimedTracker) -> tuple[TrackedTake, tuple[str, ...]]:
+    """The take of a capture, and no notes."""
+    with progress_bar("frames") as (bar, task):
+        take = track_capture(
+            source,
+            timed,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    return take, ()
+
+
+def _track_live(url: str, seconds: float | None, timed: TimedTracker) -> tuple[TrackedTake, tuple[str, ...]]:
+    """The take of a stream until it ends, time is up or the user interrupts; notes on frames left out."""
+    recorder = TakeRecorder(timed)
     console = Console(stderr=True)
     with (
         closing(open_stream(url)) as stream,
         console.status("waiting for the first frame") as status,
-        interrupt_told() as interrupted,  # what came so far is not lost
+        interrupt_told() as interrupted,  # the frames so far are kept
     ):
-        began, shown = perf_counter(), 0.0
-        for frame, tracked in follow(stream, watch):
+        start, shown = perf_counter(), 0.0
+        for frame, tracked in track_stream(stream, timed):
             recorder.add(frame, tracked)
-            elapsed = perf_counter() - began if frame.silent else recorder.duration
+            elapsed = perf_counter() - start if frame.silent else recorder.duration
             if interrupted() or (seconds is not None and elapsed >= seconds):
                 break
             if frame.silent or perf_counter() > shown + _REFRESH:
                 shown = perf_counter()
-                status.update(_word(frame, tracked))
+                status.update(_status_line(frame, tracked))
     if recorder.num_frames < 2:
         raise CaptureError(f"{url}: {recorder.num_frames} frames came, expected two or more")
     notes = []
@@ -179,10 +186,10 @@ def _track_live(url: str, seconds: float | None, watch: Stopwatch) -> tuple[Trac
     return recorder.take(), tuple(notes)
 
 
-def _word(frame: StreamedFrame, tracked: TrackedFrame) -> str:
-    """How it goes, in a line."""
+def _status_line(frame: StreamedFrame, tracked: TrackedFrame) -> str:
+    """Status of a live stream, in one line."""
     if frame.silent:
-        return "nothing comes; is the server playing?"
+        return "no frames arrive; is the server playing?"
     words = [f"{hand.side} {hand.status.value}" for hand in tracked.hands]
     words += [f"{body.name} {body.status.value}" for body in tracked.bodies]
     return f"frame {frame.number}: {', '.join(words)}; Ctrl-C ends it and writes the take"

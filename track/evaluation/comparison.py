@@ -1,4 +1,4 @@
-"""All trackers on the same takes, with calibrated hands and without: the figures of the tracking tables."""
+"""Comparison of all trackers on the same takes, with calibrated and uncalibrated hands."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from track.evaluation.take_evaluation import (
     FrameTracker,
     TrackingReport,
     evaluate_tracker,
+    nominal_users,
     seen_frame,
     true_users,
-    usual_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, cut, first_locks, recoveries
+from track.evaluation.trials import FEWEST_FRAMES, cut_take, initialization_times, recovery_times
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 
@@ -34,31 +34,34 @@ if TYPE_CHECKING:
 
 OURS: Final = "handsim"
 PAPERS_LOOP: Final = "paper's loop"
-GIVEN_FIRST: Final = ("nearest point", "Hungarian")
-"""Those that are given the labels of the first frame, and so do not begin by themselves."""
+NEED_FIRST_LABELS: Final = ("nearest point", "Hungarian")
+"""Methods that get the labels of the first frame and cannot initialize a hand."""
 USERS: Final[dict[str, Callable[[Take], list[GloveFit]]]] = {
     "calibrated": true_users,
-    "uncalibrated": usual_users,
+    "uncalibrated": nominal_users,
 }
 TRIALS: Final = 10
-_WARM_UP: Final = 30  # frames before the clock counts: kernels are loaded
+_WARM_UP: Final = 30  # frames before time is measured, in which kernels are loaded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
-    """What one tracker made of one take with one pair of hands."""
+class Measurement:
+    """Results of one tracker on one take."""
 
     method: str
+    """Name of the tracker."""
     users: str
+    """Name of the hands, one of `USERS`."""
     capture: str
+    """Name of the take."""
     report: TrackingReport
-    locks: Float[np.ndarray, "S"]
-    """Frames until all was right, from random ones of the take; NaN for more than a second. See `trials`."""
-    recoveries: Float[np.ndarray, "S"]
-    """The same after a second in the dark."""
+    initialization: Float[np.ndarray, "S"]
+    """Frames until all was right, from random frames of the take; NaN: never. See `trials`."""
+    recovery: Float[np.ndarray, "S"]
+    """The same after a second without points."""
 
     def record(self) -> dict[str, Any]:
-        """All figures, for JSON; None where there is nothing to count."""
+        """All results, for JSON; None where nothing was counted."""
         figures = {name: number_or_none(value) for name, value in self.report.figures().items()}
         errors = [
             {
@@ -76,23 +79,23 @@ class Measured:
             "frames": len(self.report.right),
             **figures,
             "by_occlusion": errors,
-            "first_lock_frames": [number_or_none(value) for value in self.locks],
-            "recovery_frames": [number_or_none(value) for value in self.recoveries],
+            "first_lock_frames": [number_or_none(value) for value in self.initialization],
+            "recovery_frames": [number_or_none(value) for value in self.recovery],
         }
 
 
 def trackers(labeler: Labeler, seed: int) -> dict[str, MakeTracker]:
-    """What makes a tracker for a take (or a part of it) and hands, by the method's name.
+    """Functions that make a tracker for a take (or a part of it) and hands, by the method's name.
 
     Args:
-        labeler: Labeler of those that need one.
+        labeler: Labeler for the methods that need one.
         seed: Seed of the paper's loop.
     """
     return {
         OURS: lambda take, users: Tracker(users, labeler),
         PAPERS_LOOP: lambda take, users: PaperTracker(users, labeler, rng=np.random.default_rng(seed)),
-        GIVEN_FIRST[0]: lambda take, users: NearestNeighborTracker(users, seen_frame(take, 0).labels),
-        GIVEN_FIRST[1]: lambda take, users: HungarianTracker(users, seen_frame(take, 0).labels),
+        NEED_FIRST_LABELS[0]: lambda take, users: NearestNeighborTracker(users, seen_frame(take, 0).labels),
+        NEED_FIRST_LABELS[1]: lambda take, users: HungarianTracker(users, seen_frame(take, 0).labels),
     }
 
 
@@ -103,15 +106,15 @@ def compare_trackers(
     seed: int,
     trials: int = 0,
     done: Callable[[], None] | None = None,
-) -> list[Measured]:
-    """Run every tracker over every take, with every kind of hands.
+) -> list[Measurement]:
+    """Run every tracker over every take, with calibrated and uncalibrated hands.
 
     Args:
         takes: Simulated takes, by name.
-        labeler: Labeler of those that need one.
-        seed: Seed of the paper's loop, and of where trials begin.
-        trials: How often first lock and recovery are measured in each take that is long enough.
-        done: Called after every frame of a take; trials are not counted.
+        labeler: Labeler for the methods that need one.
+        seed: Seed of the paper's loop and of the first frames of trials.
+        trials: Number of trials of initialization and of recovery in each take that is long enough.
+        done: Called after each frame of a take; trials are not counted.
     """
     wearers = {
         (users, capture): hands_of(take)
@@ -123,21 +126,21 @@ def compare_trackers(
         for (users, capture), hands in wearers.items():
             take = takes[capture]
             report = _report(take, hands, make, done)
-            waits = _try(take, hands, name, make, trials, seed)
-            measured.append(Measured(name, users, capture, report, *waits))
+            waits = _run_trials(take, hands, name, make, trials, seed)
+            measured.append(Measurement(name, users, capture, report, *waits))
     return measured
 
 
 def measure_with_body(
     capture: str, take: Take, labeler: Labeler, *, done: Callable[[], None] | None = None
-) -> list[Measured]:
-    """Run our tracker over a take whose body it follows beside the hands; the body's labels count too.
+) -> list[Measurement]:
+    """Run our tracker over a take with its body tracked beside the hands; the body's labels count too.
 
     Args:
         capture: The take's name.
         take: A simulated take with one of handsim's objects.
-        labeler: Of the hands' glove.
-        done: Called after every frame.
+        labeler: Labeler of the hands' glove.
+        done: Called after each frame.
 
     Raises:
         ArgumentError: The take has no body, or one with too few markers.
@@ -148,33 +151,33 @@ def measure_with_body(
     nothing, measured = np.zeros(0), []
     for users, hands_of in USERS.items():
         report = _report(take, hands_of(take), lambda _, hands: Tracker(hands, labeler, (body,)), done)
-        measured.append(Measured(f"{OURS}, {body.name} too", users, capture, report, nothing, nothing))
+        measured.append(Measurement(f"{OURS}, {body.name} too", users, capture, report, nothing, nothing))
     return measured
 
 
 def _report(
     take: Take, hands: Sequence[GloveFit], make: MakeTracker, done: Callable[[], None] | None
 ) -> TrackingReport:
-    """What a tracker makes of a take, once it is warm."""
-    start = cut(take, 0, min(_WARM_UP, take.num_frames))
+    """Results of a tracker on a take, after a warm-up on its first frames."""
+    start = cut_take(take, 0, min(_WARM_UP, take.num_frames))
     evaluate_tracker(start, hands, make(start, hands))
     return evaluate_tracker(take, hands, make(take, hands), done=done)
 
 
-def _try(
+def _run_trials(
     take: Take, hands: Sequence[GloveFit], name: str, make: MakeTracker, trials: int, seed: int
 ) -> tuple[Float[np.ndarray, "S"], Float[np.ndarray, "S"]]:
-    """First locks and recoveries, nothing where there is nothing to measure."""
+    """Frames until all was right in trials of initialization and of recovery; empty without trials."""
     nothing = np.zeros(0)
     if take.num_frames < FEWEST_FRAMES or not trials:
         return nothing, nothing
     rng = np.random.default_rng(seed)
-    again = recoveries(take, lambda part: make(part, hands), trials, rng=rng)
-    if name in GIVEN_FIRST:
-        return nothing, again
-    return first_locks(take, lambda part: make(part, hands), trials, rng=rng), again
+    recovery = recovery_times(take, lambda part: make(part, hands), trials, rng=rng)
+    if name in NEED_FIRST_LABELS:
+        return nothing, recovery
+    return initialization_times(take, lambda part: make(part, hands), trials, rng=rng), recovery
 
 
 def number_or_none(value: float) -> float | None:
-    """What JSON can hold of a figure: it knows no NaN."""
+    """A number for JSON, which has no NaN."""
     return None if np.isnan(value) else float(value)

@@ -10,7 +10,7 @@ from gloves.captures.capture import Capture
 from gloves.takes.tracked_take import save_tracked_take
 from handsim.app.demo import GLOVE, DemoRun
 from handsim.app.page import Section
-from track.capture_tracking import track
+from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
@@ -24,7 +24,7 @@ def track_take(run: DemoRun) -> Section:
     run.report("tracking a simulated capture")
     take = simulate_twin(TwinConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
     names = tuple(f"*{number}" for number in range(take.points.shape[1]))
-    tracked = track(Capture(names, take.points, take.rate), Tracker(true_users(take), load_labeler(GLOVE)))
+    tracked = track_capture(Capture(names, take.points, take.rate), Tracker(true_users(take), load_labeler(GLOVE)))
     save_tracked_take(run.tracked_take, tracked)
     errors = []
     for hand in take.hands:

@@ -1,9 +1,10 @@
-"""How far a calibrated hand in its glove is from the true one, where the truth is known.
+"""Errors of a calibrated hand in its glove, where the true hand is known.
 
-Some of a hand no marker tells. Where the wrist is in the palm is a convention, so palms are laid on each
-other by the digits' first joints before their markers are compared; a last bone ends in soft tissue that only
-touches tell, so its length is told apart from those between joints. Everything else is compared as it is: a
-finger's marker in the frame of its bone, whose origin is the joint and whose x axis points to the next one.
+Markers do not determine all of a hand. The wrist's position in the palm is a convention, so palms are aligned
+by the digits' first joints before their markers are compared. A last bone ends in soft tissue that only
+contacts determine, so its length is reported apart from those between joints. Everything else is compared
+directly: a finger's marker in the frame of its bone, whose origin is the joint and whose x axis points to the
+next joint.
 """
 
 from __future__ import annotations
@@ -26,18 +27,22 @@ if TYPE_CHECKING:
 class HandErrors(NamedTuple):
     """Differences between two hands in one glove."""
 
-    places: Float[np.ndarray, "M"]
-    """Of each marker on the bone that truly carries it, palms laid on each other [m]."""
-    wrist_places: Float[np.ndarray, "M"]
-    """The same with the palm's markers in the wrist's own frame [m]."""
+    positions: Float[np.ndarray, "M"]
+    """Of each marker on the bone that carries it on the true hand, palms aligned [m]."""
+    wrist_positions: Float[np.ndarray, "M"]
+    """The same without the alignment: the palm's markers in the wrist's frame [m]."""
     lengths: Float[np.ndarray, "5 2"]
-    """Of the bones between joints, in shares of the true ones; positive: too long."""
+    """Relative errors of the bones between joints; positive: too long."""
     tips: Float[np.ndarray, "5"]
-    """Of the last bones, to their soft tips."""
+    """Relative errors of the last bones, to their soft tips."""
 
 
 def hand_errors(found: GloveFit, true: GloveFit) -> HandErrors:
-    """How far a hand in its glove is from the true one.
+    """Errors of a hand in its glove.
+
+    Args:
+        found: The calibrated hand.
+        true: The true one.
 
     Raises:
         ArgumentError: They are of different sides or wear different gloves.
@@ -46,25 +51,27 @@ def hand_errors(found: GloveFit, true: GloveFit) -> HandErrors:
         raise ArgumentError("the hands are of different sides or gloves, expected two of the same")
     bones = true.attachment.main_bones
     off = _on_bones(found.model, found.attachment, bones) - _on_bones(true.model, true.attachment, bones)
-    wrist_places = np.linalg.norm(off, axis=1)
-    turn, shift = _laid(found.model.skeleton.offsets[1::3], true.model.skeleton.offsets[1::3])
+    wrist_positions = np.linalg.norm(off, axis=1)
+    rotation, translation = _align_rigid(
+        found.model.skeleton.offsets[1::3], true.model.skeleton.offsets[1::3]
+    )
     palm = bones == PALM
-    off[palm] = found.attachment.points[palm] @ turn.T + shift - true.attachment.points[palm]
+    off[palm] = found.attachment.points[palm] @ rotation.T + translation - true.attachment.points[palm]
     lengths = found.model.shape.bone_lengths / true.model.shape.bone_lengths - 1.0
-    return HandErrors(np.linalg.norm(off, axis=1), wrist_places, lengths[:, :2], lengths[:, 2])
+    return HandErrors(np.linalg.norm(off, axis=1), wrist_positions, lengths[:, :2], lengths[:, 2])
 
 
 def _on_bones(model: HandModel, worn: Attachment, bones: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Markers in the frames of these bones [m]."""
+    """Markers (M, 3) in the frames of these bones (M,) [m]."""
     rest = model.rest_transforms[bones]
     local: NDArray[np.float64] = np.einsum("mji,mj->mi", rest[:, :3, :3], worn.points - rest[:, :3, 3])
     return local
 
 
-def _laid(source: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Rotation and shift that bring points nearest to others (Kabsch 1976)."""
-    middle, there = source.mean(axis=0), target.mean(axis=0)
-    left, _, right = np.linalg.svd((target - there).T @ (source - middle))
-    handed = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
-    turn = left @ handed @ right
-    return turn, there - turn @ middle
+def _align_rigid(source: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Rotation (3, 3) and translation (3,) that align points (P, 3) with others (Kabsch 1976)."""
+    center, target_center = source.mean(axis=0), target.mean(axis=0)
+    left, _, right = np.linalg.svd((target - target_center).T @ (source - center))
+    reflection = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
+    rotation = left @ reflection @ right
+    return rotation, target_center - rotation @ center

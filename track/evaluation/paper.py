@@ -1,7 +1,7 @@
-"""What Han et al. 2018 print of tracking, as shares, with the rows of Table 5 as they must be read.
+"""The tracking results of Han et al. 2018, as shares; Table 5 with two rows exchanged.
 
-In print Table 5 has the paper's own figures of hand-hand and hand-pen in each other's row: 4477 frames are
-more than the 3312 of hand-hand, and 3101 of 3312 are what Table 7's two shares multiply to.
+The printed Table 5 has the paper's own figures of hand-hand and hand-pen in each other's row: 4477 frames are
+more than the 3312 of hand-hand, and 3101 of 3312 is the product of Table 7's two shares.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FRAMES: Final[dict[Kind, int]] = {
     "hand-pen": 4511,
     "hand-controller": 2645,
 }
-"""Frames of the captures; Table 3."""
+"""Numbers of frames of the captures; Table 3."""
 
 HAN: Final = "Han 2018"
 
@@ -34,7 +34,7 @@ TABLE5: Final[dict[str, dict[Kind, float]]] = {
         "hand-controller": 2599 / 2645,
     },
 }
-"""Frames all of whose labels are right, of all; hands are calibrated."""
+"""Share of frames with all labels right; hands are calibrated."""
 
 TABLE7: Final[dict[str, dict[Kind, tuple[float, float]]]] = {
     "calibrated": {
@@ -50,8 +50,9 @@ TABLE7: Final[dict[str, dict[Kind, tuple[float, float]]]] = {
         "hand-controller": (0.9758, 0.8954),
     },
 }
-"""Frames whose poses pass the test, of all; and those of them whose labels are right."""
+"""Share of frames whose poses pass the test, and share of these with all labels right."""
 
 CAMERAS: Final = (0.9555, 0.9232)
-"""The same of a single-hand capture with more than half of the 16 cameras off; section 5."""
+"""The same for a single-hand capture with more than half of the 16 cameras off; section 5."""
 CAMERAS_FRAMES: Final = 2875
+"""Number of frames of that capture."""

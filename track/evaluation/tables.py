@@ -1,4 +1,4 @@
-"""The paper's tables of tracking: the same counts for all our trackers, its figures in rows of their own."""
+"""Tables of tracking results, with the paper's figures in separate rows."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from track.evaluation.comparison import Measured
+from track.evaluation.comparison import Measurement
 from track.evaluation.paper import CAMERAS, HAN, TABLE5, TABLE7
 from train.simulation.twins import KINDS
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 _HEAD: Final = ("method", "hands")
 
 
-def print_table5(measured: Sequence[Measured], *, with_paper: bool) -> Table:
-    """Frames all of whose labels are right [%], a column a capture; blank where nothing was measured."""
+def print_table5(measured: Sequence[Measurement], *, with_paper: bool) -> Table:
+    """Frames all of whose labels are right [%], one column per capture; blank where nothing was measured."""
     table = _table("Table 5: frames all of whose labels are right [%]", KINDS)
     if with_paper:
         for method, shares in TABLE5.items():
@@ -32,8 +32,8 @@ def print_table5(measured: Sequence[Measured], *, with_paper: bool) -> Table:
     return table
 
 
-def print_table7(measured: Sequence[Measured], *, with_paper: bool) -> Table:
-    """Valid frames of all, and right ones of the valid [%], a column a capture."""
+def print_table7(measured: Sequence[Measurement], *, with_paper: bool) -> Table:
+    """Share of valid frames, and of right ones among them [%], one column per capture."""
     table = _table("Table 7: frames whose poses fit / right ones of these [%]", KINDS)
     if with_paper:
         for users, shares in TABLE7.items():
@@ -45,8 +45,15 @@ def print_table7(measured: Sequence[Measured], *, with_paper: bool) -> Table:
     return table
 
 
-def print_cameras(measured: Sequence[Measured], missing: float, *, rig: str, with_paper: bool) -> Table:
-    """Hands in the air before few cameras; `missing` is the share of markers that they lose."""
+def print_cameras(measured: Sequence[Measurement], missing: float, *, rig: str, with_paper: bool) -> Table:
+    """Results with few cameras.
+
+    Args:
+        measured: Results on one capture.
+        missing: Share of markers without a point.
+        rig: Name of the camera rig.
+        with_paper: Whether to add the paper's row.
+    """
     title = f"Rig {rig}: {_percent(missing)} % of the markers missing"
     table = _table(title, ("fit [%]", "right of these [%]", "both [%]", "joints [mm]", "angles [deg]"))
     if with_paper:
@@ -60,13 +67,13 @@ def print_cameras(measured: Sequence[Measured], missing: float, *, rig: str, wit
     return table
 
 
-def print_errors(measured: Sequence[Measured]) -> tuple[Table, Table]:
-    """Errors of joints [mm] and hinges [deg] by how many markers a hand lacks, over all captures."""
+def print_errors(measured: Sequence[Measurement]) -> tuple[Table, Table]:
+    """Errors of joints [mm] and joint angles [deg] by the number of missing markers, over all captures."""
     bounds = list(measured[0].report.by_occlusion())
     words = ["none", *(f"{low}-{high}" for low, high in bounds[1:-1]), f"{bounds[-1][0]} or more"]
     what = "by markers that a hand lacks"
     joints = _table(f"Mean distance of joints from the truth {what} [mm]", words)
-    angles = _table(f"Mean distance of hinges from the truth {what} [deg]", words)
+    angles = _table(f"Mean error of joint angles {what} [deg]", words)
     for head, row in _rows(measured):
         errors = [_mean_errors([one.report.by_occlusion()[bound] for one in row]) for bound in bounds]
         joints.add_row(*head, *(_length(joint) for joint, _ in errors))
@@ -74,22 +81,25 @@ def print_errors(measured: Sequence[Measured]) -> tuple[Table, Table]:
     return joints, angles
 
 
-def print_times(measured: Sequence[Measured]) -> Table:
-    """Time of a frame [ms], over all captures."""
-    table = _table("Time of a frame on this machine [ms]", ("median", "p99"))
+def print_times(measured: Sequence[Measurement]) -> Table:
+    """Time per frame [ms], over all captures."""
+    table = _table("Time per frame on this machine [ms]", ("median", "p99"))
     for head, row in _rows(measured):
         seconds = np.concatenate([one.report.seconds for one in row])
         table.add_row(*head, *(f"{1e3 * np.quantile(seconds, q):.2f}" for q in (0.5, 0.99)))
     return table
 
 
-def print_trials(measured: Sequence[Measured]) -> Table:
-    """How long it takes until all is right, at first and after a second in the dark, over all captures."""
-    columns = ("first: median", "p90", "in 1 s [%]", "dark: median", "p90", "in 1 s [%]")
-    table = _table("Frames until all is right, from random frames and after a second in the dark", columns)
+def print_trials(measured: Sequence[Measurement]) -> Table:
+    """Frames until all is right, at first and after a second without points, over all captures."""
+    columns = ("first: median", "p90", "in 1 s [%]", "hidden: median", "p90", "in 1 s [%]")
+    table = _table("Frames until all is right, from random frames and after a second without points", columns)
     for (method, users), row in _rows(measured):
-        waits = [np.concatenate([one.locks for one in row]), np.concatenate([one.recoveries for one in row])]
-        table.add_row(method, users, *(cell for wait in waits for cell in _waits(wait)))
+        waits = [
+            np.concatenate([one.initialization for one in row]),
+            np.concatenate([one.recovery for one in row]),
+        ]
+        table.add_row(method, users, *(cell for wait in waits for cell in _quantiles(wait)))
     return table
 
 
@@ -102,9 +112,9 @@ def _table(title: str, columns: Iterable[str]) -> Table:
     return table
 
 
-def _rows(measured: Sequence[Measured]) -> list[tuple[tuple[str, str], list[Measured]]]:
-    """What was measured, by method and hands, in order."""
-    rows: dict[tuple[str, str], list[Measured]] = {}
+def _rows(measured: Sequence[Measurement]) -> list[tuple[tuple[str, str], list[Measurement]]]:
+    """Results by method and hands, in order."""
+    rows: dict[tuple[str, str], list[Measurement]] = {}
     for one in measured:
         rows.setdefault((one.method, one.users), []).append(one)
     return list(rows.items())
@@ -127,7 +137,7 @@ def _angle(radians: float) -> str:
 
 
 def _mean_errors(parts: Sequence[tuple[int, float, float]]) -> tuple[float, float]:
-    """Errors of joints and hinges over several captures, by the hands counted in each."""
+    """Errors of joints [m] and joint angles [rad] over several captures, weighted by the number of poses."""
     counted = [part for part in parts if part[0]]
     if not counted:
         return np.nan, np.nan
@@ -136,8 +146,8 @@ def _mean_errors(parts: Sequence[tuple[int, float, float]]) -> tuple[float, floa
     return float(joint), float(angle)
 
 
-def _waits(frames: Float[np.ndarray, "S"]) -> tuple[str, str, str]:
-    """Median, 90th percentile and share of trials that ended; blank for what was never reached."""
+def _quantiles(frames: Float[np.ndarray, "S"]) -> tuple[str, str, str]:
+    """Median, 90th percentile and share of successful trials; 'never' for a quantile that was not reached."""
     if not len(frames):
         return "", "", ""
     never = np.where(np.isnan(frames), np.inf, frames)

@@ -1,4 +1,4 @@
-"""Measure a tracker on simulated takes: labels, poses and time, frame by frame, against the truth."""
+"""Evaluation of a tracker on a simulated take: labels, poses and time per frame, against the truth."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))
-"""Missing markers of a hand, from and to, by which pose errors are told apart."""
+"""Classes of a hand's number of missing markers, from and to, for pose errors."""
 
 
 class FrameTracker(Protocol):
-    """Anything that takes in a capture frame by frame."""
+    """Anything that tracks a capture frame by frame."""
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Take in the next frame: points [m], their IDs, and the time [s]."""
+        """Track the next frame: points [m], their IDs, and the time [s]."""
         ...
 
 
 class SeenFrame(NamedTuple):
-    """What there is to see of a frame, and what it is."""
+    """The points of a frame and their true labels."""
 
     points: Float[np.ndarray, "N 3"]
     """[m]"""
@@ -46,26 +46,26 @@ class SeenFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingReport:
-    """What a tracker made of a take."""
+    """Results of a tracker on a take."""
 
     right: Bool[np.ndarray, "T"]
     """Every point has its true label, see `is_right`."""
     valid: Bool[np.ndarray, "T"]
     """Every hand has a pose, fitted to its labeled markers within 8 mm RMS."""
     missing: Int[np.ndarray, "T H"]
-    """Markers of each hand that the system does not see."""
+    """Number of each hand's markers without a point."""
     joint_error: Float[np.ndarray, "T H"]
-    """Distance of the wrist and the 15 joints of the digits from the truth, on average [m]; NaN: no pose."""
+    """Mean distance of the wrist and the 15 joints of the digits from the truth [m]; NaN without a pose."""
     angle_error: Float[np.ndarray, "T H"]
-    """Distance of the 20 hinges from the truth, on average [rad]; NaN without a pose."""
+    """Mean absolute error of the 20 joint angles [rad]; NaN without a pose."""
     seconds: Float[np.ndarray, "T"]
-    """Time that the tracker took."""
+    """Computing time [s]."""
 
     def figures(self) -> dict[str, float]:
-        """The figures in one place, by name; NaN where there is nothing to count.
+        """Averages over the take, by name; NaN where nothing was counted.
 
         Shares in [0, 1]: `right`; `valid`; `right_of_valid`, Table 7's second number; `valid_and_right`, its
-        product. Errors where there is a pose: `joint_error` [m], `angle_error` [rad]. Time of a frame [s]:
+        product. Errors in frames with a pose: `joint_error` [m], `angle_error` [rad]. Time per frame [s]:
         `seconds_p50`, `seconds_p99`.
         """
         both = self.valid & self.right
@@ -81,10 +81,10 @@ class TrackingReport:
         }
 
     def by_occlusion(self) -> dict[tuple[int, int], tuple[int, float, float]]:
-        """Pose errors by how many markers a hand lacks, from and to (`OCCLUSIONS`).
+        """Pose errors by the number of missing markers (`OCCLUSIONS`).
 
         Returns:
-            Hands counted frame by frame that have a pose, mean joint error [m], mean angle error [rad].
+            Number of poses, mean joint error [m], mean angle error [rad].
         """
         found = {}
         for low, high in OCCLUSIONS:
@@ -95,29 +95,29 @@ class TrackingReport:
 
 
 def seen_frame(take: Take, frame: int) -> SeenFrame:
-    """What there is to see of one frame of a take."""
+    """Points and true labels of one frame of a take."""
     here = np.isfinite(take.points[frame, :, 0])
     labels = take.labels[frame, here].astype(np.int64)
     return SeenFrame(take.points[frame, here], take.ids[frame, here].astype(np.int64), labels)
 
 
 def true_users(take: Take) -> list[GloveFit]:
-    """The hands of a take with their true shapes and gloves as worn: the best that calibration can find."""
+    """The hands of a take with their true shapes and gloves: the result of a perfect calibration."""
     return [hand.fit for hand in take.hands]
 
 
-def usual_users(take: Take) -> list[GloveFit]:
-    """The hands of a take without calibration: of the five sizes the nearest in length, gloves as designed.
+def nominal_users(take: Take) -> list[GloveFit]:
+    """The hands of a take without calibration: the nearest of the five sizes, gloves as designed.
 
     Raises:
-        LayoutError: The glove that the take was made with is not there.
+        LayoutError: The take's glove is not found.
     """
     layout = load_layout(str(take.settings["glove"]))
     return [nominal_fit(layout, nearest_size(hand.fit.shape.length), hand.side) for hand in take.hands]
 
 
 def nearest_size(length: float) -> str:
-    """The one of the five sizes whose hand length is nearest to a length [m]."""
+    """Name of the size whose hand length is nearest to a length [m]."""
     return min(SIZES, key=lambda size: abs(1e-3 * SIZES[size][0] - length))
 
 
@@ -128,13 +128,13 @@ def evaluate_tracker(
     *,
     done: Callable[[], None] | None = None,
 ) -> TrackingReport:
-    """Run a tracker over a take and count.
+    """Run a tracker over a take and compare it with the truth.
 
     Args:
         take: A simulated take.
-        users: The hands that the tracker was told to follow, in the take's order.
-        tracker: One that nothing was tracked with yet.
-        done: Called after every frame.
+        users: The tracker's hands, in the take's order.
+        tracker: A tracker that has not seen a frame.
+        done: Called after each frame.
     """
     frames = range(take.num_frames)
     right, valid = np.zeros(len(frames), dtype=bool), np.zeros(len(frames), dtype=bool)
@@ -160,7 +160,12 @@ def evaluate_tracker(
 def is_right(take: Take, tracked: TrackedFrame, seen: SeenFrame) -> bool:
     """Whether every point of a frame has its true label: a marker its own, all others none.
 
-    Markers of a body that was tracked are to have theirs; of one that was not, none of a hand's.
+    The markers of a body must have their labels if the body is tracked, and no label of a hand otherwise.
+
+    Args:
+        take: The take.
+        tracked: Result of the tracker.
+        seen: Points and true labels of the frame.
     """
     if tracked.bodies:
         return np.array_equal(tracked.labels, seen.labels)
@@ -175,7 +180,7 @@ def is_valid(tracked: TrackedFrame) -> bool:
 def _pose_errors(
     model: HandModel, poses: NDArray[np.float64], true_model: HandModel, truth: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean distance of joints [m] and hinges [rad] in every frame, NaN without a pose."""
+    """Mean errors of joints [m] and of joint angles [rad] per frame (T,), NaN without a pose."""
     there = np.flatnonzero(np.isfinite(poses[:, 0]))
     joints, angles = np.full((2, len(poses)), np.nan)
     if len(there):
@@ -186,7 +191,7 @@ def _pose_errors(
 
 
 def _of_hands(take: Take, labels: Int[np.ndarray, "N"]) -> Int[np.ndarray, "N"]:
-    """Labels of hands alone: markers of bodies count as none."""
+    """The labels of hands; -1 for all others."""
     return np.where(labels < take.hand_labels[-1].stop, labels, -1)
 
 

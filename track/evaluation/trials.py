@@ -1,4 +1,4 @@
-"""Hard beginnings: takes that are cut or go dark, and how long a tracker then needs until all is right."""
+"""Trials of initialization and recovery: frames that a tracker needs until all labels and poses are right."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from track.evaluation.take_evaluation import FrameTracker, is_right, is_valid, s
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_LEAD: Final = 60  # frames that a tracker sees before all goes dark
-_DARK: Final = 120
-_PATIENCE: Final = 120  # frames that it may need
-FEWEST_FRAMES: Final = _LEAD + _DARK + _PATIENCE
-"""Frames of a take that trials are made with, at least."""
+_FRAMES_BEFORE: Final = 60  # frames that a tracker sees before all points are hidden
+_FRAMES_HIDDEN: Final = 120  # a second
+_MOST_FRAMES: Final = 120  # frames after which a trial has failed
+FEWEST_FRAMES: Final = _FRAMES_BEFORE + _FRAMES_HIDDEN + _MOST_FRAMES
+"""Frames that a take needs for trials."""
 
 
-def cut(take: Take, first: int, last: int) -> Take:
-    """A take from one frame to before another.
+def cut_take(take: Take, first: int, last: int) -> Take:
+    """The frames of a take from `first` to before `last`.
 
     Raises:
         ArgumentError: There are no such frames.
@@ -38,21 +38,26 @@ def cut(take: Take, first: int, last: int) -> Take:
     )
 
 
-def darken(take: Take, first: int, frames: int) -> Take:
-    """A take in which nothing at all is seen for some frames; what comes back has other IDs."""
+def hide_points(take: Take, first: int, frames: int) -> Take:
+    """A take with all points of some frames hidden; later points have new IDs.
+
+    Args:
+        take: The take.
+        first: First frame without points.
+        frames: Number of frames without points.
+    """
     points, ids, labels = take.points.copy(), take.ids.copy(), take.labels.copy()
-    dark, after = slice(first, first + frames), ids[first + frames :]
-    points[dark], ids[dark], labels[dark] = np.nan, -1, -1
+    hidden, after = slice(first, first + frames), ids[first + frames :]
+    points[hidden], ids[hidden], labels[hidden] = np.nan, -1, -1
     after[after >= 0] += take.ids.max() + 1
     return dataclasses.replace(take, points=points, ids=ids, labels=labels)
 
 
 def without_body(take: Take) -> Take:
-    """A take without the points of its body of three or more markers: the optical system's own business.
+    """A take without the points of its body, which an optical system tracks itself.
 
     The paper's system tracked such bodies beside the hands (its figure 1);
-    `train.evaluation.labeler_evaluation.hand_clouds`
-    leaves them out as well.
+    `train.evaluation.labeler_evaluation.hand_clouds` leaves them out as well.
     """
     gone = take.labels >= take.hand_labels[-1].stop
     return dataclasses.replace(
@@ -64,47 +69,54 @@ def without_body(take: Take) -> Take:
     )
 
 
-def first_locks(
+def initialization_times(
     take: Take, make: Callable[[Take], FrameTracker], starts: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "S"]:
-    """Frames that pass before all points and poses are right, from random frames of a take.
+    """Number of frames until all labels and poses are right, starting from random frames of a take.
 
     Args:
         take: The take, of at least 120 frames.
         make: A new tracker for a part of the take.
-        starts: How often to begin.
-        rng: Decides where.
+        starts: Number of trials, S.
+        rng: Draws the first frames.
 
     Returns:
-        0 for the very first frame; NaN where 120 were not enough.
+        0 for the first frame; NaN where 120 frames were not enough.
     """
-    locks = np.full(starts, np.nan)
-    for number, first in enumerate(_places(take, _PATIENCE, starts, rng)):
-        part = cut(take, first, first + _PATIENCE)
-        locks[number] = _wait(part, make(part), 0)
-    return locks
+    times = np.full(starts, np.nan)
+    for number, first in enumerate(_random_starts(take, _MOST_FRAMES, starts, rng)):
+        part = cut_take(take, first, first + _MOST_FRAMES)
+        times[number] = _frames_until_right(part, make(part), 0)
+    return times
 
 
-def recoveries(
+def recovery_times(
     take: Take, make: Callable[[Take], FrameTracker], trials: int, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "S"]:
-    """The same after 60 frames of the take and 120 more in which nothing is seen: a second at 120 Hz."""
-    waits = np.full(trials, np.nan)
-    for number, first in enumerate(_places(take, FEWEST_FRAMES, trials, rng)):
-        part = darken(cut(take, first, first + FEWEST_FRAMES), _LEAD, _DARK)
-        waits[number] = _wait(part, make(part), _LEAD + _DARK)
-    return waits
+    """The same after 60 frames of the take and 120 frames (a second) without points.
+
+    Args:
+        take: The take, of at least `FEWEST_FRAMES` frames.
+        make: A new tracker for a part of the take.
+        trials: Number of trials, S.
+        rng: Draws the first frames.
+    """
+    times = np.full(trials, np.nan)
+    for number, first in enumerate(_random_starts(take, FEWEST_FRAMES, trials, rng)):
+        part = hide_points(cut_take(take, first, first + FEWEST_FRAMES), _FRAMES_BEFORE, _FRAMES_HIDDEN)
+        times[number] = _frames_until_right(part, make(part), _FRAMES_BEFORE + _FRAMES_HIDDEN)
+    return times
 
 
-def _places(take: Take, frames: int, count: int, rng: np.random.Generator) -> list[int]:
+def _random_starts(take: Take, frames: int, count: int, rng: np.random.Generator) -> list[int]:
     if take.num_frames < frames:
         raise ArgumentError(f"the take has {take.num_frames} frames, expected at least {frames}")
-    places: list[int] = rng.integers(0, take.num_frames - frames + 1, size=count).tolist()
-    return places
+    first_frames: list[int] = rng.integers(0, take.num_frames - frames + 1, size=count).tolist()
+    return first_frames
 
 
-def _wait(take: Take, tracker: FrameTracker, since: int) -> float:
-    """Frames from one on until all is right."""
+def _frames_until_right(take: Take, tracker: FrameTracker, since: int) -> float:
+    """Number of frames from `since` on until all labels and poses are right; NaN if they never are."""
     for frame in range(take.num_frames):
         seen = seen_frame(take, frame)
         tracked = tracker.step(seen.points, seen.ids, frame / take.rate)

@@ -1,8 +1,8 @@
-"""NatNet, in which OptiTrack servers stream markers: its packets of versions 3.0 to 4.1 as values.
+"""NatNet, the protocol in which OptiTrack servers stream markers: packets of versions 3.0 to 4.1.
 
-Little-endian; a packet is its kind and payload size (two uint16), then the payload. What a tracker wants of
-a frame is in its list of markers with IDs, which holds labeled and unlabeled ones; everything else is
-stepped over. Nothing is believed of a packet before it has been counted against the bytes that are there.
+Packets are little-endian: kind and payload size (two uint16), then the payload. A tracker needs a frame's
+list of markers with IDs, which holds labeled and unlabeled ones; all other sections are skipped. Every count
+is checked against the number of remaining bytes before it is used.
 """
 
 from __future__ import annotations
@@ -23,12 +23,10 @@ COMMAND_PORT: Final = 1510
 LARGEST: Final = 65507  # bytes of a UDP datagram
 OLDEST: Final[Version] = (3, 0)
 NEWEST: Final[Version] = (4, 1)
-"""The newest layout known here; servers are asked for it."""
-_SIZED: Final[Version] = (
-    4,
-    1,
-)  # from here on sections tell their size, and there are assets and a finer clock
-_FARTHEST: Final = 1e3  # [m]: what stands for a lost marker lies farther off
+"""The newest known layout; servers are asked for it."""
+_SIZED: Final[Version] = (4, 1)
+"""The first version whose sections have a size, and with assets and a finer clock."""
+_FARTHEST: Final = 1e3  # [m]: a lost marker is sent as a point beyond
 _OCCLUDED, _SEEN, _FILLED, _UNLABELED = 1, 2, 4, 16  # flags of a marker
 _NAME: Final = 256  # bytes of a program's name
 _BODY: Final = 38  # bytes of a rigid body: ID, position, orientation, error, flags
@@ -53,36 +51,36 @@ class Kind(IntEnum):
 
 
 class DamagedPacket(ValueError):
-    """Bytes that are no packet of the kind and version they should be."""
+    """Bytes that are not a packet of the expected kind and version."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServerInfo:
-    """What a server says of itself."""
+    """A server's description of itself."""
 
     application: str
     version: Version
-    """The NatNet that it speaks."""
+    """Its NatNet version."""
     data_port: int
     group: str | None
-    """Address that it multicasts to; None where it answers each client on its own."""
+    """Multicast address of its frames; None if it sends them to each client."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkerFrame:
-    """The markers that a system sees in a frame."""
+    """The markers of one frame."""
 
     number: int
     time: float
-    """Since the server was started [s]."""
+    """Time since the server was started [s]."""
     points: Float[np.ndarray, "N 3"]
-    """[m], in the axes that are set at the server."""
+    """[m], in the axes set at the server."""
     ids: Int[np.ndarray, "N"]
-    """One number for as long as a marker is tracked; -1 where none is given."""
+    """A marker keeps its ID for as long as it is tracked; -1 without an ID."""
 
 
 def pack(kind: Kind, payload: bytes = b"") -> bytes:
-    """A packet."""
+    """A packet of a kind."""
     return struct.pack("<HH", kind, len(payload)) + payload
 
 
@@ -90,7 +88,7 @@ def unpack(packet: bytes) -> tuple[int, bytes]:
     """Kind and payload of a packet.
 
     Raises:
-        DamagedPacket: It is cut.
+        DamagedPacket: It is truncated.
     """
     if len(packet) < 4:
         raise DamagedPacket("no header")
@@ -101,7 +99,7 @@ def unpack(packet: bytes) -> tuple[int, bytes]:
 
 
 def pack_connect() -> bytes:
-    """A client's first packet: its name, two versions of its own, all data, and the layout it asks for."""
+    """A client's first packet: its name and versions, and a request for all data in the newest layout."""
     name = b"handsim".ljust(_NAME, b"\0")
     return pack(
         Kind.CONNECT, name + bytes((1, 0, 0, 0)) + bytes((*NEWEST, 0, 0)) + bytes((0, *NEWEST, 0, 0, 0))
@@ -109,7 +107,7 @@ def pack_connect() -> bytes:
 
 
 def pack_server_info(info: ServerInfo) -> bytes:
-    """A server's answer to it; its clock is said to tick a million times a second."""
+    """A server's answer to it; its clock has a million ticks per second."""
     group = bytes(int(part) for part in info.group.split(".")) if info.group else bytes(4)
     name = info.application.encode()[: _NAME - 1].ljust(_NAME, b"\0")
     versions = bytes((1, 0, 0, 0, *info.version, 0, 0))
@@ -121,7 +119,7 @@ def parse_server_info(payload: bytes) -> ServerInfo:
     """Read a server's answer.
 
     Raises:
-        DamagedPacket: It is cut.
+        DamagedPacket: It is truncated.
     """
     reader = _Reader(payload)
     application = reader.take(_NAME).split(b"\0")[0].decode(errors="replace")
@@ -134,7 +132,7 @@ def parse_server_info(payload: bytes) -> ServerInfo:
 
 
 def pack_frame(frame: MarkerFrame, version: Version) -> bytes:
-    """A frame with nothing but markers: those with IDs among the labeled, all in the older list."""
+    """A packet with the markers of a frame: those with IDs in the labeled list, all in the older one."""
     known = frame.ids >= 0
     markers = np.zeros(int(known.sum()), dtype=_MARKER)
     markers["id"], markers["position"] = frame.ids[known], frame.points[known]
@@ -154,10 +152,10 @@ def _section(count: int, content: bytes, sized: bool) -> bytes:
 
 
 def parse_frame(payload: bytes, version: Version) -> MarkerFrame:
-    """Read the markers that were seen in a frame; those that a server only thinks to be there are left out.
+    """Read the observed markers of a frame; markers that the server filled in are left out.
 
     Raises:
-        DamagedPacket: It is cut, or no frame of this version.
+        DamagedPacket: It is truncated, or not a frame of this version.
     """
     reader, sized = _Reader(payload), version >= _SIZED
     number = reader.integer()
@@ -192,21 +190,21 @@ def parse_frame(payload: bytes, version: Version) -> MarkerFrame:
 def _seen(
     markers: NDArray[np.void], older: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Every point once: the older list repeats those with IDs, and two assets may share a marker."""
-    guessed = (markers["flags"] & _OCCLUDED != 0) | (markers["flags"] & (_SEEN | _FILLED) == _FILLED)
+    """Points (N, 3) [m] and IDs (N,), each once: the older list repeats points, two assets may share one."""
+    filled_in = (markers["flags"] & _OCCLUDED != 0) | (markers["flags"] & (_SEEN | _FILLED) == _FILLED)
     points = np.concatenate([markers["position"], older])
     ids = np.concatenate([markers["id"], np.full(len(older), -1)]).astype(np.int64)
     _, first = np.unique(np.ascontiguousarray(points).view("V12").ravel(), return_index=True)
     once = np.zeros(len(points), dtype=bool)
     once[first] = True
-    once[: len(markers)] &= ~guessed
+    once[: len(markers)] &= ~filled_in
     with np.errstate(invalid="ignore"):
         once &= (np.abs(points) < _FARTHEST).all(axis=1)
     return points[once].astype(np.float64), ids[once]
 
 
 class _Reader:
-    """Steps through bytes and never past their end."""
+    """Reads values from bytes, never beyond their end."""
 
     def __init__(self, content: bytes) -> None:
         self._content, self._at = content, 0
@@ -217,7 +215,7 @@ class _Reader:
 
     def take(self, size: int) -> bytes:
         if size > self.left:
-            raise DamagedPacket("cut")
+            raise DamagedPacket("truncated")
         self._at += size
         return self._content[self._at - size : self._at]
 
@@ -226,14 +224,14 @@ class _Reader:
         return number
 
     def count(self, least: int) -> int:
-        """A number of things that take `least` bytes each."""
+        """A number of items of at least `least` bytes each."""
         count = self.integer()
         if not 0 <= count * least <= self.left:
             raise DamagedPacket("counts more than there is")
         return count
 
     def section(self, least: int, sized: bool) -> int:
-        """The count of a section; its size, where it tells one, is not needed to step over it."""
+        """The number of items of a section; its size, if it has one, is not needed to skip it."""
         count = self.integer()
         if sized:
             self.take(4)

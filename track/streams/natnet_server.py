@@ -1,4 +1,4 @@
-"""A capture or a take as a live stream on this machine, for whoever has no cameras."""
+"""A NatNet server that replays a capture or a take on this machine, to try a live set-up without cameras."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ if TYPE_CHECKING:
 
 LOOPBACK: Final = "127.0.0.1"
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
-_MOST_POINTS: Final = 1500  # that fit into a datagram
+_MOST_POINTS: Final = 1500  # in a datagram
 _MOST_CLIENTS: Final = 8
-_FORGET: Final = 10.0  # [s] without a sign of life
+_CLIENT_TIMEOUT: Final = 10.0  # [s] without a packet from a client
 
 
 class ReplayServer:
-    """Streams frames at their rate over NatNet, from when the first client comes and as long as there is one.
+    """Streams frames at their rate over NatNet, while there is a client.
 
-    It listens on this machine only. A block of a `with` statement or `close` ends it.
+    It listens on this machine only. The end of a `with` block or `close` ends it.
 
     Args:
-        points: Frames [m]; NaN where there is no point.
+        points: Points of all frames [m]; NaN where there is no point.
         ids: ID of each point, -1 where it has none.
-        rate: Frames a second [Hz].
-        version: The NatNet to speak.
-        port: To listen at; a free one when not given.
+        rate: Frames per second [Hz].
+        version: NatNet version of the packets.
+        port: UDP port to listen at; a free one when not given.
 
     Raises:
-        CaptureError: The arrays do not fit together, there are too many points, the version is none of those
-            known, or the port is taken.
+        CaptureError: The arrays do not fit together, there are too many points, the version is unknown, or
+            the port is taken.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class ReplayServer:
                 f"points have shape {points.shape} and IDs {ids.shape}, expected (T, N, 3) and (T, N)"
             )
         if ids.shape[1] > _MOST_POINTS:
-            raise CaptureError(f"{ids.shape[1]} points a frame, expected at most {_MOST_POINTS}")
+            raise CaptureError(f"{ids.shape[1]} points per frame, expected at most {_MOST_POINTS}")
         if version not in VERSIONS:
             known = [f"{major}.{minor}" for major, minor in VERSIONS]
             raise CaptureError(choices(".".join(map(str, version)), known, noun="NatNet version"))
@@ -74,25 +74,25 @@ class ReplayServer:
             raise CaptureError(f"port {port} cannot be listened at ({error})") from error
         self._socket.setblocking(False)
         self._port: int = self._socket.getsockname()[1]
-        self._clients: dict[tuple[str, int], float] = {}  # and when each was heard last
+        self._clients: dict[tuple[str, int], float] = {}  # and the time of their last packets
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="natnet replay", daemon=True)
         self._thread.start()
 
     @classmethod
     def of_capture(cls, capture: Capture, *, version: Version = natnet.NEWEST, port: int = 0) -> ReplayServer:
-        """The points of a marker file; names are not sent, an ID lasts until its marker is lost."""
+        """Replay a marker file; names are not sent, an ID lasts until its marker is lost."""
         ids = number_runs(np.isfinite(capture.positions[..., 0]))
         return cls(capture.positions, ids, capture.rate, version=version, port=port)
 
     @classmethod
     def of_take(cls, take: Take, *, version: Version = natnet.NEWEST, port: int = 0) -> ReplayServer:
-        """The points of a take and their IDs; its truth is not sent."""
+        """Replay the points of a take with their IDs; its truth is not sent."""
         return cls(take.points, take.ids, take.rate, version=version, port=port)
 
     @property
     def url(self) -> str:
-        """What to open."""
+        """Address for `open_stream`."""
         return f"natnet://{LOOPBACK}:{self._port}"
 
     def close(self) -> None:
@@ -113,7 +113,7 @@ class ReplayServer:
         start, number = 0.0, 0
         while not self._ended.is_set():
             if not self._clients:
-                start = time.monotonic() - number / self._rate  # wait where we are
+                start = time.monotonic() - number / self._rate  # continue at this frame
             due = start + number / self._rate if number < len(self._points) else np.inf
             self._answer(min(0.05, max(0.0, due - time.monotonic())))
             if self._clients and time.monotonic() >= due:
@@ -146,7 +146,9 @@ class ReplayServer:
 
     def _send_all(self, packet: bytes) -> None:
         now = time.monotonic()
-        self._clients = {client: heard for client, heard in self._clients.items() if now - heard < _FORGET}
+        self._clients = {
+            client: heard for client, heard in self._clients.items() if now - heard < _CLIENT_TIMEOUT
+        }
         for client in self._clients:
             self._send(packet, client)
 

@@ -1,4 +1,4 @@
-"""Live points from an OptiTrack server (Motive), frame by frame, over NatNet."""
+"""A live stream of points from an OptiTrack server (Motive) over NatNet."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
 SILENCE: Final = 2.0
-"""Time without a frame [s] after which a stream says that it is silent."""
+"""Time without a frame [s] after which a stream yields a silent frame."""
 _PATIENCE: Final = 3.0  # [s] to wait for a server
-_GREETING: Final = 0.5  # [s] between calls to a server that does not answer
-_ALIVE: Final = 2.0  # [s] between signs of life to one that does
-_REORDERED: Final = 1.0  # [s]: time that runs back by more is a take that starts again
-_BUFFER: Final = 1 << 20  # bytes that may wait while somebody is busy
+_RETRY: Final = 0.5  # [s] between requests to a server that does not answer
+_KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
+_REORDERED: Final = 1.0  # [s]: when time runs back by more, a recording has started again
+_BUFFER: Final = 1 << 20  # bytes of frames that may wait for the reader
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StreamedFrame:
-    """The points of a frame."""
+    """The points of one frame."""
 
     number: int
     """The server's number of the frame."""
@@ -42,21 +42,21 @@ class StreamedFrame:
     points: Float[np.ndarray, "N 3"]
     """[m], in the server's axes."""
     ids: Int[np.ndarray, "N"]
-    """The server's ID of each, -1 where it gives none."""
+    """The server's ID of each point, -1 where it gives none."""
     silent: bool = False
-    """Nothing came for a while: there are no points, and number and time are the last ones."""
+    """No frame arrived for a while: there are no points, and number and time are those of the last frame."""
 
 
 def open_stream(url: str, *, local: str | None = None, silence: float = SILENCE) -> PointStream:
-    """Listen to a server.
+    """Connect to a NatNet server.
 
     Args:
-        url: `natnet://host` or `natnet://host:port`, where the port is the one for commands.
+        url: `natnet://host` or `natnet://host:port`, with the port for commands.
         local: Address of the network card to listen at; the one that leads to the host when not given.
-        silence: Time without a frame after which the stream says so [s].
+        silence: Time without a frame after which the stream yields a silent frame [s].
 
     Raises:
-        CaptureError: The address is none, no server answers there, or it speaks an older NatNet.
+        CaptureError: The address is invalid, no server answers, or its NatNet is older than 3.0.
     """
     host, port = _split(url)
     try:
@@ -75,30 +75,30 @@ def open_stream(url: str, *, local: str | None = None, silence: float = SILENCE)
 
 
 class PointStream(Iterator[StreamedFrame]):
-    """Frames as they come; a block of a `with` statement or `close` ends it.
+    """Iterator of the frames of a stream; the end of a `with` block or `close` ends it.
 
-    Whoever takes frames more slowly than they come finds them late, not lost, until a megabyte waits.
+    When frames are read more slowly than they arrive, up to a megabyte of them waits.
     """
 
     def __init__(
         self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo, silence: float
     ) -> None:
         self.server = server
-        """What the server said of itself."""
+        """The server's description of itself."""
         self.damaged = 0
-        """Packets that were no frames; they were left out."""
+        """Number of damaged packets, which were left out."""
         self.late = 0
-        """Frames that came twice or after a newer one; they were left out."""
+        """Number of frames that came twice or after a newer one, which were left out."""
         self._sockets, self._address, self._silence = sockets, address, silence
         self._version = min(server.version, natnet.NEWEST)
         self._last: StreamedFrame | None = None
-        self._greeted = self._heard = time.monotonic()
+        self._kept_alive = self._heard = time.monotonic()
 
     def __next__(self) -> StreamedFrame:
-        """Wait for the next frame; after a silence an empty one says so, and again after another."""
+        """Wait for the next frame; after each period of silence a silent frame."""
         quiet = time.monotonic() + self._silence
         while self._sockets:
-            frame = self._receive(self._stay_in_touch(quiet))
+            frame = self._receive(self._keep_alive(quiet))
             if frame is not None:
                 self._last, self._heard = frame, time.monotonic()
                 return frame
@@ -108,7 +108,7 @@ class PointStream(Iterator[StreamedFrame]):
         raise StopIteration
 
     def close(self) -> None:
-        """Take leave of the server; no further frame comes."""
+        """Disconnect from the server; no further frame comes."""
         if self._sockets:
             _send(self._sockets[0], natnet.pack(Kind.DISCONNECT), self._address)
         for one in self._sockets:
@@ -123,18 +123,18 @@ class PointStream(Iterator[StreamedFrame]):
     ) -> None:
         self.close()
 
-    def _stay_in_touch(self, quiet: float) -> float:
-        """Greet the server if it is time to; returns how long to wait for a packet [s]."""
+    def _keep_alive(self, quiet: float) -> float:
+        """Send a keep-alive packet when it is due; returns how long to wait for a packet [s]."""
         now = time.monotonic()
-        if now >= self._greeted + _ALIVE:
+        if now >= self._kept_alive + _KEEP_ALIVE:
             _send(self._sockets[0], natnet.pack(Kind.KEEP_ALIVE), self._address)
-            if now >= self._heard + _ALIVE:  # a server that was started anew does not know us
+            if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
                 _send(self._sockets[0], natnet.pack_connect(), self._address)
-            self._greeted = now
-        return max(0.0, min(quiet, self._greeted + _ALIVE) - now)
+            self._kept_alive = now
+        return max(0.0, min(quiet, self._kept_alive + _KEEP_ALIVE) - now)
 
     def _receive(self, seconds: float) -> StreamedFrame | None:
-        """One packet's frame, if one comes and is good."""
+        """The frame of the next packet; None without a packet or without a valid frame in it."""
         ready, _, _ = select.select(self._sockets, [], [], seconds)
         packet = _receive(ready[0], self._address[0]) if ready else None
         if packet is None:
@@ -155,7 +155,7 @@ class PointStream(Iterator[StreamedFrame]):
         return StreamedFrame(frame.number, frame.time, frame.points, frame.ids)
 
     def _parse(self, payload: bytes) -> MarkerFrame:
-        """A frame of the version that was said, or of the other layout: some servers speak an older one."""
+        """A frame of the server's version, or of the other layout: some servers send an older one."""
         try:
             return natnet.parse_frame(payload, self._version)
         except DamagedPacket:
@@ -166,19 +166,21 @@ class PointStream(Iterator[StreamedFrame]):
 
 
 def _split(url: str) -> tuple[str, int]:
-    """Host and port."""
+    """Host and port of an address."""
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
     except ValueError:
         host, port = None, None
     if not host or parts.scheme != "natnet" or parts.path not in ("", "/") or port == 0:
-        raise CaptureError(f"'{url}' is no address of a stream, expected natnet://host or natnet://host:port")
+        raise CaptureError(
+            f"'{url}' is not an address of a stream, expected natnet://host or natnet://host:port"
+        )
     return host, port or COMMAND_PORT
 
 
 def _own_address(server: tuple[str, int]) -> str:
-    """Address of the network card that leads to the server: nothing else shall hear us. No packet is sent."""
+    """Address of the network card that leads to the server, the only one to listen at. No packet is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(server)
         own: str = probe.getsockname()[0]
@@ -189,7 +191,7 @@ def _bind(address: str, port: int) -> socket.socket:
     one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
-        if port:  # of a multicast: others on this machine may listen too
+        if port:  # of a multicast: other programs on this machine may listen too
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         one.bind((address, port))
         one.setblocking(False)
@@ -200,10 +202,10 @@ def _bind(address: str, port: int) -> socket.socket:
 
 
 def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> ServerInfo:
-    """Call until the server says who it is."""
-    for _ in range(round(_PATIENCE / _GREETING)):
+    """Send requests until the server describes itself."""
+    for _ in range(round(_PATIENCE / _RETRY)):
         _send(commands, natnet.pack_connect(), server)
-        until = time.monotonic() + _GREETING
+        until = time.monotonic() + _RETRY
         while (seconds := until - time.monotonic()) > 0.0:
             ready, _, _ = select.select([commands], [], [], seconds)
             info = _server_info(_receive(commands, server[0])) if ready else None
@@ -231,7 +233,9 @@ def _join(info: ServerInfo, commands: socket.socket, url: str) -> socket.socket:
     """Listen to the group that the server multicasts to."""
     group, local = str(info.group), commands.getsockname()[0]
     if not ipaddress.ip_address(group).is_multicast:
-        raise CaptureError(f"{url}: the server says that it multicasts to {group}, which is no such address")
+        raise CaptureError(
+            f"{url}: the server says that it multicasts to {group}, which is not a multicast address"
+        )
     try:
         one = _bind(local if os.name == "nt" else group, info.data_port)
         one.setsockopt(
@@ -246,13 +250,13 @@ def _send(one: socket.socket, packet: bytes, address: tuple[str, int]) -> None:
     try:
         one.sendto(packet, address)
     except OSError:
-        pass  # a network that is down for now: silence will be told
+        pass  # the network is down for now: the stream yields silent frames
 
 
 def _receive(one: socket.socket, host: str) -> bytes | None:
-    """A packet from the host, if there is one."""
+    """A packet from the host; None if there is none."""
     try:
         packet, (sender, _) = one.recvfrom(natnet.LARGEST)
-    except OSError:  # nothing there after all, or word that a port is closed
+    except OSError:  # no packet, or a message that a port is closed
         return None
     return packet if sender == host else None

@@ -12,7 +12,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.baselines.assignment_trackers import GATE, NEAR, HungarianTracker, NearestNeighborTracker
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
-from track.evaluation.trials import cut, darken, without_body
+from track.evaluation.trials import cut_take, hide_points, without_body
 from track.tracked_frame import Status
 from train.simulation.twins import TwinConfig, simulate_twin
 
@@ -48,7 +48,7 @@ def test_hands_in_the_air_are_followed(kind, take, users):
 
 @BOTH
 def test_hands_are_lost_with_their_points_and_stay_so(kind, take, users):
-    dark = darken(take, 20, 200)
+    dark = hide_points(take, 20, 200)
     tracker, seen, time = started(kind, users, dark, 220)
     frame = tracker.step(seen.points, seen.ids, time)
     assert not np.array_equal(frame.labels, seen.labels)
@@ -60,7 +60,7 @@ def test_the_first_frame_is_as_it_is_told(kind, take, users):
     seen = seen_frame(take, 0)
     wrong = np.roll(seen.labels, 1)
     assert np.array_equal(kind(users, wrong).step(seen.points, seen.ids, 0.0).labels, wrong)
-    with pytest.raises(ArgumentError, match="first_labels name 38 points, but the first frame has 37"):
+    with pytest.raises(ArgumentError, match="first_labels are of 38 points, but the first frame has 37"):
         kind(users, wrong).step(seen.points[1:], seen.ids[1:], 0.0)
     with pytest.raises(ArgumentError, match="first_labels go up to 38, expected less than 38"):
         kind(users, wrong + 1)
@@ -106,7 +106,7 @@ def test_a_new_point_is_the_nearest_lost_marker(shift, named, take, users):
 
 
 def test_lost_markers_are_looked_for_where_they_were_going(users, take):
-    first = cut(take, 0, 1)
+    first = cut_take(take, 0, 1)
     speed = np.array([1.2, 0.0, 0.0])  # [m/s]: 10 mm a frame
 
     def at(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -129,7 +129,7 @@ def test_the_assignment_asks_for_no_ids(take, users):
     nameless = dataclasses.replace(take, ids=np.full_like(take.ids, -1))
     frames = [
         evaluate_tracker(part, users, HungarianTracker(users, seen_frame(take, 0).labels)).right
-        for part in (cut(take, 0, 60), cut(nameless, 0, 60))
+        for part in (cut_take(take, 0, 60), cut_take(nameless, 0, 60))
     ]
     np.testing.assert_array_equal(*frames)
 

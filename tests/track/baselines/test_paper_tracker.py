@@ -13,7 +13,7 @@ from gloves.takes.take import Take
 from handsim.hand.topology import JOINT_NAMES
 from track.baselines.paper_tracker import GATE, PaperTracker
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
-from track.evaluation.trials import cut, darken, without_body
+from track.evaluation.trials import cut_take, hide_points, without_body
 from track.tracked_frame import Status, TrackedFrame
 from train.labelers.protocol import Labeling
 from train.labelers.storage import load_labeler
@@ -51,7 +51,7 @@ def users(take) -> list[GloveFit]:
 def still(take) -> Take:
     """A frame of which every marker is seen, standing still."""
     frame = int(np.flatnonzero(take.markers_present().all(axis=1))[0])
-    part = cut(take, frame, frame + 1)
+    part = cut_take(take, frame, frame + 1)
     hands = tuple(dataclasses.replace(hand, qpos=np.tile(hand.qpos, (40, 1))) for hand in part.hands)
     points, ids, labels = (np.repeat(array, 40, axis=0) for array in (part.points, part.ids, part.labels))
     return dataclasses.replace(part, points=points, ids=ids, labels=labels, hands=hands)
@@ -188,7 +188,7 @@ def test_missing_markers_are_filled_in(users, labeler, still):
 
 
 def test_hands_are_found_again_after_a_second_without_points(take, users, labeler):
-    frames = run(PaperTracker(users, labeler, rng=np.random.default_rng(0)), darken(take, 60, 120))
+    frames = run(PaperTracker(users, labeler, rng=np.random.default_rng(0)), hide_points(take, 60, 120))
     assert all(hand.status is Status.LOST for hand in frames[100].hands)
     assert all(hand.status is Status.TRACKED for hand in frames[-1].hands)
     assert np.array_equal(frames[-1].labels, seen_frame(take, 239).labels)

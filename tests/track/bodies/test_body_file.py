@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
-from track.bodies.body_file import load_bodies, load_body, save_body
+from track.bodies.body_file import BodyError, load_bodies, load_body, save_body
 from track.bodies.rigid_body import RigidTemplate
 
 NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_size=8)
@@ -33,7 +33,7 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, body: RigidTemplat
     save_body(path, body)
     again = load_body(path)
     assert (again.name, again.marker_names) == (body.name, body.marker_names)
-    np.testing.assert_allclose(again.places, body.places, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(again.positions, body.positions, rtol=0.0, atol=1e-12)
     save_body(path.with_name("again.toml"), again)
     assert path.read_bytes() == path.with_name("again.toml").read_bytes()
 
@@ -57,11 +57,11 @@ def test_files_are_in_millimeters(tmp_path):
     path.write_text(text(head='name = "wand"\ndescription = "three on a stick"'))
     body = load_body(path)
     assert (body.name, body.marker_names) == ("wand", ("m0", "m1", "m2"))
-    np.testing.assert_allclose(body.places, [[0, 0, 0], [0.05, 0, 0], [0, 0.08, 0]])
+    np.testing.assert_allclose(body.positions, [[0, 0, 0], [0.05, 0, 0], [0, 0.08, 0]])
 
 
 def test_objects_of_handsim_have_names():
-    np.testing.assert_array_equal(load_body("mug").places, named_object("mug").markers)
+    np.testing.assert_array_equal(load_body("mug").positions, named_object("mug").markers)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_objects_of_handsim_have_names():
 def test_a_file_that_describes_no_body_is_told(content, words, tmp_path):
     path = tmp_path / "wand.toml"
     path.write_text(content)
-    with pytest.raises(ArgumentError) as caught:
+    with pytest.raises(BodyError) as caught:
         load_body(path)
     assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -104,9 +104,9 @@ def test_unknown_bodies_are_told(tmp_path):
         load_body("mugg")
     with pytest.raises(ArgumentError, match="pen: 1 markers, expected at least 3"):
         load_body("pen")
-    with pytest.raises(ArgumentError, match=r"nowhere.toml: cannot be read: No such file"):
+    with pytest.raises(BodyError, match=r"nowhere.toml: cannot be read: No such file"):
         load_body(tmp_path / "nowhere.toml")
-    with pytest.raises(ArgumentError, match="cannot be written"):
+    with pytest.raises(BodyError, match="cannot be written"):
         save_body(tmp_path, load_body("mug"))
 
 

@@ -14,7 +14,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from track.bodies.constellation import advance, put, velocity_between
+from track.bodies.body_pose import predict_pose, transform_markers, velocity_between
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate
 from track.tracked_frame import Status
 from train.simulation.twins import TwinConfig, simulate_twin
@@ -50,7 +50,7 @@ def transform(rng) -> np.ndarray:
 
 def seen(body: RigidTemplate, pose: np.ndarray, rng, *, without: tuple[int, ...] = (), strays: int = 40):
     """The body's markers and strays around them in any order, with what each is."""
-    markers = body.places @ pose[:3, :3].T + pose[:3, 3] + rng.normal(0.0, NOISE, body.places.shape)
+    markers = body.positions @ pose[:3, :3].T + pose[:3, 3] + rng.normal(0.0, NOISE, body.positions.shape)
     labels = np.setdiff1d(np.arange(len(markers)), without)
     points = np.vstack([markers[labels], rng.uniform(-0.4, 0.4, (strays, 3))])
     labels = np.append(labels, np.full(strays, -1))
@@ -202,7 +202,7 @@ def test_ghosts_that_drift_off_where_markers_were_take_nothing_along(rng, gone):
         ids = labels.copy()
         if number >= 10:  # one ghost a marker that is gone, one way all of them
             away = pose[:3, :3] @ [0.0, 0.0005 + 0.0007 * (number - 10), 0.0]
-            ghosts = body.places[list(gone)] @ pose[:3, :3].T + pose[:3, 3] + away
+            ghosts = body.positions[list(gone)] @ pose[:3, :3].T + pose[:3, 3] + away
             points, labels = np.vstack([points, ghosts]), np.append(labels, np.full(len(gone), -1))
             ids = np.append(ids, 100 + np.arange(len(gone)))
         frame = tracker.step(points, ids, number * STEP)
@@ -214,7 +214,7 @@ def test_ghosts_that_drift_off_where_markers_were_take_nothing_along(rng, gone):
 
 def test_two_markers_and_a_ghost_that_turns_about_them_are_no_body(rng):
     body, pose = template("controller"), transform(rng)
-    tracker, places = BodyTracker(body), body.places
+    tracker, places = BodyTracker(body), body.positions
     axis = (places[3] - places[0]) / np.linalg.norm(places[3] - places[0])
     arm = places[4] - places[0]
     arm -= (arm @ axis) * axis
@@ -234,7 +234,7 @@ def test_two_markers_and_a_ghost_that_turns_about_them_are_no_body(rng):
 @pytest.mark.parametrize(
     ("places", "words"),
     [
-        ([[0, 0, 0], [0.05, 0, 0]], "2 markers, expected at least 3 to tell a pose"),
+        ([[0, 0, 0], [0.05, 0, 0]], "2 markers, expected at least 3, which determine a pose"),
         ([[0, 0, 0], [0.05, 0, 0], [0.12, 0.001, 0]], "lie on one line"),
         ([[0, 0, 0], [0.05, 0, 0], [0.05, 0.004, 0]], "m1 and m2 are 4.0 mm apart, expected at least 6 mm"),
         ([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0]], "look the same from two sides (m1 at m2, m2 at m1)"),
@@ -312,8 +312,14 @@ def test_velocities_carry_poses_on(rng):
     for _ in range(20):
         first, second = (np.append(rng.normal(size=3), random_quaternions(1, rng=rng)[0]) for _ in range(2))
         velocity = velocity_between(first, second, 0.5)
-        np.testing.assert_allclose(put(places, advance(first, velocity, 0.5)), put(places, second), atol=1e-9)
+        np.testing.assert_allclose(
+            transform_markers(places, predict_pose(first, velocity, 0.5)),
+            transform_markers(places, second),
+            atol=1e-9,
+        )
         assert np.linalg.norm(velocity[3:]) * 0.5 <= np.pi + 1e-9, "the short way round"
-        np.testing.assert_array_equal(advance(first, np.zeros(6), 3.0), first)
+        np.testing.assert_array_equal(predict_pose(first, np.zeros(6), 3.0), first)
         rotation = quaternion_matrix(first[3:])
-        np.testing.assert_allclose(put(places, first), places @ rotation.T + first[:3], atol=1e-12)
+        np.testing.assert_allclose(
+            transform_markers(places, first), places @ rotation.T + first[:3], atol=1e-12
+        )

@@ -14,6 +14,7 @@ from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from handsim.space.transforms import rigid_fit
 from track.calibration.body_learning import learn_body
+from track.calibration.frames import CalibrationError
 from train.simulation.twins import TwinConfig, simulate_twin
 
 FRAMES = 240
@@ -52,8 +53,8 @@ def test_all_markers_are_where_they_are(ghosts, rng):
     capture = controller(rng, ghosts)
     body = learn_body(capture, "wand")
     assert body.name == "wand" and body.marker_names == tuple(f"Marker{n}" for n in range(1, 7))
-    assert off(body.places, named_object("controller").markers) < 0.00005
-    np.testing.assert_allclose(body.places.mean(axis=0), 0.0, atol=1e-12)
+    assert off(body.positions, named_object("controller").markers) < 0.00005
+    np.testing.assert_allclose(body.positions.mean(axis=0), 0.0, atol=1e-12)
 
 
 def test_one_frame_is_not_enough_to_be_so_right(rng):
@@ -66,15 +67,19 @@ def test_one_frame_is_not_enough_to_be_so_right(rng):
 def test_captures_of_anything_else_are_told(rng):
     take = twin()
     hands = np.where(((take.labels >= 0) & (take.labels < 38))[..., None], take.points, np.nan)
-    with pytest.raises(ArgumentError, match="points a frame, expected 3 to 20: one body and nothing else"):
+    with pytest.raises(
+        CalibrationError, match="points per frame, expected 3 to 20: one body and nothing else"
+    ):
         learn_body(capture_of(hands), "wand")
     fingers = np.where(np.isin(take.labels, (3, 6, 9, 12, 15))[..., None], take.points, np.nan)
-    with pytest.raises(ArgumentError, match="% of the points keep their places on one rigid body, wanted"):
+    with pytest.raises(
+        CalibrationError, match="% of the points keep their positions on one rigid body, expected"
+    ):
         learn_body(capture_of(fingers), "wand")
-    with pytest.raises(ArgumentError, match="a capture of 0 points a frame"):
+    with pytest.raises(CalibrationError, match="a capture of 0 points per frame"):
         learn_body(Capture(("a",), np.full((5, 1, 3), np.nan), 120.0), "wand")
     line = np.linspace(0, 0.1, 4)[:, None] * np.array([1.0, 0.0, 0.0]) + rng.normal(0, 1e-5, (9, 4, 3))
-    with pytest.raises(ArgumentError, match="wand: its markers lie on one line"):
+    with pytest.raises(CalibrationError, match="wand: its markers lie on one line"):
         learn_body(capture_of(line), "wand")
     with pytest.raises(ArgumentError, match="millimeters"):
         learn_body(capture_of(1e3 * controller(rng).positions), "wand")

@@ -9,8 +9,15 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS
 from poses.shapes.touch import touching_angles
 from poses.shapes.validity import resting_angles
-from track.calibration.contacts import PRESS, Meeting, find_touches, meet, place_contacts, trust
-from track.calibration.skin_walk import SkinPatch
+from track.calibration.contacts import (
+    PAD_COMPRESSION,
+    ContactGeometry,
+    contact_geometry,
+    contact_weights,
+    find_touches,
+    initialize_contacts,
+)
+from track.calibration.skin_coordinates import SkinPatch
 
 RATE = 60.0
 
@@ -32,11 +39,13 @@ def visits(model, fingers, hold):
     return np.concatenate(parts), holds
 
 
-def meeting_of(model, touches, angles):
+def geometry_of(model, touches, angles):
     bones = model.forward_kinematics(join_qpos(angles[[frame for frame, _ in touches]]))
-    contacts = place_contacts(model, touches, bones)
-    faces = np.concatenate([contacts.thumb_places.faces, contacts.finger_places.faces])
-    return contacts, meet(contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones)
+    contacts = initialize_contacts(model, touches, bones)
+    faces = np.concatenate([contacts.thumb_coordinates.faces, contacts.finger_coordinates.faces])
+    return contacts, contact_geometry(
+        contacts, SkinPatch(faces).corners(model.surface.vertices), model, bones
+    )
 
 
 def test_every_touch_is_found_once(model):
@@ -63,25 +72,25 @@ def test_a_wave_past_the_finger_is_no_touch(model):
 @pytest.mark.parametrize("finger", ["index", "middle", "ring", "little"])
 def test_pads_of_a_touch_press_as_much_as_is_held(finger, model):
     angles = touching_angles(model, finger)[None]
-    contacts, meeting = meeting_of(model, [(0, finger)], angles)
-    assert meeting.square.all()
-    assert abs(meeting.gaps[0]) < 0.0015
+    contacts, geometry = geometry_of(model, [(0, finger)], angles)
+    assert geometry.facing.all()
+    assert abs(geometry.gaps[0]) < 0.0015
     assert DIGITS[contacts.fingers[0]] == finger
 
 
 def test_gaps_grow_as_the_thumb_leaves(model):
     touch, rest = touching_angles(model, "index"), resting_angles(model)
     angles = touch + np.array([[0.0], [0.1], [0.2], [0.3]]) * (rest - touch)
-    _, meeting = meeting_of(model, [(number, "index") for number in range(4)], angles)
-    assert (np.diff(meeting.gaps) > 0.0005).all()
-    assert PRESS == 0.001  # what gaps count from, told in the document
+    _, geometry = geometry_of(model, [(number, "index") for number in range(4)], angles)
+    assert (np.diff(geometry.gaps) > 0.0005).all()
+    assert PAD_COMPRESSION == 0.001  # what gaps count from, told in the document
 
 
 def test_an_odd_touch_is_not_trusted():
     gaps = np.array([0.003, 0.0032, 0.0029, 0.009, 0.02])
     fingers = np.array([1, 1, 1, 1, 2])
-    meeting = Meeting(np.zeros((5, 3)), gaps, np.array([True, True, True, True, False]))
-    weights = trust(meeting, fingers)
+    geometry = ContactGeometry(np.zeros((5, 3)), gaps, np.array([True, True, True, True, False]))
+    weights = contact_weights(geometry, fingers)
     assert weights[:3].min() > 0.9
     assert weights[3] < 0.05
     assert weights[4] == 0.0

@@ -13,18 +13,18 @@ from handsim.hand.model import join_qpos
 from handsim.space.transforms import random_quaternions
 from poses.shapes.touch import touching_angles
 from poses.shapes.validity import sample_valid_angles
-from track.calibration.contacts import place_contacts, slide_contacts
-from track.calibration.energy import Guess, Problem
+from track.calibration.contacts import initialize_contacts, slide_contacts
+from track.calibration.energy import Estimate, Problem
 from track.calibration.hand_parameters import NUM_PARAMETERS
-from track.calibration.skin_walk import nearest_places
-from track.calibration.solver import descend, eliminate, marker_rms
+from track.calibration.skin_coordinates import nearest_coordinates
+from track.calibration.solver import eliminate_poses, levenberg_marquardt, marker_rms
 
 FRAMES = 12
 SHARED = NUM_PARAMETERS + 57
 
 
 @pytest.fixture(scope="module")
-def problem_and_guess():
+def problem_and_estimate():
     """A hand in poses of which two are touches, looked for 3 mm and more away from where it is."""
     rng = np.random.default_rng(7)
     hand = nominal_fit(load_layout("dense19"), "M", "right")
@@ -38,14 +38,14 @@ def problem_and_guess():
     bones = hand.model.forward_kinematics(qpos)
     targets = hand.attachment.centers(hand.model, bones) + rng.normal(scale=0.001, size=(FRAMES, 19, 3))
     targets[3, 5] = np.nan
-    places = nearest_places(hand.attachment.points, hand.model.shape)
-    problem = Problem(hand.model.shape, places, 0.0032, targets, noise=0.001, reach=0.01)
-    contacts = place_contacts(hand.model, touches, bones[:2])
-    guess = Guess(np.zeros(NUM_PARAMETERS), hand.attachment.points, places, qpos, contacts)
+    coordinates = nearest_coordinates(hand.attachment.points, hand.model.shape)
+    problem = Problem(hand.model.shape, coordinates, 0.0032, targets, noise=0.001, robust_scale=0.01)
+    contacts = initialize_contacts(hand.model, touches, bones[:2])
+    estimate = Estimate(np.zeros(NUM_PARAMETERS), hand.attachment.points, coordinates, qpos, contacts)
     shared = rng.normal(size=SHARED) * np.r_[np.full(NUM_PARAMETERS, 0.002), np.full(57, 0.0005)]
-    guess = problem.moved(guess, rng.normal(scale=0.02, size=(FRAMES, 26)), shared)
-    fit = problem.fit(guess)
-    return problem, dataclasses.replace(guess, contacts=slide_contacts(contacts, fit.model, fit.bones[:2]))
+    estimate = problem.apply_step(estimate, rng.normal(scale=0.02, size=(FRAMES, 26)), shared)
+    fit = problem.fit(estimate)
+    return problem, dataclasses.replace(estimate, contacts=slide_contacts(contacts, fit.model, fit.bones[:2]))
 
 
 def direction(kind, rng):
@@ -61,24 +61,26 @@ def direction(kind, rng):
 
 # E_prior's normals are held within a step, and a marker that moves along the skin turns its own.
 @pytest.mark.parametrize(("kind", "tolerance"), [("poses", 2e-3), ("shape", 2e-3), ("markers", 3e-2)])
-def test_the_gradient_is_the_energys(kind, tolerance, problem_and_guess, rng, monkeypatch):
+def test_the_gradient_is_the_energys(kind, tolerance, problem_and_estimate, rng, monkeypatch):
     # How far a touch is trusted is held within a step, which is what reweighting means.
-    monkeypatch.setattr("track.calibration.energy.trust", lambda meeting, fingers: np.full(len(fingers), 0.7))
-    problem, guess = problem_and_guess
-    equations = problem.equations(guess, problem.fit(guess))
+    monkeypatch.setattr(
+        "track.calibration.energy.contact_weights", lambda geometry, fingers: np.full(len(fingers), 0.7)
+    )
+    problem, estimate = problem_and_estimate
+    equations = problem.normal_equations(estimate, problem.fit(estimate))
     poses, shared = direction(kind, rng)
     step = 1e-5
     there, back = (
-        problem.fit(problem.moved(guess, sign * poses, sign * shared)).cost for sign in (step, -step)
+        problem.fit(problem.apply_step(estimate, sign * poses, sign * shared)).cost for sign in (step, -step)
     )
     told = (equations.pose_gradient * poses).sum() + equations.shared_gradient @ shared
     assert told == pytest.approx((there - back) / (4 * step), rel=tolerance)
 
 
-def test_elimination_solves_the_whole_system(problem_and_guess):
-    problem, guess = problem_and_guess
-    equations = problem.equations(guess, problem.fit(guess))
-    reduced, solved = eliminate(equations, 0.0)
+def test_elimination_solves_the_whole_system(problem_and_estimate):
+    problem, estimate = problem_and_estimate
+    equations = problem.normal_equations(estimate, problem.fit(estimate))
+    reduced, solved = eliminate_poses(equations, 0.0)
     shared = -np.linalg.solve(reduced[:, :-1], reduced[:, -1])
     poses = -solved[..., -1] - solved[..., :-1] @ shared
     left = equations.shared @ shared + np.einsum("fps,fp->s", equations.mixed, poses)
@@ -88,11 +90,11 @@ def test_elimination_solves_the_whole_system(problem_and_guess):
     np.testing.assert_allclose(rest / np.sqrt(np.einsum("fpp->fp", equations.pose)), 0.0, atol=1e-6)
 
 
-def test_steps_go_down_and_are_told(problem_and_guess):
-    problem, guess = problem_and_guess
+def test_steps_go_down_and_are_told(problem_and_estimate):
+    problem, estimate = problem_and_estimate
     told = []
-    _, fit, steps = descend(problem, guess, 10, 14, lambda *values: told.append(values))
-    assert fit.cost < 0.2 * problem.fit(guess).cost
+    _, fit, steps = levenberg_marquardt(problem, estimate, 10, 14, lambda *values: told.append(values))
+    assert fit.cost < 0.2 * problem.fit(estimate).cost
     assert [row[0] for row in told] == list(range(11, steps + 1))
     assert told[-1][1] == marker_rms(problem, fit) < 0.0015
     assert told[-1][2] < 0.001

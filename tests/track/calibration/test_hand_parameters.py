@@ -1,4 +1,4 @@
-"""A shape's parameters make valid hands, and skinned points follow them as their slopes say."""
+"""A shape's parameters make valid hands, and skinned points follow them as their jacobians say."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from poses.shapes.validity import sample_valid_angles
 from track.calibration.hand_parameters import (
     NUM_PARAMETERS,
     shape_at,
+    shape_jacobian,
     shape_precision,
-    skeleton_numbers,
-    skinned,
-    skinned_shape_slopes,
-    slopes_of,
+    skeleton_parameters,
+    skinned_shape_jacobian,
+    skinning_terms,
 )
-from track.calibration.skin_walk import nearest_places, place_weights
+from track.calibration.skin_coordinates import nearest_coordinates, skin_weights
 
 
 def test_no_change_is_the_first_hand(rng):
@@ -43,7 +43,7 @@ def test_points_follow_the_skeleton(rng):
     shape = sample_shape(rng=rng)
     model = HandModel(shape)
     worn = attach_markers(load_layout("dense19"), model)
-    weights = place_weights(nearest_places(worn.points, shape))
+    weights = skin_weights(nearest_coordinates(worn.points, shape))
     qpos = join_qpos(
         sample_valid_angles(model, 4, rng=rng),
         position=rng.normal(size=(4, 3)),
@@ -54,18 +54,18 @@ def test_points_follow_the_skeleton(rng):
         lengths, knuckles, angles = numbers.reshape(3, 5, 3)
         changed = dataclasses.replace(shape, bone_lengths=lengths, knuckles=knuckles, base_angles=angles)
         other = HandModel(changed)
-        carried = skinned(other, other.forward_kinematics(qpos), worn.points, weights)[1]
+        carried = skinning_terms(other, other.forward_kinematics(qpos), worn.points, weights)[1]
         return np.einsum("ml,tmli->tmi", weights, carried)
 
-    slopes = skinned_shape_slopes(model, model.forward_kinematics(qpos), worn.points, weights)
-    here, step = skeleton_numbers(shape), 1e-6
+    jacobian = skinned_shape_jacobian(model, model.forward_kinematics(qpos), worn.points, weights)
+    here, step = skeleton_parameters(shape), 1e-6
     for number, nudge in enumerate(step * np.eye(len(here))):
         quotient = (placed(here + nudge) - placed(here - nudge)) / (2 * step)
-        np.testing.assert_allclose(slopes[..., number], quotient, atol=1e-7)
+        np.testing.assert_allclose(jacobian[..., number], quotient, atol=1e-7)
 
 
-def test_slopes_of_a_linear_function(rng):
+def test_jacobian_of_a_linear_function(rng):
     shape = sample_shape(rng=rng)
-    slopes = slopes_of(shape, np.zeros(NUM_PARAMETERS), lambda hand: hand.knuckles.ravel())
-    np.testing.assert_allclose(slopes[:, 17:32], np.eye(15), atol=1e-9)
-    np.testing.assert_allclose(slopes[::3, 0], shape.knuckles[:, 0], rtol=1e-4)
+    jacobian = shape_jacobian(shape, np.zeros(NUM_PARAMETERS), lambda hand: hand.knuckles.ravel())
+    np.testing.assert_allclose(jacobian[:, 17:32], np.eye(15), atol=1e-9)
+    np.testing.assert_allclose(jacobian[::3, 0], shape.knuckles[:, 0], rtol=1e-4)

@@ -18,7 +18,7 @@ from handsim.hand.topology import JOINT_NAMES, SIDES
 from handsim.space.transforms import MIRROR
 from poses.motion.wrist_paths import WristConfig, wrist_path
 from track.calibration.picture import save_picture
-from track.calibration.skin_walk import slip
+from track.calibration.skin_coordinates import displace_markers
 from track.calibration.user_calibration import Calibration, CalibrationError, calibrate, calibrate_hands
 from track.evaluation.hand_errors import hand_errors
 from track.user import load_user, save_user
@@ -43,7 +43,7 @@ def somebody():
         radii=1.03 * mean.radii,
     )
     model = HandModel(shape)
-    worn = slip(attach_markers(LAYOUT, model), shape, 0.005, rng=rng)
+    worn = displace_markers(attach_markers(LAYOUT, model), shape, 0.005, rng=rng)
     angles = calibration_angles(model, CalibrationTakeConfig(free=12.0, rounds=1), rng=rng)
     angles = angles[::4]
     where = wrist_path(len(angles), RATE, WristConfig(), rng=rng)
@@ -85,8 +85,8 @@ def test_a_hand_and_its_glove_come_back(side):
     before, after = hand_errors(result.start, true), hand_errors(result.hand, true)
     moving = [0, 1, 2, 4] if side == "left" else [0, 1, 2, 3, 4]  # digits, the thumb first
     assert result.hand.side == side
-    assert before.places.mean() > 0.004
-    assert after.places.mean() < 0.0008
+    assert before.positions.mean() > 0.004
+    assert after.positions.mean() < 0.0008
     assert np.abs(before.lengths).mean() > 0.06
     assert np.abs(after.lengths[moving]).mean() < 0.015
     assert result.rms_before > 0.003
@@ -96,8 +96,8 @@ def test_a_hand_and_its_glove_come_back(side):
 
 def test_errors_are_as_large_as_told():
     true, result, _ = calibrated()["right"]
-    errors = hand_errors(result.hand, true).wrist_places
-    assert (errors < 2.5 * result.place_errors).mean() > 0.75
+    errors = hand_errors(result.hand, true).wrist_positions
+    assert (errors < 2.5 * result.position_errors).mean() > 0.75
     off = np.abs(result.hand.model.shape.bone_lengths - true.model.shape.bone_lengths)[:, :2]
     assert (off < 2.5 * result.length_errors[:, :2]).mean() > 0.75
     assert result.length_errors.max() < 0.005
@@ -105,11 +105,11 @@ def test_errors_are_as_large_as_told():
 
 def test_touches_are_found_and_closed():
     _, result, _ = calibrated()["right"]
-    fingers = {touch.finger for touch in result.touches if touch.trust > 0.5}
+    fingers = {touch.finger for touch in result.touches if touch.weight > 0.5}
     assert len(fingers) >= 3
     before, after = result.gaps()
     assert after < 0.0007 < before
-    assert result.trusted_touches
+    assert result.significant_touches
 
 
 def test_progress_is_told():
@@ -126,7 +126,7 @@ def test_a_finger_that_does_not_move_is_told():
     still = {JOINT_NAMES[number] for number in RING}
     assert still <= set(result.still_joints)
     assert not {"index_PIP_flexion", "middle_PIP_flexion"} & set(result.still_joints)
-    advice = " / ".join(result.advice())
+    advice = " / ".join(result.suggestions())
     assert "move the ring more: MCP abduction, MCP flexion, PIP flexion, DIP flexion" in advice
     assert calibrated()["right"][1].length_errors[3, 0] < result.length_errors[3, 0]
 
@@ -150,7 +150,7 @@ def test_a_hand_that_does_not_move_is_told(rng):
     markers = markers_of(hand, still)
     start = [nominal_fit(LAYOUT, "M", side) for side in SIDES]
     shown = {"right": markers, "left": np.full_like(markers, np.nan)}  # a hand that is not there is left out
-    with pytest.raises(CalibrationError, match="of the right hand's 20 hinges cover less than 30%"):
+    with pytest.raises(CalibrationError, match="of the right hand's 20 joints cover less than 30%"):
         calibrate_hands(shown, start, RATE)
     with pytest.raises(CalibrationError, match="no marker of the left or right hand"):
         calibrate_hands({"left": shown["left"]}, start, RATE)

@@ -14,7 +14,7 @@ from handsim.errors import ArgumentError
 from track.commands import reproduce as table_commands
 from track.evaluation import comparison
 from track.evaluation.comparison import (
-    GIVEN_FIRST,
+    NEED_FIRST_LABELS,
     OURS,
     PAPERS_LOOP,
     USERS,
@@ -28,7 +28,7 @@ from track.evaluation.trials import FEWEST_FRAMES, without_body
 from train.labelers.storage import load_labeler
 from train.simulation.twins import KINDS, TWINS, TwinConfig, simulate_twin
 
-METHODS = (OURS, PAPERS_LOOP, *GIVEN_FIRST)
+METHODS = (OURS, PAPERS_LOOP, *NEED_FIRST_LABELS)
 WITH_BODY = "handsim, controller too"
 
 
@@ -141,14 +141,14 @@ def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     take = without_body(simulate_twin(TwinConfig(kind="single-hand", num_frames=FEWEST_FRAMES)))
     measured = compare_trackers({"single-hand": take}, load_labeler("dense19"), seed=0, trials=1)
     by_name = {one.method: one for one in measured}
-    assert by_name[OURS].locks[0] <= 3 and by_name[OURS].recoveries[0] <= 3
-    for name in GIVEN_FIRST:
-        assert not len(by_name[name].locks), "they are told how it begins"
-        assert np.isnan(by_name[name].recoveries[0])
+    assert by_name[OURS].initialization[0] <= 3 and by_name[OURS].recovery[0] <= 3
+    for name in NEED_FIRST_LABELS:
+        assert not len(by_name[name].initialization), "they are told how it begins"
+        assert np.isnan(by_name[name].recovery[0])
     ours = [by_name[OURS]]
     joints, _ = print_errors(ours)
     assert list(joints.columns[2].cells) == [f"{1e3 * ours[0].report.by_occlusion()[0, 0][1]:.2f}"]
-    waits = print_trials([by_name[GIVEN_FIRST[0]]])
+    waits = print_trials([by_name[NEED_FIRST_LABELS[0]]])
     assert [next(iter(column.cells)) for column in waits.columns[2:]] == [
         "",
         "",

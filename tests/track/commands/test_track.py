@@ -70,7 +70,7 @@ def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     assert found.side == "right", "the left hand is not in the capture"
     errors = hand_errors(found, true)
     start = hand_errors(nominal_fit(load_layout("dense19"), "L", "right"), true)
-    assert np.median(errors.places) < 0.5 * np.median(start.places)
+    assert np.median(errors.positions) < 0.5 * np.median(start.positions)
     assert main(["track", str(folder / "user.c3d"), "--shape", str(folder / "user.json"), "--out",
                  str(folder / "take.npz")]) == 0  # fmt: skip
     take = load_tracked_take(folder / "take.npz")
@@ -102,7 +102,7 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     assert lines[0] == f"{out}: {FRAMES} frames, 0.5 s at 120 Hz"
     assert lines[1].startswith("right hand: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median")
     assert lines[2].startswith("left hand: ") and " mm, " in lines[2]
-    assert lines[3].endswith("points are no markers") and lines[4].endswith(" ms a frame")
+    assert lines[3].endswith("points are not markers") and lines[4].endswith(" ms per frame")
     take, truth = load_tracked_take(out), load_take(capture.with_suffix(".truth.npz"))
     assert take.sides == ("right", "left")
     assert take.settings["capture"] == "take.c3d" and take.settings["user"] == "L"
@@ -156,7 +156,7 @@ def test_a_body_is_learned_from_a_capture_of_it(capture, tmp_path, capsys):
     assert main(["body", str(file), "--out", str(wand)]) == 0
     assert capsys.readouterr().out.startswith(f"{wand}: wand, 6 markers, at most 99.9 mm apart")
     body, true = load_body(wand), load_body("controller")
-    np.testing.assert_allclose(np.sort(body.sides.ravel()), np.sort(true.sides.ravel()), atol=0.0002)
+    np.testing.assert_allclose(np.sort(body.distances.ravel()), np.sort(true.distances.ravel()), atol=0.0002)
 
 
 def test_a_body_is_followed_through_a_stream(capture, tmp_path, capsys):

@@ -35,7 +35,7 @@ def test_what_differs_is_told(side, rng):
     errors = hand_errors(found, true)
     assert errors.lengths[2, 1] == pytest.approx(0.1)
     assert np.abs(np.delete(errors.lengths.ravel(), 5)).max() < 1e-12
-    assert errors.places[0] == pytest.approx(0.003)
+    assert errors.positions[0] == pytest.approx(0.003)
 
 
 def test_a_palm_that_lies_elsewhere_is_laid_back(rng):
@@ -47,8 +47,8 @@ def test_a_palm_that_lies_elsewhere_is_laid_back(rng):
     )
     errors = hand_errors(found, true)
     palm = true.attachment.bone_indices[:, 0] == PALM
-    assert errors.places.max() < 1e-12
-    np.testing.assert_allclose(errors.wrist_places[palm], np.linalg.norm(shift))
+    assert errors.positions.max() < 1e-12
+    np.testing.assert_allclose(errors.wrist_positions[palm], np.linalg.norm(shift))
 
 
 def test_other_hands_are_told():

@@ -15,9 +15,9 @@ from track.evaluation.take_evaluation import (
     OCCLUSIONS,
     evaluate_tracker,
     nearest_size,
+    nominal_users,
     seen_frame,
     true_users,
-    usual_users,
 )
 from track.kinematics.pose_solver import PoseSolver
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
@@ -159,7 +159,7 @@ def test_nothing_counted_is_nan_and_no_warning(take):
 
 def test_true_users_wear_what_was_worn_and_usual_ones_what_was_designed(take):
     rms = {}
-    for kind, users in (("true", true_users(take)), ("usual", usual_users(take))):
+    for kind, users in (("true", true_users(take)), ("usual", nominal_users(take))):
         assert [user.side for user in users] == [hand.shape.side for hand in take.hands]
         fits = [
             PoseSolver(user).solve(take.observed(label)[:5])
@@ -168,7 +168,7 @@ def test_true_users_wear_what_was_worn_and_usual_ones_what_was_designed(take):
         rms[kind] = np.concatenate([fit.rms for fit in fits])
     assert (rms["true"] < 0.0005).all()
     assert (rms["usual"] > 0.001).all() and (rms["usual"] < 0.008).all()
-    usual = usual_users(take)[0].model.shape
+    usual = nominal_users(take)[0].model.shape
     assert usual.length == pytest.approx(1e-3 * SIZES[nearest_size(take.hands[0].shape.length)][0])
 
 

@@ -8,7 +8,14 @@ import pytest
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.evaluation.take_evaluation import seen_frame, true_users
-from track.evaluation.trials import FEWEST_FRAMES, cut, darken, first_locks, recoveries, without_body
+from track.evaluation.trials import (
+    FEWEST_FRAMES,
+    cut_take,
+    hide_points,
+    initialization_times,
+    recovery_times,
+    without_body,
+)
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
@@ -37,18 +44,18 @@ class Late:
 
 
 def test_a_cut_take_is_a_part_of_it(take):
-    part = cut(take, 10, 40)
+    part = cut_take(take, 10, 40)
     assert part.num_frames == 30
     np.testing.assert_array_equal(part.points, take.points[10:40])
     np.testing.assert_array_equal(part.hands[1].qpos, take.hands[1].qpos[10:40])
     assert part.body is not None and take.body is not None
     np.testing.assert_array_equal(part.body.T_world_body, take.body.T_world_body[10:40])
     with pytest.raises(ArgumentError, match="frames 10 to 999, expected a part of 0 to 320"):
-        cut(take, 10, 999)
+        cut_take(take, 10, 999)
 
 
 def test_what_comes_back_from_the_dark_has_other_ids(take):
-    dark = darken(take, 60, 120)
+    dark = hide_points(take, 60, 120)
     assert all(not len(seen_frame(dark, frame).points) for frame in range(60, 180))
     before = np.unique(dark.ids[:60][dark.ids[:60] >= 0])
     after = np.unique(dark.ids[180:][dark.ids[180:] >= 0])
@@ -72,21 +79,21 @@ def test_a_take_without_its_body_has_only_points_of_hands_and_ghosts(take):
 def test_waits_are_counted_from_the_first_frame_with_points(take, rng):
     for after in (0, 7):
         np.testing.assert_array_equal(
-            first_locks(take, lambda part, n=after: Late(part, n), 3, rng=rng), after
+            initialization_times(take, lambda part, n=after: Late(part, n), 3, rng=rng), after
         )
         np.testing.assert_array_equal(
-            recoveries(take, lambda part, n=after: Late(part, n), 2, rng=rng), after
+            recovery_times(take, lambda part, n=after: Late(part, n), 2, rng=rng), after
         )
-    assert np.isnan(first_locks(take, lambda part: Late(part, 120), 2, rng=rng)).all()
-    assert np.isnan(recoveries(take, lambda part: Late(part, 120), 2, rng=rng)).all()
+    assert np.isnan(initialization_times(take, lambda part: Late(part, 120), 2, rng=rng)).all()
+    assert np.isnan(recovery_times(take, lambda part: Late(part, 120), 2, rng=rng)).all()
 
 
 def test_our_tracker_is_soon_right(take, rng):
     users, labeler = true_users(take), load_labeler("dense19")
-    assert np.median(first_locks(take, lambda part: Tracker(users, labeler), 3, rng=rng)) <= 3
-    assert np.median(recoveries(take, lambda part: Tracker(users, labeler), 2, rng=rng)) <= 3
+    assert np.median(initialization_times(take, lambda part: Tracker(users, labeler), 3, rng=rng)) <= 3
+    assert np.median(recovery_times(take, lambda part: Tracker(users, labeler), 2, rng=rng)) <= 3
 
 
 def test_a_short_take_is_told(take, rng):
     with pytest.raises(ArgumentError, match="the take has 50 frames, expected at least 120"):
-        first_locks(cut(take, 0, 50), lambda part: Late(part, 0), 1, rng=rng)
+        initialization_times(cut_take(take, 0, 50), lambda part: Late(part, 0), 1, rng=rng)

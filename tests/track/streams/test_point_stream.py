@@ -205,7 +205,7 @@ def test_the_client_listens_on_loopback_only_and_takes_leave():
 
 
 def test_a_quiet_server_is_greeted_anew(monkeypatch):
-    monkeypatch.setattr(streaming, "_ALIVE", 0.1)
+    monkeypatch.setattr(streaming, "_KEEP_ALIVE", 0.1)
     with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=0.35) as stream:
         assert next(stream).silent
         assert server.heard[1:].count(Kind.CONNECT) >= 2
@@ -249,7 +249,7 @@ def test_addresses_that_are_none_are_told(url):
 
 def test_servers_that_cannot_be_used_are_told(monkeypatch):
     monkeypatch.setattr(streaming, "_PATIENCE", 0.2)
-    monkeypatch.setattr(streaming, "_GREETING", 0.1)
+    monkeypatch.setattr(streaming, "_RETRY", 0.1)
     with Puppet() as server, pytest.raises(CaptureError, match="no NatNet server answers; in Motive, switch"):
         open_stream(server.url)
     with (

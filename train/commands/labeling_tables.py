@@ -1,4 +1,4 @@
-"""The command `handsim reproduce`: the paper's tables with our figures beside its own."""
+"""Subcommands of `handsim reproduce`: the paper's tables of labeling with our figures beside its own."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def table6(
     _print_tests("Table 6", "sparse13", TABLE6, labelers, num_frames, captures, seed)
 
 
-REPRODUCE: Final = {"table2": table2, "table3": table3, "table4": table4, "table6": table6}
+LABELING_TABLES: Final = {"table2": table2, "table3": table3, "table4": table4, "table6": table6}
 
 
 def _print_tests(
