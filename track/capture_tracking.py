@@ -7,6 +7,7 @@ unlabeled points may go on with somebody else. Column names are not used.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
@@ -118,6 +119,7 @@ class TakeRecorder:
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
+        self._config = tracker.config
         self._bodies = tuple(MarkedBody(body.name, body.marker_names, body.places) for body in tracker.bodies)
         self._frames: list[tuple[StreamedFrame, TrackedFrame]] = []
 
@@ -174,7 +176,7 @@ class TakeRecorder:
             labels=_spread(there, [one.labels for one in tracked], -1).astype(np.int16),
             confidence=_spread(there, [one.confidence for one in tracked], np.nan),
             **self._body_tracks(tracked),
-            settings={},
+            settings={"tracker": dataclasses.asdict(self._config)},
         )
 
     def _body_tracks(self, tracked: Sequence[TrackedFrame]) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class GivenFirst:
         places = np.full((self._first[-1], 3), np.inf)
         for number, (hand, pose) in enumerate(zip(self._hands, poses, strict=True)):
             if pose is not None:
-                places[self._first[number] : self._first[number + 1]] = hand.solver.place(pose)
+                places[self._first[number] : self._first[number + 1]] = hand.solver.marker_positions(pose)
         return places
 
 

@@ -102,7 +102,9 @@ class PaperTracker:
         places = np.full((self._first[-1], 3), np.inf)
         for number, hand in enumerate(self._hands):
             if hand.qpos is not None:
-                places[self._first[number] : self._first[number + 1]] = hand.solver.place(hand.qpos)
+                places[self._first[number] : self._first[number + 1]] = hand.solver.marker_positions(
+                    hand.qpos
+                )
         places[labels[labels >= 0]] = np.inf
         found = np.full(len(points), -1)
         found[free] = name_by_proximity(points[free], places, GATE)

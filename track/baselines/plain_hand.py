@@ -67,7 +67,7 @@ class PlainHand:
     ) -> TrackedHand:
         """What is said of this hand in a frame: one of the poses that were solved and its names."""
         there = names >= 0
-        markers = self.solver.place(fit.qpos[row])
+        markers = self.solver.marker_positions(fit.qpos[row])
         markers[names[there]] = points[there]
         filled = np.setdiff1d(np.arange(self.num_markers), names[there])
         return TrackedHand(self.hand.side, status, fit.qpos[row], float(fit.rms[row]), markers, filled)

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from track.kinematics.starting_poses import lay_rigidly
+from track.kinematics.starting_poses import align_rigid
 
 FEWEST: Final = 3  # markers that tell a pose
 _NEW: Final = 1.5  # how much farther than tight a point with a new ID may be off
@@ -137,7 +137,7 @@ def _fit(places: Any, points: Any, owners: Any, pose: Any) -> Any:
             count += 1
     if count < FEWEST:
         return count, np.nan, np.nan
-    lay_rigidly(places, target, np.ones(len(places)), pose)
+    align_rigid(places, target, np.ones(len(places)), pose)
     there, total, worst = put(places, pose), 0.0, 0.0
     for marker in range(len(places)):
         if owners[marker] >= 0:

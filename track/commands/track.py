@@ -100,7 +100,7 @@ def track(
         "user": size or "M" if shape is None else shape.name,
         "labeler": labeler or glove,
     }
-    take = dataclasses.replace(take, settings=made)
+    take = dataclasses.replace(take, settings={**take.settings, **made})
     save_tracked_take(out, take)
     if labeled is not None:
         write_capture(labeled, labeled_points(take))

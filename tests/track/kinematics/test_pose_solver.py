@@ -19,7 +19,7 @@ from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.motion.motions import sample_motion
 from poses.shapes.validity import resting_angles, sample_valid_angles
 from track.kinematics.integration import move
-from track.kinematics.pose_solver import PoseSolver, Prediction, solve_poses
+from track.kinematics.pose_solver import AnglePrior, PoseSolver, solve_poses
 
 INDEX = slice(11, 15)  # of qpos
 
@@ -153,7 +153,7 @@ def test_a_hidden_digit_stays_where_it_is_thought_to_be(rng):
     near = move(qpos, 0.01 * rng.standard_normal((20, 26)))
     thought = qpos[:, 7:] + 0.02 * rng.standard_normal((20, 20))
     solver = PoseSolver(GloveFit(model, glove))
-    fit = solver.solve(markers, near, prediction=Prediction(thought, 0.1))
+    fit = solver.solve(markers, near, prior=AnglePrior(thought, 0.1))
     apart = np.rad2deg(np.abs(fit.qpos[:, INDEX] - thought[:, 4:8]))
     assert apart.max() < 1.0  # what rest pulls, 90 degrees of spread against 0.1 rad
     others = np.r_[7:11, 15:27]
@@ -168,8 +168,8 @@ def test_a_prediction_is_not_heard_where_all_markers_are(rng):
     qpos = random_poses(model, 5, rng)
     markers = markers_of(model, glove, qpos)
     solver = PoseSolver(GloveFit(model, glove))
-    told = solver.solve(markers, qpos, prediction=Prediction(np.zeros(20), 1e-3))
-    np.testing.assert_array_equal(told.qpos, solver.solve(markers, qpos).qpos)
+    informed = solver.solve(markers, qpos, prior=AnglePrior(np.zeros(20), 1e-3))
+    np.testing.assert_array_equal(informed.qpos, solver.solve(markers, qpos).qpos)
 
 
 def test_a_sparse_glove_is_steadied_by_a_prediction(rng):
@@ -177,9 +177,11 @@ def test_a_sparse_glove_is_steadied_by_a_prediction(rng):
     qpos = random_poses(model, 30, rng)
     markers = markers_of(model, glove, qpos) + rng.normal(scale=0.0005, size=(30, 13, 3))
     solver = PoseSolver(GloveFit(model, glove))
-    told = solver.solve(markers, qpos, prediction=Prediction(qpos[:, 7:], np.full(20, 0.05)))
-    error, told_error = (np.abs(fit.qpos - qpos)[:, 7:].mean() for fit in (solver.solve(markers, qpos), told))
-    assert told_error < 0.5 * error
+    informed = solver.solve(markers, qpos, prior=AnglePrior(qpos[:, 7:], np.full(20, 0.05)))
+    error, informed_error = (
+        np.abs(fit.qpos - qpos)[:, 7:].mean() for fit in (solver.solve(markers, qpos), informed)
+    )
+    assert informed_error < 0.5 * error
 
 
 def test_frames_and_starts_know_nothing_of_each_other(rng):
@@ -281,9 +283,9 @@ def test_bad_starts_predictions_and_distances_are_told(rng):
         solver.solve(targets, np.zeros((1, 26)))
     with pytest.raises(ArgumentError, match="initial has a quaternion of length zero in frame 0"):
         solver.solve(targets, np.zeros((1, 27)))
-    with pytest.raises(ArgumentError, match=r"prediction\.spread is 0 rad, expected positive"):
-        solver.solve(targets, flat, prediction=Prediction(np.zeros(20), 0.0))
-    with pytest.raises(ArgumentError, match=r"prediction has angles of shape \(3, 20\)"):
-        solver.solve(targets, flat, prediction=Prediction(np.zeros((3, 20)), 0.1))
+    with pytest.raises(ArgumentError, match=r"prior\.spread is 0 rad, expected positive"):
+        solver.solve(targets, flat, prior=AnglePrior(np.zeros(20), 0.0))
+    with pytest.raises(ArgumentError, match=r"prior has angles of shape \(3, 20\)"):
+        solver.solve(targets, flat, prior=AnglePrior(np.zeros((3, 20)), 0.1))
     with pytest.raises(ArgumentError, match="outlier_distance is -1 m, expected a positive distance"):
         PoseSolver(GloveFit(model, glove), outlier_distance=-1.0)
