@@ -2,7 +2,7 @@
 
 Lengths are in meters, times in seconds, angles in radians; log-odds are natural. The defaults made every
 published figure. Constants of fast-math kernels are not here but beside their kernels
-(`track.kinematics.levenberg_marquardt`, `track.association.digit_hypotheses`), because they are compiled in.
+(`track.kinematics.levenberg_marquardt`, `track.association.digit_fit`), because they are compiled in.
 """
 
 from __future__ import annotations

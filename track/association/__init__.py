@@ -10,6 +10,7 @@ In the order of a frame's way through it:
 - `point_matching`: one-to-one matching of points with markers by log-odds; for the palm.
 - `candidates`: candidate points of each digit.
 - `digit_hypotheses`: every assignment of a digit's candidates to its markers, fitted and scored.
+- `digit_fit`: the fit of one such assignment.
 - `joint_assignment`: the best combination of the hypotheses of all digits that share candidates.
 - `initialization`: hands without history, from labeled clouds.
 """

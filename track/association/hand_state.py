@@ -17,10 +17,11 @@ from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
 from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.association.point_matching import peak_log_odds
 from track.config import TrackerConfig
+from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.integration import move, velocity_of
 from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
 from track.kinematics.marker_prediction import MarkerPrediction
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from track.kinematics.pose_solver import PoseSolver
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

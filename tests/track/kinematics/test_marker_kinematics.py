@@ -48,12 +48,12 @@ def test_markers_sit_where_the_glove_has_them(posed):
     np.testing.assert_allclose(work.markers, centers, atol=1e-14)
 
 
-def test_slopes_are_the_numpy_ones(posed):
+def test_the_jacobian_is_the_numpy_one(posed):
     model, glove, angles, _, work = posed
     np.testing.assert_allclose(work.jacobian, true_jacobian(model, glove, angles), atol=1e-13)
 
 
-def test_slopes_of_an_earlier_pose_are_forgotten(posed, rng):
+def test_the_jacobian_of_an_earlier_pose_is_overwritten(posed, rng):
     model, glove, _, hand, work = posed
     angles = rng.uniform(*model.skeleton.ranges.T)
     compute_markers(hand, angles, work)
@@ -62,7 +62,7 @@ def test_slopes_of_an_earlier_pose_are_forgotten(posed, rng):
     np.testing.assert_allclose(work.jacobian, true_jacobian(model, glove, angles), atol=1e-13)
 
 
-def test_the_normal_matrix_is_gathered_whole(posed, rng):
+def test_the_normal_matrix_is_accumulated_completely(posed, rng):
     model, glove, angles, hand, work = posed
     weights = rng.uniform(0.5, 2.0, size=len(glove.points))
     weights[rng.choice(len(weights), size=3, replace=False)] = 0.0
@@ -75,6 +75,6 @@ def test_the_normal_matrix_is_gathered_whole(posed, rng):
     gradient = np.einsum("m,mia,mi->a", weights[there], jacobian[there], work.residuals[there])
     np.testing.assert_allclose(np.triu(work.normal), np.triu(normal), atol=1e-12)
     np.testing.assert_allclose(work.gradient, gradient, atol=1e-12)
-    left_out = np.arange(NUM_UNKNOWNS) < hand.starts[:, None]
+    left_out = np.arange(NUM_UNKNOWNS) < hand.skyline[:, None]
     assert left_out.sum() > 50, "the factor has zeros to keep"
     np.testing.assert_array_equal(normal[left_out], 0.0)
