@@ -168,4 +168,5 @@ def _add_nearest(
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
+    """Distance of two points [m]."""
     return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)  # type: ignore[no-any-return]

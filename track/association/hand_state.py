@@ -91,17 +91,17 @@ class HandState:
         """Positions (M, 3) of the pose's markers [m]."""
         self.confirmed = np.zeros(len(DIGITS), dtype=bool)
         """Digits that have had a settled label since the hand was initialized."""
-        self._velocity = np.zeros(6 + NUM_JOINTS)
-        self._joint_covariance = resting_covariance(config.motion)
+        self._velocity = np.zeros(6 + NUM_JOINTS)  # [m/s, rad/s] in MuJoCo's order
+        self._joint_covariance = resting_covariance(config.motion)  # [rad^2] of the last estimate
         self._resting_prior = resting_prior(config.motion)
-        self._bias = np.zeros((count, 3))
-        self._bias_frames = np.zeros(count)
-        self._variance = self.variance.copy()
-        self._typical_bias = 0.0
-        self._last_seen = np.zeros(count)
-        self._designed = self.adapted.positions[:, 0].copy()
+        self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
+        self._bias_frames = np.zeros(count)  # that each bias is averaged over
+        self._variance = self.variance.copy()  # [m^2] while the biases are certain
+        self._typical_bias = 0.0  # [m] RMS over the markers
+        self._last_seen = np.zeros(count)  # [s] of each marker
+        self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(self.adapted)
-        self._now = 0.0
+        self._now = 0.0  # [s] of the last prediction
 
     def predict(self, time: float) -> Prediction:
         """The pose at a time [s] if the hand goes on with its velocity; for a hand that has a pose."""
@@ -254,6 +254,7 @@ class HandState:
         self._shift_markers()
 
     def _store(self, estimate: Estimate, time: float) -> None:
+        """Keep an estimate as the state at a time [s]."""
         self.qpos, self.time, self.positions = estimate.qpos, time, estimate.positions
         self.rms = estimate.rms
         self._joint_covariance = estimate.predicted.joint_covariance
@@ -264,6 +265,7 @@ class HandState:
         self._last_seen[present] = time
 
     def _shift_markers(self) -> None:
+        """Shift the markers of `adapted` by their biases."""
         noise = self.config.noise
         self._typical_bias = _shift_markers(
             self._bias_frames,

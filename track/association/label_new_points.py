@@ -111,6 +111,7 @@ def _label_palm(
 
 
 def _marker_table(hands: Sequence[HandTrack], frame: FrameState) -> MarkerTable:
+    """The markers of all hands in a row."""
     assigned, digits, first = np.full(len(frame.points), -1), [], 0
     for row, hand in enumerate(hands):
         labels, own = frame.labels[hand.index], hand.state.digits
@@ -161,6 +162,7 @@ def _evaluate_hand(
 
 
 def _write_labels(hands: Sequence[HandTrack], assigned: NDArray[np.int64], frame: FrameState) -> None:
+    """Write the markers of points, counted through the hands, to the frame's labels."""
     first = 0
     for hand in hands:
         last = first + hand.state.num_markers

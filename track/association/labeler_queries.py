@@ -99,6 +99,7 @@ class LabelerQueries:
         return True
 
     def _near(self, points: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Which points are within the radius of a position."""
         distances = np.linalg.norm(points[:, None] - positions, axis=-1)
         near: NDArray[np.bool_] = (distances < self._config.radius).any(axis=1)
         return near
