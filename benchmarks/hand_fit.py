@@ -26,7 +26,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape, shape_from_measures
 from handsim.hand.topology import JOINTS
 from handsim.kernels.integration import move
-from track.kinematics.pose_solver import PoseFit, solve_poses
+from track.kinematics.pose_solver import PoseFit, solve_pose
 
 ROUNDS = 12
 STEP = 1e-5
@@ -98,10 +98,10 @@ def fit_person(markers: np.ndarray, layout: MarkerLayout) -> tuple[Person, np.nd
     size = np.linalg.norm(markers[:, first] - markers[:, second], axis=1).mean() / 0.0749  # of the mean hand
     person = Person(shape_from_measures(0.187 * size, 0.083 * size), layout)
     parameters = np.zeros(len(person.spread))
-    fit = solve_poses(person.wear(parameters), markers)
+    fit = solve_pose(person.wear(parameters), markers)
     for _ in range(ROUNDS):
         parameters, qpos = improve(person, parameters, fit)
-        fit = solve_poses(person.wear(parameters), markers, initial=qpos, iterations=10)
+        fit = solve_pose(person.wear(parameters), markers, initial=qpos, iterations=10)
     return person, parameters
 
 
@@ -137,7 +137,7 @@ def main() -> None:
     for name, markers in right_hands(arguments.captures, layout.names).items():
         chosen = rng.choice(len(markers), arguments.frames + arguments.held_out, replace=False)
         person, parameters = fit_person(markers[chosen[: arguments.frames]], layout)
-        fit = solve_poses(person.wear(parameters), markers[chosen[arguments.frames :]])
+        fit = solve_pose(person.wear(parameters), markers[chosen[arguments.frames :]])
         tell(name, person, parameters, fit)
         everyone.append(1e3 * fit.rms)
     rms = np.concatenate(everyone)

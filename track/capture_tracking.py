@@ -7,6 +7,7 @@ unlabeled points may continue with another marker. Column names are not used.
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
@@ -128,6 +129,7 @@ class TakeRecorder:
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
+        self._config = tracker.config
         self._bodies = tuple(
             MarkedBody(body.name, body.marker_names, body.positions) for body in tracker.bodies
         )
@@ -186,7 +188,7 @@ class TakeRecorder:
             labels=_spread(present, [one.labels for one in tracked], -1).astype(np.int16),
             confidence=_spread(present, [one.confidence for one in tracked], np.nan),
             **self._body_tracks(tracked),
-            settings={},
+            settings={"tracker": dataclasses.asdict(self._config)},
         )
 
     def _body_tracks(self, tracked: Sequence[TrackedFrame]) -> dict[str, Any]:

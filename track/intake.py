@@ -1,54 +1,60 @@
-"""What comes in is looked over before anybody relies on it: points, IDs and the time of a frame.
+"""Checks of what a stream brings, before anything relies on it: points, IDs and the time of a frame.
 
-A stream is not stopped for a bad frame. What cannot be used is left out, and a note says so.
+A bad frame does not stop a stream. What cannot be used is left out, and a note says so.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from handsim.errors import ArgumentError
+from track.config import IntakeConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_FARTHEST: Final = 1e3  # [m] beyond which there is no room
-_USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] until a stream has shown its own
-_SILENCE: Final = 0.25  # [s] without a frame that is told
-_EASE: Final = 0.1  # share of the newest interval in the usual one
-_SHORTEST, _LONGEST = 0.1, 2.0  # of the usual interval: between two frames on the clock; of one that counts
-_LATEST: Final = 1e11  # [s] beyond which there is no time: a clock of doubles would stand still
 
-
-class Incoming(NamedTuple):
+class IncomingFrame(NamedTuple):
     """A frame as the tracker uses it."""
 
     points: Float[np.ndarray, "P 3"]
-    """[m], all of them finite."""
+    """Points [m], all of them finite."""
     ids: Int[np.ndarray, "P"]
-    """-1 where a point has none of its own."""
+    """Their IDs; -1 where a point has none of its own."""
     kept: Int[np.ndarray, "P"]
-    """Which points of the frame these are."""
+    """Indices of these points in the frame as it came."""
     time: float
-    """On a clock that only goes forward [s]."""
+    """Time on a clock that only goes forward [s]."""
     notes: tuple[str, ...]
+    """What was wrong with the frame, in words."""
 
 
 class Intake:
-    """Looks over the frames of one stream."""
+    """Checks the frames of one stream.
 
-    def __init__(self) -> None:
+    Args:
+        config: Bounds, and the usual interval between frames.
+    """
+
+    def __init__(self, config: IntakeConfig = IntakeConfig()) -> None:  # noqa: B008 (frozen)
+        self._config = config
         self._last = np.nan
         self._clock = 0.0
-        self._interval = _USUAL_INTERVAL
+        self._interval = config.usual_interval
 
-    def take(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> Incoming:
-        """The next frame.
+    def take(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> IncomingFrame:
+        """Check the next frame.
+
+        Args:
+            points: Points [m].
+            ids: Their IDs; -1 where there is none.
+            time: Time stamp of the frame [s].
 
         Raises:
-            ArgumentError: `points` and `ids` do not fit together: the caller's mistake, not the stream's.
+            ArgumentError: `points` and `ids` do not fit together, which is the caller's mistake, not the
+                stream's.
         """
         points, ids = np.asarray(points, dtype=np.float64), np.asarray(ids, dtype=np.int64)
         if points.shape != (len(ids), 3):
@@ -57,7 +63,7 @@ class Intake:
             )
         notes = self._tick(float(time))
         with np.errstate(invalid="ignore"):
-            usable = np.abs(points).max(axis=1, initial=0.0) < _FARTHEST  # which NaN is not
+            usable = np.abs(points).max(axis=1, initial=0.0) < self._config.farthest  # which NaN is not
         if not usable.all():
             notes.append(f"{np.sum(~usable)} of {len(points)} points are nowhere and left out")
         kept = np.flatnonzero(usable)
@@ -67,12 +73,12 @@ class Intake:
             several = sorted({number for number in known if known.count(number) > 1})
             notes.append(f"IDs of several points at once: {', '.join(map(str, several[:5]))}")
             ids = np.where(np.isin(ids, several), -1, ids)
-        return Incoming(points, np.maximum(ids, -1), kept, self._clock, tuple(notes))
+        return IncomingFrame(points, np.maximum(ids, -1), kept, self._clock, tuple(notes))
 
     def _tick(self, time: float) -> list[str]:
-        """Move the clock on; what was odd about the time."""
+        """Advance the clock; return notes on what was wrong with the time stamp."""
         span = time - self._last
-        if abs(time) < _LATEST:
+        if abs(time) < self._config.latest_time:
             self._last = time
         else:
             self._clock += self._interval
@@ -83,9 +89,10 @@ class Intake:
         if span <= 0.0:
             self._clock += self._interval
             return [f"the time went back by {-span:.3g} s" if span else "the time stood still"]
-        # Stamps shake; what moved is divided by the time that it took.
-        self._clock += max(span, _SHORTEST * self._interval)
-        if span > _SILENCE:
+        # Time stamps jitter, and velocities are divided by their differences.
+        self._clock += max(span, self._config.shortest_interval * self._interval)
+        if span > self._config.silence:
             return [f"no frame for {span:.3g} s"]
-        self._interval += _EASE * (min(span, _LONGEST * self._interval) - self._interval)
+        newest = min(span, self._config.longest_interval * self._interval)
+        self._interval += self._config.interval_smoothing * (newest - self._interval)
         return []

@@ -1,4 +1,4 @@
-"""What a tracker says of one frame: a pose a hand, a label a point, and how it came to them."""
+"""The tracker's output for one frame: one pose per hand, one label per point, and their status."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Status(Enum):
     """How far a hand's pose can be relied on."""
 
     TRACKED = "tracked"
-    """It follows from the frame before."""
+    """It continues the pose of the frame before."""
     FOUND = "found"
-    """It was found among the points without any history."""
+    """It was initialized from the points, without history."""
     COASTING = "coasting"
-    """Too few markers are there: the pose is the one that was coming; it is given for a few frames only."""
+    """Too few markers are visible: the pose is the predicted one; it is given for a few frames only."""
     LOST = "lost"
     """There is no pose."""
 
@@ -34,17 +34,17 @@ class TrackedHand:
     side: Side
     status: Status
     qpos: Float[np.ndarray, "27"]
-    """NaN where the hand is lost."""
+    """The pose; NaN where the hand is lost."""
     rms: float
-    """3D RMS distance of the labeled markers from the pose's [m]; NaN without a fit."""
+    """3D RMS distance of the labeled markers from the pose's, biases included [m]; NaN without a fit."""
     markers: Float[np.ndarray, "M 3"]
     """The labeled markers [m], and the pose's where they are missing; NaN where the hand is lost."""
     filled: Int[np.ndarray, "F"]
-    """Which of these are filled in from the pose."""
+    """Indices of the markers that are filled in from the pose."""
 
     @property
     def has_pose(self) -> bool:
-        """Whether there is a pose to stand by."""
+        """Whether there is a pose."""
         return self.status is not Status.LOST
 
 
@@ -55,7 +55,7 @@ class TrackedBody:
     name: str
     status: Status
     translation: Float[np.ndarray, "3"]
-    """Of the body's frame in the world [m]; NaN where it is lost."""
+    """Position of the body's frame in the world [m]; NaN where it is lost."""
     rotation: Float[np.ndarray, "4"]
     """Its orientation, wxyz; NaN where it is lost."""
     rms: float
@@ -71,7 +71,7 @@ class TrackedFrame:
     labels: Int[np.ndarray, "N"]
     """Marker of each point, counted through the hands in their order, then the bodies; -1 for none."""
     confidence: Float[np.ndarray, "N"]
-    """How sure each label is, 0 to 1."""
+    """Confidence in each label, 0 to 1."""
     bodies: tuple[TrackedBody, ...] = ()
     notes: tuple[str, ...] = ()
-    """What was wrong with the frame itself, in words; most frames have nothing to say."""
+    """What was wrong with the frame itself, in words; empty for most frames."""

@@ -1,29 +1,29 @@
-"""The online tracker: points of a frame in, hands in motion out.
+"""The online tracker: the points of a frame in, the motion of hands out.
 
-Section 4 of Han et al. 2018, with more memory: names go along with IDs while they fit, new points are named
-by what the hand that is coming explains (`track.association.label_consistency`), and a hand of which nothing
-is known is looked for
-with the labeler (`track.association.initialization`).
+Section 4 of Han et al. 2018 with more history: labels go along with IDs while they fit, new points are
+labeled by the pose that is predicted (`track.association`), and hands without history are initialized with
+the labeler.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
-from track.association.candidates import YOUNG
-from track.association.hand_state import Estimate, HandMemory
-from track.association.initialization import MOST_RMS, Found, HandFinder, score_of
-from track.association.label_consistency import fit_names, forget_surprises, targets_of
-from track.association.label_new_points import Following, name_new
-from track.association.labeler_queries import Adviser
+from track.association.frame_state import FrameState
+from track.association.hand_state import Estimate, HandState
+from track.association.initialization import HandInitializer, InitializedHand
+from track.association.label_consistency import fit_labels, gate_labels, targets_of
+from track.association.label_new_points import HandTrack, label_new_points
+from track.association.labeler_queries import LabelerQueries
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
-from track.intake import Incoming, Intake
+from track.config import TrackerConfig
+from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
 
@@ -31,254 +31,217 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-_FEWEST: Final = 5  # named points that a pose can be relied on for
-_LONGEST_COAST: Final = 0.1  # [s] that a pose is carried on without them
-_SHARE: Final = 0.6  # of a hand's markers; with fewer named it is doubted
-_AROUND, _PATIENCE = 0.2, 0.15  # [m] where its points must be, [s] for which that must last
-_ROUGH: Final = 0.003  # [m] RMS of a hand, its habits known, that is doubted
-_BETTER: Final = 20.0  # log odds by which a hand must be more, to be taken anew
-_MOST_CREDIT: Final = 12.0
-_INCOME: Final = 2.0  # credit of a name in each frame, less half the squared deviations it is off
-
 
 class Tracker:
-    """Follows the user's hands, and things with markers of their own, from frame to frame.
+    """Tracks the user's hands, and bodies with markers of their own, from frame to frame.
 
     Args:
         hands: The user's hands, each side at most once.
-        labeler: Knows the markers of the hands' glove.
-        bodies: Rigid bodies that are there beside the hands.
+        labeler: Labels the markers of the hands' glove.
+        bodies: Rigid bodies beside the hands.
+        config: All settings.
     """
 
     def __init__(
-        self, hands: Sequence[GloveFit], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
+        self,
+        hands: Sequence[GloveFit],
+        labeler: Labeler,
+        bodies: Sequence[RigidTemplate] = (),
+        config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     ) -> None:
         self.hands = tuple(hands)
         self.bodies = tuple(bodies)
-        self._intake = Intake()
+        self.config = config
+        self._intake = Intake(config.intake)
         self._bodies = [BodyTracker(body) for body in bodies]
-        self._memories = [HandMemory(hand) for hand in hands]
-        self._finder = HandFinder(self._memories, labeler)
-        sizes = [memory.num_markers for memory in self._memories]
+        self._states = [HandState(hand, config) for hand in hands]
+        self._initializer = HandInitializer(self._states, labeler, config)
+        self._queries = LabelerQueries(labeler, config.queries)
+        sizes = [state.num_markers for state in self._states]
         self._first = np.cumsum([0, *sizes, *(len(body.marker_names) for body in bodies)])
-        self._adviser = Adviser(labeler)
-        self._labels: dict[int, tuple[int, float]] = {}
-        self._born: dict[int, float] = {}
-        self._trusted = np.zeros(len(hands))
+        self._labels: dict[int, tuple[int, float]] = {}  # label and evidence of each ID
+        self._first_seen: dict[int, float] = {}  # [s] of each ID
+        self._last_sound = np.zeros(len(hands))  # [s] when each track was last beyond doubt
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Take in the next frame; whatever a stream may bring ends in a status or a note.
+        """Track the next frame; whatever a stream may bring ends in a status or a note.
 
         Args:
-            points: Points [m]; those that are no finite places are left alone.
-            ids: The system's IDs: a point keeps its own for as long as it is seen; -1 where there is none.
+            points: Points [m]; those without finite coordinates are left out.
+            ids: The system's IDs: a point keeps its own for as long as it is visible; -1 where there is none.
             time: Time of the frame [s].
 
         Raises:
             ArgumentError: `points` and `ids` do not fit together.
         """
-        frame = self._intake.take(points, ids, time)
-        bodies, labels = self._track_bodies(frame)
-        sure, free = np.ones(len(labels)), labels < 0
-        hands, labels[free], sure[free] = self._track_hands(frame.points[free], frame.ids[free], frame.time)
-        all_labels, all_sure = np.full(len(points), -1), np.ones(len(points))
-        all_labels[frame.kept], all_sure[frame.kept] = labels, sure
-        return TrackedFrame(time, hands, all_labels, all_sure, bodies, frame.notes)
+        incoming = self._intake.take(points, ids, time)
+        bodies, labels = self._track_bodies(incoming)
+        confidence, free = np.ones(len(labels)), labels < 0
+        frame = self._frame_state(incoming.points[free], incoming.ids[free], incoming.time)
+        hands, labels[free] = self._track_hands(frame)
+        confidence[free] = frame.confidence
+        all_labels, all_confidence = np.full(len(points), -1), np.ones(len(points))
+        all_labels[incoming.kept], all_confidence[incoming.kept] = labels, confidence
+        return TrackedFrame(time, hands, all_labels, all_confidence, bodies, incoming.notes)
 
-    def _track_bodies(self, frame: Incoming) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
+    def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
         """Every body, and the labels (P,) of their points."""
-        labels, bodies = np.full(len(frame.points), -1), []
-        for number, tracker in enumerate(self._bodies, start=len(self._memories)):
-            found = tracker.step(frame.points, frame.ids, frame.time)
-            labels[found.labels >= 0] = self._first[number] + found.labels[found.labels >= 0]
-            place, turn = np.full(3, np.nan), np.full(4, np.nan)
-            if found.T_world_body is not None:
-                place, turn = (
-                    found.T_world_body[:3, 3],
-                    rotation_quaternions(found.T_world_body[None, :3, :3])[0],
-                )
-            bodies.append(TrackedBody(tracker.template.name, found.status, place, turn, found.rms))
+        labels, bodies = np.full(len(incoming.points), -1), []
+        for number, tracker in enumerate(self._bodies, start=len(self._states)):
+            body = tracker.step(incoming.points, incoming.ids, incoming.time)
+            labels[body.labels >= 0] = self._first[number] + body.labels[body.labels >= 0]
+            position, rotation = np.full(3, np.nan), np.full(4, np.nan)
+            if body.T_world_body is not None:
+                position = body.T_world_body[:3, 3]
+                rotation = rotation_quaternions(body.T_world_body[None, :3, :3])[0]
+            bodies.append(TrackedBody(tracker.template.name, body.status, position, rotation, body.rms))
         return tuple(bodies), labels
 
-    def _track_hands(
-        self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float
-    ) -> tuple[tuple[TrackedHand, ...], NDArray[np.int64], NDArray[np.float64]]:
-        """Every hand, and the labels (P,) of points and how sure they are."""
-        names, credit = self._carry_over(ids)
-        born = self._births(ids, time)
-        sure = 1.0 / (1.0 + np.exp(-credit - 1.0))
-        following = self._follow(points, ids, names, credit, sure, born, time)
-        hands = [
-            self._judge(memory, points, names[number], credit, following.get(number), time)
-            for number, memory in enumerate(self._memories)
-        ]
-        self._find_lost(points, names, hands, time)
-        self._doubt(points, names, hands, time)
+    def _frame_state(self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float) -> FrameState:
+        """The frame with the labels and the evidence that its IDs carry over."""
+        known = [self._labels.get(point, (-1, 0.0)) for point in ids.tolist()]
+        carried = np.array([label for label, _ in known], dtype=np.int64)
+        first = self._first[: len(self._states) + 1, None]
+        labels = carried - first[:-1]
+        labels[(labels < 0) | (carried >= first[1:])] = -1
+        evidence = np.array([evidence for _, evidence in known])
+        self._first_seen = {point: self._first_seen.get(point, time) for point in ids.tolist() if point >= 0}
+        first_seen = np.array([self._first_seen.get(point, time) for point in ids.tolist()])
+        confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
+        return FrameState(points, ids, labels, evidence, confidence, first_seen, time)
+
+    def _track_hands(self, frame: FrameState) -> tuple[tuple[TrackedHand, ...], NDArray[np.int64]]:
+        """Every hand, and the labels (P,) of points, counted through the hands."""
+        estimates = self._associate(frame)
+        hands = [self._update(index, frame, estimates.get(index)) for index in range(len(self._states))]
+        self._initialize_lost(frame, hands)
+        self._replace_doubted(frame, hands)
         first = self._first[: len(hands), None]
-        labels = np.where(names >= 0, names + first, -1).max(axis=0, initial=-1)
+        labels = np.where(frame.labels >= 0, frame.labels + first, -1).max(axis=0, initial=-1)
         self._labels = {
-            point: (label, worth)
-            for point, label, worth in zip(ids.tolist(), labels.tolist(), credit.tolist(), strict=True)
+            point: (label, evidence)
+            for point, label, evidence in zip(
+                frame.ids.tolist(), labels.tolist(), frame.evidence.tolist(), strict=True
+            )
             if label >= 0 and point >= 0
         }
-        return tuple(hands), labels, sure
+        return tuple(hands), labels
 
-    def _carry_over(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Names (H, N) that the IDs carry, and what they are worth (N,)."""
-        known = [self._labels.get(point, (-1, 0.0)) for point in ids.tolist()]
-        labels = np.array([label for label, _ in known], dtype=np.int64)
-        first = self._first[: len(self._memories) + 1, None]
-        names = labels - first[:-1]
-        names[(names < 0) | (labels >= first[1:])] = -1
-        return names, np.array([worth for _, worth in known])
-
-    def _births(self, ids: NDArray[np.int64], time: float) -> NDArray[np.float64]:
-        """Since when each point has been there."""
-        self._born = {point: self._born.get(point, time) for point in ids.tolist() if point >= 0}
-        return np.array([self._born.get(point, time) for point in ids.tolist()])
-
-    def _follow(
-        self,
-        points: NDArray[np.float64],
-        ids: NDArray[np.int64],
-        names: NDArray[np.int64],
-        credit: NDArray[np.float64],
-        sure: NDArray[np.float64],
-        born: NDArray[np.float64],
-        time: float,
-    ) -> dict[int, Estimate]:
-        """Poses of the hands that were there before; names (H, N) and credits are overwritten."""
+    def _associate(self, frame: FrameState) -> dict[int, Estimate]:
+        """Predict the hands that have a pose, test and complete their labels, and fit their poses."""
         hands = []
-        for number, memory in enumerate(self._memories):
-            if (names[number] >= 0).sum() < _FEWEST and time - memory.time > _LONGEST_COAST:
-                memory.qpos = None
-            if memory.qpos is None:
-                names[number] = -1
+        for index, state in enumerate(self._states):
+            labels = frame.labels[index]
+            if (labels >= 0).sum() < self.config.track.fewest_labels and self._coasted_out(state, frame.time):
+                state.qpos = None
+            if state.qpos is None:
+                labels[:] = -1
                 continue
-            coming = memory.predict(time)
-            forget_surprises(memory, points, names[number], coming)
-            estimate = fit_names(memory, points, names[number], coming)
-            hands.append(Following(number, memory, coming, estimate))
-        before = names.copy()
-        advice = self._adviser.odds(hands, points, ids, names, born, time)
-        how_sure = name_new(hands, points, names, credit, born, advice)
-        changed = np.isfinite(how_sure)
-        credit[changed], sure[changed] = 0.0, how_sure[changed]
-        fitted = {}
+            prediction = state.predict(frame.time)
+            gate_labels(state, frame.points, labels, prediction, self.config.gating)
+            estimate = fit_labels(state, frame.points, labels, prediction, self.config.gating)
+            hands.append(HandTrack(index, state, prediction, estimate))
+        before = frame.labels.copy()
+        confidence = label_new_points(hands, frame, self._queries.log_odds(hands, frame))
+        changed = np.isfinite(confidence)
+        frame.evidence[changed], frame.confidence[changed] = 0.0, confidence[changed]
+        estimates = {}
         for hand in hands:
-            mine, estimate = names[hand.number], hand.estimate
-            if (mine != before[hand.number]).any():
-                estimate = fit_names(hand.memory, points, mine, hand.coming)
-            fitted[hand.number] = estimate
-        return fitted
+            labels, estimate = frame.labels[hand.index], hand.estimate
+            if (labels != before[hand.index]).any():
+                estimate = fit_labels(hand.state, frame.points, labels, hand.prediction, self.config.gating)
+            estimates[hand.index] = estimate
+        return estimates
 
-    def _judge(
-        self,
-        memory: HandMemory,
-        points: NDArray[np.float64],
-        names: NDArray[np.int64],
-        credit: NDArray[np.float64],
-        fit: Estimate | None,
-        time: float,
-    ) -> TrackedHand:
-        """Take a pose over or throw it away."""
-        mine = np.flatnonzero(names >= 0)
-        if fit is not None and len(mine) >= _FEWEST and fit.rms <= MOST_RMS:
-            firm = np.zeros(memory.num_markers, dtype=bool)
-            firm[names[mine]] = credit[mine] >= YOUNG
-            memory.carry_on(fit, firm, time)
-            off = ((points[mine] - memory.places[names[mine]]) ** 2).sum(axis=1)
-            income = _INCOME - 0.5 * off / memory.variance[names[mine]]
-            credit[mine] = np.clip(credit[mine] + income, 0.0, _MOST_CREDIT)
-            return _tracked(memory, Status.TRACKED, points, names, fit)
-        if memory.qpos is not None and time - memory.time > _LONGEST_COAST:
-            memory.qpos = None
-        if memory.qpos is None:
-            names[:] = -1
-            return _tracked(memory, Status.LOST, points, names, None)
-        return _tracked(memory, Status.COASTING, points, names, None)
+    def _coasted_out(self, state: HandState, time: float) -> bool:
+        """Whether a pose is too old to be predicted on."""
+        return time - state.time > self.config.track.longest_coast
 
-    def _find_lost(
-        self,
-        points: NDArray[np.float64],
-        names: NDArray[np.int64],
-        hands: list[TrackedHand],
-        time: float,
-    ) -> None:
-        """Look for the hands that have no pose among the points without a name."""
-        lost = [n for n, hand in enumerate(hands) if hand.status in (Status.LOST, Status.COASTING)]
+    def _update(self, index: int, frame: FrameState, estimate: Estimate | None) -> TrackedHand:
+        """Take over a hand's estimate, or reject it; the evidence of its labels is updated."""
+        state, labels = self._states[index], frame.labels[index]
+        track, association = self.config.track, self.config.association
+        labeled = np.flatnonzero(labels >= 0)
+        enough = len(labeled) >= track.fewest_labels
+        if estimate is not None and enough and estimate.rms <= self.config.initialization.most_rms:
+            settled = np.zeros(state.num_markers, dtype=bool)
+            settled[labels[labeled]] = frame.evidence[labeled] >= association.settled_evidence
+            state.update(estimate, settled, frame.time)
+            squares = ((frame.points[labeled] - state.positions[labels[labeled]]) ** 2).sum(axis=1)
+            gain = association.evidence_per_frame - 0.5 * squares / state.variance[labels[labeled]]
+            frame.evidence[labeled] = np.clip(frame.evidence[labeled] + gain, 0.0, association.most_evidence)
+            return _tracked(state, Status.TRACKED, frame.points, labels, estimate)
+        if state.qpos is not None and self._coasted_out(state, frame.time):
+            state.qpos = None
+        if state.qpos is None:
+            labels[:] = -1
+            return _tracked(state, Status.LOST, frame.points, labels, None)
+        return _tracked(state, Status.COASTING, frame.points, labels, None)
+
+    def _initialize_lost(self, frame: FrameState, hands: list[TrackedHand]) -> None:
+        """Initialize hands without a pose with the points that the others leave; `hands` is overwritten."""
+        lost = [index for index, hand in enumerate(hands) if hand.status in (Status.LOST, Status.COASTING)]
         if not lost:
             return
-        others = np.delete(names, lost, axis=0)
-        free = np.flatnonzero((others < 0).all(axis=0))
-        for found in self._finder.find(points[free], tuple(lost)):
-            hands[found.number] = self._take_up(found, free, points, names, time)
-            lost.remove(found.number)
-            for other in lost:  # it may have held on to some of these points
-                names[other, names[found.number] >= 0] = -1
-                memory = self._memories[other]
-                hands[other] = _tracked(memory, hands[other].status, points, names[other], None)
+        free = frame.unlabeled_by_others(lost)
+        for hand in self._initializer.initialize(frame.points[free], tuple(lost)):
+            hands[hand.index] = self._start(hand, free, frame)
+            lost.remove(hand.index)
+            for other in lost:  # it may have kept labels of some of these points
+                frame.labels[other, frame.labels[hand.index] >= 0] = -1
+                state = self._states[other]
+                hands[other] = _tracked(state, hands[other].status, frame.points, frame.labels[other], None)
 
-    def _doubt(
-        self,
-        points: NDArray[np.float64],
-        names: NDArray[np.int64],
-        hands: list[TrackedHand],
-        time: float,
-    ) -> None:
-        """Look again for a hand that leaves most of its markers open, or fits badly, with points around it.
+    def _replace_doubted(self, frame: FrameState, hands: list[TrackedHand]) -> None:
+        """Initialize a hand again that lacks most of its labels, or fits badly, with points around it.
 
-        A hand can be followed in the wrong place on a few points; it must not stay there.
+        A track can hold on to a wrong pose with a few points; it must not stay there. `hands` is overwritten.
         """
-        for number, (hand, memory) in enumerate(zip(hands, self._memories, strict=True)):
-            named = int((names[number] >= 0).sum())
-            fewest = _SHARE * memory.num_markers
-            well = named >= fewest and memory.rms < _ROUGH
-            if hand.status is not Status.TRACKED or well:
-                self._trusted[number] = time
+        track = self.config.track
+        for index, (hand, state) in enumerate(zip(hands, self._states, strict=True)):
+            count = int((frame.labels[index] >= 0).sum())
+            fewest = track.doubt_share * state.num_markers
+            sound = count >= fewest and state.rms < track.doubt_rms
+            if hand.status is not Status.TRACKED or sound:
+                self._last_sound[index] = frame.time
                 continue
-            open_points = np.flatnonzero((np.delete(names, number, axis=0) < 0).all(axis=0))
-            around = np.linalg.norm(points[open_points] - hand.qpos[:3], axis=1) < _AROUND
+            free = frame.unlabeled_by_others(index)
+            around = np.linalg.norm(frame.points[free] - hand.qpos[:3], axis=1) < track.doubt_radius
             if around.sum() < fewest:
-                self._trusted[number] = time
-            if time - self._trusted[number] < _PATIENCE:
+                self._last_sound[index] = frame.time
+            if frame.time - self._last_sound[index] < track.doubt_time:
                 continue
-            self._trusted[number] = time
-            for found in self._finder.find(points[open_points], [number]):
-                if found.score > score_of(named, memory.rms) + _BETTER:
-                    hands[number] = self._take_up(found, open_points, points, names, time)
+            self._last_sound[index] = frame.time
+            least_score = self._initializer.score(count, state.rms) + track.replacement_margin
+            for again in self._initializer.initialize(frame.points[free], [index]):
+                if again.score > least_score:
+                    hands[index] = self._start(again, free, frame)
 
-    def _take_up(
-        self,
-        found: Found,
-        among: NDArray[np.int64],
-        points: NDArray[np.float64],
-        names: NDArray[np.int64],
-        time: float,
-    ) -> TrackedHand:
-        """Go on with a hand as it was found among some of the points; its names (H, N) are overwritten."""
-        memory, mine = self._memories[found.number], names[found.number]
-        mine[:] = -1
-        mine[among] = found.names
-        estimate = memory.begin(found.fit.qpos[0], targets_of(points, mine, memory.num_markers), time)
-        return _tracked(memory, Status.FOUND, points, mine, estimate)
+    def _start(self, hand: InitializedHand, among: NDArray[np.int64], frame: FrameState) -> TrackedHand:
+        """Start a track from a hand that was initialized among some points; its labels are overwritten."""
+        state, labels = self._states[hand.index], frame.labels[hand.index]
+        labels[:] = -1
+        labels[among] = hand.labels
+        targets = targets_of(frame.points, labels, state.num_markers)
+        estimate = state.initialize(hand.fit.qpos[0], targets, frame.time)
+        return _tracked(state, Status.FOUND, frame.points, labels, estimate)
 
 
 def _tracked(
-    memory: HandMemory,
+    state: HandState,
     status: Status,
     points: NDArray[np.float64],
-    names: NDArray[np.int64],
-    fit: Estimate | None,
+    labels: NDArray[np.int64],
+    estimate: Estimate | None,
 ) -> TrackedHand:
-    count = memory.num_markers
-    if memory.qpos is None:
-        nothing = np.full((count, 3), np.nan)
-        return TrackedHand(memory.hand.side, status, np.full(NUM_QPOS, np.nan), np.nan, nothing, np.arange(0))
-    markers, mine = memory.places.copy(), names >= 0
-    markers[names[mine]] = points[mine]
-    there = np.zeros(count, dtype=bool)
-    there[names[mine]] = True
-    filled = np.flatnonzero(~there)
-    rms = np.nan if fit is None else memory.rms_as_designed(fit)
-    return TrackedHand(memory.hand.side, status, memory.qpos.copy(), rms, markers, filled)
+    """The output for a hand: labeled points (N, 3) [m] where there are some, the pose's markers elsewhere."""
+    count, side = state.num_markers, state.hand.side
+    if state.qpos is None:
+        no_markers = np.full((count, 3), np.nan)
+        return TrackedHand(side, status, np.full(NUM_QPOS, np.nan), np.nan, no_markers, np.arange(0))
+    markers, labeled = state.positions.copy(), labels >= 0
+    markers[labels[labeled]] = points[labeled]
+    present = np.zeros(count, dtype=bool)
+    present[labels[labeled]] = True
+    rms = np.nan if estimate is None else state.rms_without_bias(estimate)
+    return TrackedHand(side, status, state.qpos.copy(), rms, markers, np.flatnonzero(~present))

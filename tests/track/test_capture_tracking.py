@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -24,6 +25,7 @@ from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
 from track.bodies.rigid_body import RigidTemplate
 from track.capture_tracking import TakeRecorder, capture_frames, track_capture, track_stream
+from track.config import TrackerConfig
 from track.streams.natnet_server import ReplayServer
 from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import Status
@@ -85,6 +87,7 @@ def test_a_capture_is_tracked_as_its_truth_says(tracked, truth, user, tmp_path):
     save_tracked_take(path, tracked)
     again = load_tracked_take(path)
     np.testing.assert_array_equal(again.markers, tracked.markers)
+    assert again.settings["tracker"] == dataclasses.asdict(TrackerConfig())
     assert again.labels.dtype == tracked.labels.dtype and again.ids.dtype == tracked.ids.dtype
 
 

@@ -98,5 +98,5 @@ def test_stamps_that_lie_together_are_told_apart():
 
 def test_points_and_ids_that_do_not_fit_are_the_callers_mistake():
     for points, ids in [(np.zeros((2, 3)), np.zeros(3)), (np.zeros((2, 2)), np.zeros(2)), (np.zeros(3), [1])]:
-        with pytest.raises(ArgumentError, match="wanted"):
+        with pytest.raises(ArgumentError, match="expected"):
             Intake().take(points, np.asarray(ids, dtype=int), 0.0)

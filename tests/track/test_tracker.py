@@ -42,7 +42,7 @@ def run(tracker: Tracker, take: Take, frames: range) -> list[TrackedFrame]:
     return [tracker.step(*seen(take, frame)[:2], frame / take.rate) for frame in frames]
 
 
-def test_hands_are_found_and_followed(take, labeler):
+def test_hands_are_initialized_and_tracked(take, labeler):
     frames = range(take.num_frames)
     tracked = run(Tracker(users(take), labeler), take, frames)
     assert [hand.status for hand in tracked[0].hands] == [Status.FOUND, Status.FOUND]
@@ -57,7 +57,7 @@ def test_hands_are_found_and_followed(take, labeler):
         assert np.rad2deg(np.abs(poses[:, 7:] - hand.qpos[:, 7:])).mean() <= 1.0
 
 
-def test_hands_are_found_again_after_a_second_without_points(take, labeler):
+def test_hands_are_initialized_again_after_a_second_without_points(take, labeler):
     tracker = Tracker(users(take), labeler)
     run(tracker, take, range(60))
     dark = [tracker.step(np.zeros((0, 3)), np.zeros(0, dtype=int), (60 + n) / 120) for n in range(120)]
@@ -69,14 +69,14 @@ def test_hands_are_found_again_after_a_second_without_points(take, labeler):
     assert np.array_equal(after[-1].labels, seen(take, 182)[2])
 
 
-def test_points_without_ids_are_named_by_where_they_are(take, labeler):
+def test_points_without_ids_are_labeled_by_their_positions(take, labeler):
     nameless = dataclasses.replace(take, ids=np.full_like(take.ids, -1))
     tracked = run(Tracker(users(take), labeler), nameless, range(20))
     right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
     assert np.mean(right) >= 0.9
 
 
-def test_an_id_that_goes_over_to_another_marker_loses_its_name(take, labeler):
+def test_an_id_that_goes_over_to_another_marker_loses_its_label(take, labeler):
     tracker = Tracker(users(take), labeler)
     run(tracker, take, range(10))
     points, ids, labels = seen(take, 10)

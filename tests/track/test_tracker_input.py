@@ -484,9 +484,9 @@ def test_two_trackers_that_are_given_the_same_say_the_same(users, labeler, take)
 
 
 def test_a_caller_whose_points_and_ids_do_not_fit_is_told(tracker):
-    with pytest.raises(ArgumentError, match="wanted"):
+    with pytest.raises(ArgumentError, match="expected"):
         tracker.step(np.zeros((3, 3)), np.zeros(2, dtype=int), 0.0)
-    with pytest.raises(ArgumentError, match="wanted"):
+    with pytest.raises(ArgumentError, match="expected"):
         tracker.step(np.zeros((3, 2)), np.zeros(3, dtype=int), 0.0)
 
 

@@ -1,122 +1,162 @@
-"""Which points each digit may take: those within reach of its markers, compiled."""
+"""Candidate points of each digit: those within a radius of its markers; compiled."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numba
 import numpy as np
 
+from track.config import AssociationConfig
+
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Bool, Float, Int
 
-YOUNG: Final = 4.0
-"""Credit below which a name stands for re-election."""
-MOST_CANDIDATES: Final = 7
-"""Points that are tried on a digit."""
-_REACH_WHOLE, _REACH_MISSING = 0.012, 0.05  # [m] around a marker seen or not: points that may be its
+MAX_CANDIDATES: Final = 7
+"""Candidates of a digit at most; the number of hypotheses and the bits of `joint_assignment` grow with it."""
 
 
-class Crowd(NamedTuple):
-    """All hands' markers in a row, and which points have their names."""
+class MarkerTable(NamedTuple):
+    """The K markers of all hands in a row, and the marker of each of N points."""
 
-    places: Float[np.ndarray, "K 3"]
-    """Where the markers are expected [m]."""
-    parts: Int[np.ndarray, "K"]
+    positions: Float[np.ndarray, "K 3"]
+    """Predicted positions [m]."""
+    digits: Int[np.ndarray, "K"]
     """Digit of each marker, counted through the hands; -1 on a palm."""
-    owners: Int[np.ndarray, "N"]
+    assigned: Int[np.ndarray, "N"]
     """Marker of each point, -1 for none."""
 
 
-class Reach(NamedTuple):
-    """Points that digits may take, and those they have."""
+class DigitCandidates(NamedTuple):
+    """Candidate points of D digits, those with their labels among them."""
 
     candidates: Int[np.ndarray, "D 7"]
-    """Points of each digit: first those named its markers, then others, the nearest first."""
+    """Points of each digit: first those labeled as its markers, then others, the nearest first."""
     counts: Int[np.ndarray, "D"]
-    """How many; none where there is nothing to decide."""
-    own: Int[np.ndarray, "D"]
-    """How many of them are named its markers."""
+    """How many there are; zero where there is nothing to decide."""
+    labeled: Int[np.ndarray, "D"]
+    """How many of them are labeled as the digit's markers."""
 
 
-def find_reach(
-    points: Float[np.ndarray, "N 3"], credit: Float[np.ndarray, "N"], crowd: Crowd, num_digits: int
-) -> Reach:
-    """What each digit may take.
+def find_candidates(
+    points: Float[np.ndarray, "N 3"],
+    evidence: Float[np.ndarray, "N"],
+    table: MarkerTable,
+    num_digits: int,
+    config: AssociationConfig,
+) -> DigitCandidates:
+    """The candidates of each digit.
 
     Args:
         points: The frame's points [m].
-        credit: What the name of each point is worth.
-        crowd: The hands.
-        num_digits: Of all hands.
+        evidence: Evidence for the label of each point (log-odds).
+        table: The markers of all hands.
+        num_digits: Digits of all hands.
+        config: Radii, and the evidence of a settled label.
     """
-    reach = Reach(
-        np.full((num_digits, MOST_CANDIDATES), -1),
+    found = DigitCandidates(
+        np.full((num_digits, MAX_CANDIDATES), -1),
         np.zeros(num_digits, dtype=np.int64),
         np.zeros(num_digits, dtype=np.int64),
     )
-    _find_reach(points, credit, crowd, reach)
-    return reach
+    _find_candidates(
+        points,
+        evidence,
+        table,
+        config.settled_evidence,
+        config.seen_radius,
+        config.missing_radius,
+        found,
+    )
+    return found
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _find_reach(points: Any, credit: Any, crowd: Any, reach: Any) -> None:
-    places, parts, owners = crowd
-    missing = np.ones(len(places), dtype=np.bool_)
-    for owner in owners:
+def _find_candidates(
+    points: Float[np.ndarray, "N 3"],
+    evidence: Float[np.ndarray, "N"],
+    table: MarkerTable,
+    settled: float,
+    seen_radius: float,
+    missing_radius: float,
+    found: DigitCandidates,
+) -> None:
+    """Fill `found`; arguments as of `find_candidates`, `settled` in log-odds, radii in [m]."""
+    positions, digits, assigned = table
+    missing = np.ones(len(positions), dtype=np.bool_)
+    for owner in assigned:
         if owner >= 0:
             missing[owner] = False
-    contested = _find_contested(points, credit, crowd, missing)
-    apart = np.full((len(reach.counts), len(points)), np.inf)
-    for digit in range(len(reach.counts)):
-        lacks, doubtful = False, False
+    contested = _find_contested(points, evidence, table, missing, settled, missing_radius)
+    distances = np.full((len(found.counts), len(points)), np.inf)
+    for digit in range(len(found.counts)):
+        incomplete, undecided = False, False
         rivals = np.zeros(len(points), dtype=np.bool_)
-        for marker in range(len(places)):
-            if parts[marker] != digit:
+        for marker in range(len(positions)):
+            if digits[marker] != digit:
                 continue
-            lacks = lacks or missing[marker]
+            incomplete = incomplete or missing[marker]
             for point in range(len(points)):
-                off = _distance(points[point], places[marker])
-                apart[digit, point] = min(apart[digit, point], off)
-                if owners[point] < 0:
-                    rivals[point] |= off < (_REACH_MISSING if missing[marker] else _REACH_WHOLE)
+                distance = _distance(points[point], positions[marker])
+                distances[digit, point] = min(distances[digit, point], distance)
+                if assigned[point] < 0:
+                    rivals[point] |= distance < (missing_radius if missing[marker] else seen_radius)
                 elif contested[point] and missing[marker]:
-                    rivals[point] |= off < _REACH_MISSING
+                    rivals[point] |= distance < missing_radius
         count = 0
         for point in range(len(points)):
-            if owners[point] >= 0 and parts[owners[point]] == digit:
+            if assigned[point] >= 0 and digits[assigned[point]] == digit:
                 rivals[point] = False
-                doubtful = doubtful or contested[point] or (lacks and credit[point] < YOUNG)
-                reach.candidates[digit, count] = point
+                undecided = undecided or contested[point] or (incomplete and evidence[point] < settled)
+                found.candidates[digit, count] = point
                 count += 1
-        if not (doubtful or rivals.any()):
+        if not (undecided or rivals.any()):
             continue
-        reach.own[digit] = count
-        reach.counts[digit] = _add_nearest(apart[digit], rivals, reach.candidates[digit], count)
+        found.labeled[digit] = count
+        found.counts[digit] = _add_nearest(distances[digit], rivals, found.candidates[digit], count)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _find_contested(points: Any, credit: Any, crowd: Any, missing: Any) -> Any:
-    """Points of a digit whose names are young, with a missing marker of another digit in reach."""
+def _find_contested(
+    points: Float[np.ndarray, "N 3"],
+    evidence: Float[np.ndarray, "N"],
+    table: MarkerTable,
+    missing: Bool[np.ndarray, "K"],
+    settled: float,
+    radius: float,
+) -> Bool[np.ndarray, "N"]:
+    """Points with an unsettled label and a missing marker of another digit within the radius [m]."""
     contested = np.zeros(len(points), dtype=np.bool_)
     for point in range(len(points)):
-        owner = crowd.owners[point]
-        if owner < 0 or crowd.parts[owner] < 0 or credit[point] >= YOUNG:
+        owner = table.assigned[point]
+        if owner < 0 or table.digits[owner] < 0 or evidence[point] >= settled:
             continue
         for marker in range(len(missing)):
-            other = missing[marker] and crowd.parts[marker] not in (-1, crowd.parts[owner])
-            if other and _distance(points[point], crowd.places[marker]) < _REACH_MISSING:
+            other = missing[marker] and table.digits[marker] not in (-1, table.digits[owner])
+            if other and _distance(points[point], table.positions[marker]) < radius:
                 contested[point] = True
     return contested
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _add_nearest(apart: Any, rivals: Any, candidates: Any, count: Any) -> Any:
-    """Add the nearest rivals to a digit's candidates while there is room; how many there are then."""
+def _add_nearest(
+    distances: Float[np.ndarray, "N"],
+    rivals: Bool[np.ndarray, "N"],
+    candidates: Int[np.ndarray, "7"],
+    count: int,
+) -> int:
+    """Append the nearest rivals to a digit's candidates while there is room; return the number of candidates.
+
+    Args:
+        distances: Distance of each point from the digit's nearest marker [m].
+        rivals: Points that may be appended; overwritten.
+        candidates: Candidates so far, overwritten.
+        count: How many there are so far.
+    """
     while count < len(candidates):
         nearest = -1
         for point in range(len(rivals)):
-            if rivals[point] and (nearest < 0 or apart[point] < apart[nearest]):
+            if rivals[point] and (nearest < 0 or distances[point] < distances[nearest]):
                 nearest = point
         if nearest < 0:
             break
@@ -127,5 +167,6 @@ def _add_nearest(apart: Any, rivals: Any, candidates: Any, count: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _distance(one: Any, other: Any) -> Any:
-    return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)
+def _distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
+    """Distance of two points [m]."""
+    return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)  # type: ignore[no-any-return]

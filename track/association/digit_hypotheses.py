@@ -1,52 +1,40 @@
-"""Which points are a digit's markers: every way to name a few points is tried on the digit itself, compiled.
+"""Hypotheses of a digit: every assignment of a few candidate points to its markers is fitted; compiled.
 
-The palm being known, a digit is four hinges, and three markers on it leave five of nine coordinates to check.
-So a handful of points near a digit can be named by trying: each naming is fitted, and what counts is how well
-its points lie on the digit, how far its hinges are from where they were coming to, and for how long an ID has
-carried a name.
+With the palm known, a digit has four hinges, and three markers on it leave five of nine coordinates as a
+test. So the points near a digit can be labeled by trying all assignments. The score of a hypothesis is its
+log-odds against all points being strays: from the distances of the points from the fitted markers, from that
+of the hinges from their prior, from the Laplace approximation of the hinges' uncertainty, and from the
+evidence of IDs and queries.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numba
 import numpy as np
 
 from handsim.hand.topology import DIGITS
-from track.kinematics.joint_prior import HingeBelief, believe_digit
-from track.kinematics.marker_kinematics import (
-    FAST,
-    HandArrays,
-    find_slopes,
-    place_digit,
-    place_marker,
-    place_markers,
-    workspace,
-)
-from track.kinematics.marker_prediction import Expectation
-from track.kinematics.small_systems import eliminate, solve_positive
-from track.kinematics.starting_poses import write_rotation
+from track.association.digit_fit import fit_hypothesis
+from track.kinematics.joint_prior import JointPrior, digit_prior
+from track.kinematics.marker_kinematics import HandArrays, compute_markers, workspace
+from track.kinematics.marker_prediction import MarkerPrediction
+from track.kinematics.starting_poses import write_rotation_matrix
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_STEPS: Final = 10
-_SMALL_GAIN: Final = 0.01  # of a misfit
-_APART: Final = np.deg2rad(5.0)  # between two starts, or one will do
-_LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2
-_FREEDOM: Final = 20.0  # squared deviations of a prior from which on it loses its say
-_SLACK: Final = 0.003  # [m] that two markers may be nearer or farther than on any pose of the hand
-_CLEAR: Final = 7.0  # log odds behind another naming from which on a naming is not looked at
-NEVER: Final = 1e9
-"""Score below zero of what cannot be."""
+IMPOSSIBLE: Final = 1e9
+"""Minus the score of a hypothesis that is excluded."""
 
 
 class DigitRanges(NamedTuple):
-    """How near and how far two markers of one digit can be from each other."""
+    """Range of the distance between two markers of one digit over all poses."""
 
     nearest: Float[np.ndarray, "M M"]
+    """Least distance [m]."""
     farthest: Float[np.ndarray, "M M"]
+    """Largest distance [m]."""
 
 
 def digit_ranges(hand: HandArrays) -> DigitRanges:
@@ -59,338 +47,279 @@ def digit_ranges(hand: HandArrays) -> DigitRanges:
     for angles in grid:
         low, high = hand.ranges[:, 0], hand.ranges[:, 1]
         posed = low + np.tile(angles, len(DIGITS)) * (high - low)
-        place_markers(hand, posed, work)
-        apart = np.linalg.norm(work.markers[:, None] - work.markers[None], axis=-1)
-        nearest, farthest = np.minimum(nearest, apart), np.maximum(farthest, apart)
+        compute_markers(hand, posed, work)
+        distances = np.linalg.norm(work.markers[:, None] - work.markers[None], axis=-1)
+        nearest, farthest = np.minimum(nearest, distances), np.maximum(farthest, distances)
     return DigitRanges(nearest, farthest)
 
 
-class DigitNamings(NamedTuple):
-    """For each digit the best naming of every set of points, a row a set: bit n is its n-th candidate."""
+class DigitHypotheses(NamedTuple):
+    """The best assignment of every set of a digit's points, one row per set: bit n is its n-th candidate."""
 
     scores: Float[np.ndarray, "D S"]
-    """Log odds against all points being strays; far below zero where there is none."""
+    """Log-odds against all points being strays; `-IMPOSSIBLE` where there is no assignment."""
     runners_up: Float[np.ndarray, "D S"]
-    """The same of the next best naming of the same points."""
-    names: Int[np.ndarray, "D S K"]
+    """The same of the next best assignment of the same points."""
+    assignments: Int[np.ndarray, "D S K"]
     """Candidate of each of the digit's markers, -1 for none."""
 
 
-def digit_namings(num_digits: int, num_candidates: int, num_markers: int) -> DigitNamings:
-    """Room for the namings of some digits."""
+def empty_hypotheses(num_digits: int, num_candidates: int, num_markers: int) -> DigitHypotheses:
+    """`DigitHypotheses` to be filled.
+
+    Args:
+        num_digits: Digits.
+        num_candidates: Candidates of each digit at most.
+        num_markers: Markers of each digit at most.
+    """
     sets = num_digits, 1 << num_candidates
-    return DigitNamings(np.full(sets, -NEVER), np.full(sets, -NEVER), np.full((*sets, num_markers), -1))
+    return DigitHypotheses(
+        np.full(sets, -IMPOSSIBLE), np.full(sets, -IMPOSSIBLE), np.full((*sets, num_markers), -1)
+    )
 
 
-class DigitTrust(NamedTuple):
-    """What a digit's points are measured by."""
+class DigitModel(NamedTuple):
+    """The model that the candidates of a digit are tested against."""
 
-    belief: HingeBelief
-    """What was believed of the hand's hinges before its markers were asked."""
-    seen: Expectation
-    """What they said."""
+    joint_prior: JointPrior
+    """Distribution of the hand's hinges before the frame's markers were used."""
+    predicted: MarkerPrediction
+    """The hand as fitted to the labels so far."""
     variance: Float[np.ndarray, "M"]
-    """Of each marker around its place [m^2]."""
-    worth: Float[np.ndarray, "M"]
-    """What naming a point is worth that lies where its marker is expected."""
+    """Variance of each marker around its position [m^2]."""
+    peak_log_odds: Float[np.ndarray, "M"]
+    """Log-odds of a point exactly at the predicted position of each marker."""
     slack: Float[np.ndarray, "M"]
-    """How far each marker may be off its place on the hand of the ranges [m]."""
+    """Distance by which each marker may be off its position on the hand of the ranges [m]."""
     ranges: DigitRanges
+    """Distances between markers of a digit over all poses."""
+    length_tolerance: float
+    """See `AssociationConfig` [m]."""
+    pruning_margin: float
+    """See `AssociationConfig` [log-odds]."""
+    start_distance: float
+    """See `AssociationConfig` [rad]."""
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def search_digit(
-    hand: Any,
-    trusted: Any,
-    digit: Any,
-    markers: Any,
-    points: Any,
-    candidates: Any,
-    odds: Any,
-    scores: Any,
-    runners_up: Any,
-    names: Any,
+def evaluate_digit(
+    hand: HandArrays,
+    model: DigitModel,
+    digit: int,
+    markers: Int[np.ndarray, "K"],
+    points: Float[np.ndarray, "N 3"],
+    candidates: Int[np.ndarray, "C"],
+    log_odds: Float[np.ndarray, "N M"],
+    scores: Float[np.ndarray, "S"],
+    runners_up: Float[np.ndarray, "S"],
+    assignments: Int[np.ndarray, "S K"],
 ) -> None:
-    """Try all namings of points as markers of one digit.
+    """Evaluate all assignments of candidate points to the markers of one digit.
 
     Args:
-        hand: The hand, its markers where their habits have them.
-        trusted: See `DigitTrust`.
-        digit: Which digit.
-        markers: Its markers (K,).
-        points: The frame's points (N, 3) [m].
-        candidates: Those that the digit may take (C,).
-        odds: What each name is worth to each point (N, M) beyond the fit, for the IDs' sake.
-        scores: The digit's row of `DigitNamings`, filled, as are the next two.
+        hand: The hand, its markers shifted by their biases.
+        model: Prior, noise and ranges of the digit.
+        digit: Index of the digit.
+        markers: Its markers.
+        points: The frame's points in the world [m].
+        candidates: Points that may be its markers.
+        log_odds: Log-odds of each label beside the fit, from IDs, presence and queries.
+        scores: The digit's row of `DigitHypotheses`, filled, as are the next two.
         runners_up: See there.
-        names: See there.
+        assignments: See there.
     """
-    posed, wrist = trusted.seen.qpos, np.empty((3, 3))
-    write_rotation(posed[3:7], wrist)
-    near, credit = np.zeros((len(candidates), 3)), np.empty((len(candidates), len(markers)))
+    pose, wrist = model.predicted.qpos, np.empty((3, 3))
+    write_rotation_matrix(pose[3:7], wrist)
+    local, label_log_odds = np.zeros((len(candidates), 3)), np.empty((len(candidates), len(markers)))
     for number, point in enumerate(candidates):
         for i in range(3):
             for j in range(3):
-                near[number, i] += (points[point, j] - posed[j]) * wrist[j, i]
-        for place, marker in enumerate(markers):
-            credit[number, place] = odds[point, marker]
-    coming, trust = np.empty(4), np.empty((4, 4))
-    believe_digit(trusted.belief, trusted.seen.told, trusted.seen.pull, digit, coming, trust)
-    _try_all(hand, trusted, digit, markers, near, credit, posed[7:], coming, trust, scores, runners_up, names)
+                local[number, i] += (points[point, j] - pose[j]) * wrist[j, i]
+        for slot, marker in enumerate(markers):
+            label_log_odds[number, slot] = log_odds[point, marker]
+    mean, precision = np.empty(4), np.empty((4, 4))
+    digit_prior(
+        model.joint_prior,
+        model.predicted.information_matrix,
+        model.predicted.information_vector,
+        digit,
+        mean,
+        precision,
+    )
+    _fit_hypotheses(
+        hand,
+        model,
+        digit,
+        markers,
+        local,
+        label_log_odds,
+        pose[7:],
+        mean,
+        precision,
+        scores,
+        runners_up,
+        assignments,
+    )
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _try_all(
-    hand: Any,
-    trusted: Any,
-    digit: Any,
-    markers: Any,
-    points: Any,
-    credit: Any,
-    posed: Any,
-    coming: Any,
-    trust: Any,
-    scores: Any,
-    runners_up: Any,
-    names: Any,
+def _fit_hypotheses(
+    hand: HandArrays,
+    model: DigitModel,
+    digit: int,
+    markers: Int[np.ndarray, "K"],
+    points: Float[np.ndarray, "C 3"],
+    label_log_odds: Float[np.ndarray, "C K"],
+    angles_before: Float[np.ndarray, "20"],
+    mean: Float[np.ndarray, "4"],
+    precision: Float[np.ndarray, "4 4"],
+    scores: Float[np.ndarray, "S"],
+    runners_up: Float[np.ndarray, "S"],
+    assignments: Int[np.ndarray, "S K"],
 ) -> None:
-    """Fit all namings that may be the best of their points, those with fewer names before those with more."""
+    """Fit all hypotheses that can be the best of their points, those with fewer labels first.
+
+    Args:
+        hand: The hand, its markers shifted by their biases.
+        model: Prior, noise and ranges of the digit.
+        digit: Index of the digit.
+        markers: Its markers.
+        points: The candidates in the wrist's frame [m].
+        label_log_odds: Log-odds of each label beside the fit.
+        angles_before: Hinges of the hand [rad] as fitted to the labels so far.
+        mean: Mean of the digit's prior [rad].
+        precision: Precision of the digit's prior [1/rad^2].
+        scores: See `evaluate_digit`; so for the next two.
+        runners_up: See there.
+        assignments: See there.
+    """
     count, choices = len(markers), len(points) + 1
     work = workspace(len(hand.digits))
-    place_markers(hand, posed, work)
-    naming, angles = np.full(count, -1), np.empty(4)
-    own = posed[4 * digit : 4 * digit + 4]
-    starts = 2 if np.abs(coming - own).max() > _APART else 1
+    compute_markers(hand, angles_before, work)
+    hypothesis, angles = np.full(count, -1), np.empty(4)
+    current = angles_before[4 * digit : 4 * digit + 4]
+    starts = 2 if np.abs(mean - current).max() > model.start_distance else 1
     total = choices**count
-    misfits, poses = np.zeros(total), np.empty((total, 4))
-    below = np.full(len(scores), -NEVER)
-    poses[0] = coming
+    costs, poses = np.zeros(total), np.empty((total, 4))
+    subset_scores = np.full(len(scores), -IMPOSSIBLE)
+    poses[0] = mean
     for number in range(total):
-        chosen = _read_naming(number, choices, naming)
-        smaller = _worst_part(number, choices, naming, misfits)
-        misfits[number], poses[number] = misfits[smaller], poses[smaller]
-        if number > 0 and misfits[smaller] >= NEVER:
+        points_used = _decode(number, choices, hypothesis)
+        subset = _costliest_subset(number, choices, hypothesis, costs)
+        costs[number], poses[number] = costs[subset], poses[subset]
+        if number > 0 and costs[subset] >= IMPOSSIBLE:
             continue
-        most = _most(trusted, markers, points, credit, naming)
-        if most <= -NEVER:
-            misfits[number] = NEVER
+        bound = _upper_bound(model, markers, points, label_log_odds, hypothesis)
+        if bound <= -IMPOSSIBLE:
+            costs[number] = IMPOSSIBLE
             continue
-        beaten = _best_below(chosen, scores, below)
-        hopeless = most - max(runners_up[chosen], max(scores[chosen], beaten) - _CLEAR)
-        if misfits[smaller] >= hopeless:
+        subset_score = _best_subset_score(points_used, scores, subset_scores)
+        cutoff = bound - max(
+            runners_up[points_used], max(scores[points_used], subset_score) - model.pruning_margin
+        )
+        if costs[subset] >= cutoff:
             continue
-        score = -NEVER
+        score = -IMPOSSIBLE
         for start in range(starts):
-            angles[:] = poses[smaller] if start == 0 else own
-            misfit, gap = _fit(
-                hand, digit, markers, points, trusted.variance, naming, coming, trust, hopeless, angles, work
+            angles[:] = poses[subset] if start == 0 else current
+            cost, complexity = fit_hypothesis(
+                hand,
+                digit,
+                markers,
+                points,
+                model.variance,
+                hypothesis,
+                mean,
+                precision,
+                cutoff,
+                angles,
+                work,
             )
-            if most - misfit - gap > score:
-                score = most - misfit - gap
-                misfits[number], poses[number] = misfit, angles
-        if score > scores[chosen]:
-            runners_up[chosen], scores[chosen] = scores[chosen], score
-            names[chosen, :count] = naming
-        elif score > runners_up[chosen]:
-            runners_up[chosen] = score
+            if bound - cost - complexity > score:
+                score = bound - cost - complexity
+                costs[number], poses[number] = cost, angles
+        if score > scores[points_used]:
+            runners_up[points_used], scores[points_used] = scores[points_used], score
+            assignments[points_used, :count] = hypothesis
+        elif score > runners_up[points_used]:
+            runners_up[points_used] = score
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _read_naming(number: Any, choices: Any, naming: Any) -> Any:
-    """The naming with a number, and the set of points that it uses."""
-    chosen = 0
-    for place in range(len(naming)):
-        naming[place] = number % choices - 1
+def _decode(number: int, choices: int, hypothesis: Int[np.ndarray, "K"]) -> int:
+    """Write the hypothesis with a number to `hypothesis`, and return the set of points that it uses as bits.
+
+    The digits of the number to the base `choices` are each marker's candidate plus one, zero for none.
+    """
+    points_used = 0
+    for slot in range(len(hypothesis)):
+        hypothesis[slot] = number % choices - 1
         number //= choices
-        if naming[place] >= 0:
-            chosen |= 1 << naming[place]
-    return chosen
+        if hypothesis[slot] >= 0:
+            points_used |= 1 << hypothesis[slot]
+    return points_used
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _worst_part(number: Any, choices: Any, naming: Any, misfits: Any) -> Any:
-    """Of the namings with one name less that which misses most: with one more it cannot miss less."""
-    worst, radix = 0, 1
-    for place in range(len(naming)):
-        part = number - (naming[place] + 1) * radix
+def _costliest_subset(
+    number: int, choices: int, hypothesis: Int[np.ndarray, "K"], costs: Float[np.ndarray, "H"]
+) -> int:
+    """Number of the costliest hypothesis with one label less; its cost is a lower bound of this one's."""
+    costliest, radix = 0, 1
+    for slot in range(len(hypothesis)):
+        part = number - (hypothesis[slot] + 1) * radix
         radix *= choices
-        if naming[place] >= 0 and misfits[part] >= misfits[worst]:
-            worst = part
-    return worst
+        if hypothesis[slot] >= 0 and costs[part] >= costs[costliest]:
+            costliest = part
+    return costliest
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _best_below(chosen: Any, scores: Any, below: Any) -> Any:
-    """Best score so far of any part of a set of points."""
+def _best_subset_score(
+    points_used: int, scores: Float[np.ndarray, "S"], subset_scores: Float[np.ndarray, "S"]
+) -> float:
+    """Best score so far of any proper subset of a set of points; `subset_scores` keeps it for larger sets."""
     bit = 1
-    while bit <= chosen:
-        if chosen & bit:
-            part = chosen ^ bit
-            below[chosen] = max(below[chosen], scores[part], below[part])
+    while bit <= points_used:
+        if points_used & bit:
+            part = points_used ^ bit
+            subset_scores[points_used] = max(subset_scores[points_used], scores[part], subset_scores[part])
         bit <<= 1
-    return below[chosen]
+    return subset_scores[points_used]  # type: ignore[no-any-return]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _most(trusted: Any, markers: Any, points: Any, credit: Any, naming: Any) -> Any:
-    """What a naming is worth if every point lies where it should; far below zero if they cannot."""
-    ranges, slack, total = trusted.ranges, trusted.slack, 0.0
-    for place in range(len(markers)):
-        point = naming[place]
+def _upper_bound(
+    model: DigitModel,
+    markers: Int[np.ndarray, "K"],
+    points: Float[np.ndarray, "C 3"],
+    label_log_odds: Float[np.ndarray, "C K"],
+    hypothesis: Int[np.ndarray, "K"],
+) -> float:
+    """Score of a hypothesis if every point is exactly at its marker.
+
+    It is `-IMPOSSIBLE` if the distances exclude the hypothesis. The arguments are those of `_fit_hypotheses`.
+    """
+    ranges, slack, total = model.ranges, model.slack, 0.0
+    for slot in range(len(markers)):
+        point = hypothesis[slot]
         if point < 0:
             continue
-        total += trusted.worth[markers[place]] + credit[point, place]
-        for other in range(place):
-            if naming[other] < 0:
+        total += model.peak_log_odds[markers[slot]] + label_log_odds[point, slot]
+        for other in range(slot):
+            if hypothesis[other] < 0:
                 continue
-            if naming[other] == point:
-                return -NEVER
-            apart = 0.0
+            if hypothesis[other] == point:
+                return -IMPOSSIBLE
+            distance = 0.0
             for i in range(3):
-                apart += (points[point, i] - points[naming[other], i]) ** 2
-            apart = np.sqrt(apart)
-            one, two = markers[place], markers[other]
-            loose = _SLACK + slack[one] + slack[two]
-            if apart < ranges.nearest[one, two] - loose or apart > ranges.farthest[one, two] + loose:
-                return -NEVER
-    return total
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _fit(
-    hand: Any,
-    digit: Any,
-    markers: Any,
-    points: Any,
-    variance: Any,
-    naming: Any,
-    coming: Any,
-    trust: Any,
-    hopeless: Any,
-    angles: Any,
-    work: Any,
-) -> Any:
-    """Bring four hinges to a minimum; returns the misfit of named points and hinges, and what it leaves open.
-
-    That is half the logarithm of how much surer the hinges are than before (Laplace): a naming that any pose
-    would fit says little. A misfit that is `hopeless` and would stay so is left where it is.
-    """
-    trial, factor, step = angles.copy(), np.empty((4, 4)), np.empty(4)
-    normal, gradient = np.empty((4, 4)), np.empty(4)
-    new_normal, new_gradient = np.empty((4, 4)), np.empty(4)
-    cost = _gather(
-        hand, digit, markers, points, variance, naming, coming, trust, angles, work, normal, gradient
-    )
-    damping = 1e-3
-    for _ in range(_STEPS):
-        for row in range(4):
-            step[row] = -gradient[row]
-            for column in range(4):
-                factor[row, column] = normal[row, column]
-            factor[row, row] *= 1.0 + damping
-        solve_positive(factor, step)
-        gain = 0.0
-        for row in range(4):
-            gain -= gradient[row] * step[row]
-            trial[row] = angles[row] + step[row]
-        if gain < _SMALL_GAIN:
-            break
-        if cost - 2.0 * gain > hopeless:
-            cost -= 2.0 * gain
-            break
-        tried = _gather(
-            hand,
-            digit,
-            markers,
-            points,
-            variance,
-            naming,
-            coming,
-            trust,
-            trial,
-            work,
-            new_normal,
-            new_gradient,
-        )
-        if tried < cost:
-            small = cost - tried < _SMALL_GAIN
-            cost = tried
-            angles[:] = trial
-            normal[:] = new_normal
-            gradient[:] = new_gradient
-            damping = max(damping * 0.1, 1e-9)
-            if small:
-                break
-        else:
-            damping *= 30.0
-            if damping > 1e5:
-                break
-    return cost, 0.5 * (_log_determinant(normal) - _log_determinant(trust))
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _gather(
-    hand: Any,
-    digit: Any,
-    markers: Any,
-    points: Any,
-    variance: Any,
-    naming: Any,
-    coming: Any,
-    trust: Any,
-    angles: Any,
-    work: Any,
-    normal: Any,
-    gradient: Any,
-) -> Any:
-    """Cost at some angles, with its normal matrix and half its gradient."""
-    normal[:] = 0.0
-    gradient[:] = 0.0
-    cost, first = 0.0, 4 * digit
-    place_digit(hand, digit, angles, work)
-    for place in range(len(markers)):
-        if naming[place] < 0:
-            continue
-        marker, point = markers[place], points[naming[place]]
-        place_marker(hand, marker, work)
-        find_slopes(hand, marker, work)
-        weight, slopes, placed = 1.0 / variance[marker], work.slopes[marker], work.markers[marker]
-        x, y, z = placed[0] - point[0], placed[1] - point[1], placed[2] - point[2]
-        cost += 0.5 * weight * (x * x + y * y + z * z)
-        for row in range(4):
-            a, b, c = slopes[0, first + row], slopes[1, first + row], slopes[2, first + row]
-            a, b, c = weight * a, weight * b, weight * c
-            gradient[row] += a * x + b * y + c * z
-            for column in range(row + 1):
-                other = first + column
-                normal[row, column] += a * slopes[0, other] + b * slopes[1, other] + c * slopes[2, other]
-    for row in range(4):
-        for column in range(row):
-            normal[column, row] = normal[row, column]
-    away = 0.0
-    for row in range(4):
-        for column in range(4):
-            away += (angles[row] - coming[row]) * trust[row, column] * (angles[column] - coming[column])
-    say = 1.0 / (1.0 + away / _FREEDOM)
-    cost += 0.5 * _FREEDOM * np.log(1.0 + away / _FREEDOM)
-    for row in range(4):
-        for column in range(4):
-            gradient[row] += say * trust[row, column] * (angles[column] - coming[column])
-            normal[row, column] += say * trust[row, column]
-        low, high = hand.ranges[first + row, 0], hand.ranges[first + row, 1]
-        beyond = max(angles[row] - high, 0.0) + min(angles[row] - low, 0.0)
-        if beyond != 0.0:
-            cost += 0.5 * _LIMIT_WEIGHT * beyond * beyond
-            gradient[row] += _LIMIT_WEIGHT * beyond
-            normal[row, row] += _LIMIT_WEIGHT
-    return cost
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _log_determinant(matrix: Any) -> Any:
-    """Of a small positive matrix, by elimination."""
-    factor, total = matrix.copy(), 0.0
-    eliminate(factor, np.zeros(4), 0, 4)
-    for row in range(4):
-        total += np.log(factor[row, row])
+                distance += (points[point, i] - points[hypothesis[other], i]) ** 2
+            distance = np.sqrt(distance)
+            one, two = markers[slot], markers[other]
+            tolerance = model.length_tolerance + slack[one] + slack[two]
+            if (
+                distance < ranges.nearest[one, two] - tolerance
+                or distance > ranges.farthest[one, two] + tolerance
+            ):
+                return -IMPOSSIBLE
     return total

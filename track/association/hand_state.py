@@ -1,13 +1,13 @@
-"""What a tracker remembers of a hand: its pose and motion, and by how much each marker tends to miss it.
+"""The filter state of one hand: pose, velocity, covariances, and the learned bias of each marker.
 
-A hand that is not quite the user's misses its markers by the same few millimeters in every frame, seen from
-the bones that carry them. Once that habit is known, a marker is expected where the pose and its habit put it,
-which is nearly as sharp for an uncalibrated hand as for a calibrated one.
+A hand model that is not quite the user's hand is off by the same few millimeters at each marker in every
+frame, in the frame of the bone that carries the marker. Once this bias is known, a marker is predicted from
+the pose and its bias, which is nearly as accurate for an uncalibrated hand as for a calibrated one.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -15,267 +15,353 @@ import numpy as np
 from gloves.fit import GloveFit
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels.integration import move, velocity_of
-from track.association.digit_hypotheses import DigitTrust, digit_ranges
-from track.association.point_matching import worth_of
-from track.kinematics.joint_prior import HingeBelief, foresee, rest, resting_covariance
-from track.kinematics.marker_prediction import Expectation
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
+from track.association.digit_hypotheses import DigitModel, digit_ranges
+from track.association.point_matching import peak_log_odds
+from track.config import TrackerConfig
+from track.kinematics.frame_fits import FEWEST_MARKERS
+from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
+from track.kinematics.marker_prediction import MarkerPrediction
+from track.kinematics.pose_solver import PoseSolver
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
     from numpy.typing import NDArray
 
-_FIRST_SHARE, _FIRST_SPREAD = 1.2, (0.0015, 0.006)
-"""Spread of a marker around where a hand just found has it: share of the fit's RMS; least and most [m]."""
-_AS_EVER: Final = 0.002  # [m] RMS of a hand that is found again with its habits
-_LEAST_SPREAD: Final = 0.0005  # [m] so much a marker trembles that is seen by few cameras
-_UNEVEN: Final = 0.3  # of the hand's usual miss: so much it changes as the hand moves
-_DOUBT: Final = 0.5  # [s] unseen after which a marker may miss its place by the hand's usual miss again
-_MEMORY: Final = 120.0  # frames that a habit is averaged over
-_KNOWN: Final = 30.0  # frames after which a hand's habits are known
-_NOISE: Final = 0.001  # [m] of markers around a fitted pose
-_WRIST: Final = ((0.001, 10.0), (np.deg2rad(1.5), 100.0))
-"""Of its place and its orientation: spread at once [m, rad], unforeseen acceleration [m/s^2, rad/s^2]."""
-_FADING: Final = 0.7  # of the speed of a digit that lacks markers, from frame to frame
-_SMOOTHING: Final = 0.6  # share of the newest speed
-_RETURN: Final = 0.01  # [s] over the time for which a marker was hidden: its chance to be back in a frame
-_RETURNS: Final = (0.01, 0.65)  # least and most of that chance
-_ELSEWHERE: Final = -7.0  # log chance of a marker that was seen while the point was there already
-_STRAY_LIFE: Final = 0.1  # [s] that a stray point lives, on average
-_MOST_AGE: Final = 3.0  # log odds that a point's age may come to
-_LONGEST_GLIDE: Final = 0.05  # [s] that a motion is carried on for
 
-
-class Coming(NamedTuple):
-    """A hand before its markers are asked."""
+class Prediction(NamedTuple):
+    """A hand's pose before the markers of a frame are used."""
 
     qpos: Float[np.ndarray, "27"]
-    hinges: HingeBelief
+    """The predicted pose."""
+    joint_prior: JointPrior
+    """Distribution of the hinges."""
     wrist_spread: tuple[float, float]
-    """Standard deviations of the wrist's place [m] and orientation [rad]."""
+    """Standard deviations of the wrist's position [m] and orientation [rad]."""
 
 
 class Estimate(NamedTuple):
-    """A pose that was fitted to a frame's markers."""
+    """A hand's pose that was fitted to the markers of a frame."""
 
     qpos: Float[np.ndarray, "27"]
+    """The fitted pose."""
     rms: float
-    """3D RMS distance over the markers that are there [m]."""
+    """3D RMS distance over the markers that are present [m]."""
     residuals: Float[np.ndarray, "M 3"]
     """Model minus marker [m], NaN where a marker is missing."""
-    expected: Expectation
+    predicted: MarkerPrediction
+    """Markers and hinges at that pose, with covariances."""
 
     @property
-    def places(self) -> Float[np.ndarray, "M 3"]:
-        """Where the pose has the markers [m]."""
-        return self.expected.places
+    def positions(self) -> Float[np.ndarray, "M 3"]:
+        """Positions of the pose's markers in the world [m]."""
+        return self.predicted.positions
 
     @property
     def covariances(self) -> Float[np.ndarray, "M 3 3"]:
-        """How far the markers may be from there [m^2]."""
-        return self.expected.covariances
+        """Covariance of each marker in the world [m^2]."""
+        return self.predicted.covariances
 
 
-class HandMemory:
-    """One hand of the user as a tracker remembers it.
+class HandState:
+    """Filter state of one of the user's hands.
 
     Args:
         hand: The hand and its glove.
+        config: Process and measurement models, solver weights, presence model.
     """
 
-    def __init__(self, hand: GloveFit) -> None:
+    def __init__(self, hand: GloveFit, config: TrackerConfig = TrackerConfig()) -> None:  # noqa: B008
         self.hand = hand
-        self.solver = PoseSolver(hand)
+        self.config = config
+        self.solver = PoseSolver(hand, config=config.solver)
         self.qpos: NDArray[np.float64] | None = None
+        """The pose of the last frame with one; None where the hand is lost."""
         self.time = 0.0
+        """Time of that pose [s]."""
         self.rms = np.nan
-        """Of the last pose, its habits being known [m]."""
-        self._now = 0.0
+        """RMS distance of its markers, biases removed [m]."""
         count = self.num_markers = hand.attachment.layout.num_markers
-        bones = hand.attachment.main_bones
-        self.digits = np.array([BONES[bone].digit for bone in bones])
-        self._speed = np.zeros(6 + NUM_JOINTS)
-        self._habit = np.zeros((count, 3))
-        self._variance = np.full(count, _FIRST_SPREAD[1] ** 2)
-        self._usual_miss = 0.0
-        self.variance = self._variance.copy()
-        """Of each marker around its place [m^2], as `predict` last had it."""
-        self._learned = np.zeros(count)
-        self._seen = np.zeros(count)
+        self.digits = np.array([BONES[bone].digit for bone in hand.attachment.main_bones])
+        """Digit of each marker (M,), -1 for the palm."""
         self.adapted = self.solver.hand
-        self._designed = self.adapted.places[:, 0].copy()
+        """The hand as arrays, its markers shifted by their biases."""
+        self.variance = np.full(count, config.noise.first_spread_most**2)
+        """Variance (M,) of each marker around its position on the hand [m^2], at the last prediction."""
+        self.positions = np.full((count, 3), np.nan)
+        """Positions (M, 3) of the pose's markers [m]."""
+        self.confirmed = np.zeros(len(DIGITS), dtype=bool)
+        """Digits that have had a settled label since the hand was initialized."""
+        self._velocity = np.zeros(6 + NUM_JOINTS)  # [m/s, rad/s] in MuJoCo's order
+        self._joint_covariance = resting_covariance(config.motion)  # [rad^2] of the last estimate
+        self._resting_prior = resting_prior(config.motion)
+        self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
+        self._bias_frames = np.zeros(count)  # that each bias is averaged over
+        self._variance = self.variance.copy()  # [m^2] while the biases are certain
+        self._typical_bias = 0.0  # [m] RMS over the markers
+        self._last_seen = np.zeros(count)  # [s] of each marker
+        self._designed = self.adapted.positions[:, 0].copy()  # [m] without biases
         self._ranges = digit_ranges(self.adapted)
-        self._hinges = resting_covariance()
-        self._rest = rest()
-        self.proven = np.zeros(len(DIGITS), dtype=bool)
-        """Digits that have had a firm name since the hand was found."""
-        self.places = np.full((count, 3), np.nan)
+        self._now = 0.0  # [s] of the last prediction
 
-    def predict(self, time: float) -> Coming:
-        """What is coming if the hand moves on as it did.
-
-        Only for a hand that has a pose.
-        """
+    def predict(self, time: float) -> Prediction:
+        """The pose at a time [s] if the hand goes on with its velocity; for a hand that has a pose."""
         assert self.qpos is not None
+        motion = self.config.motion
         self._now = time
         span = time - self.time
-        doubt = self._usual_miss * np.minimum((time - self._seen) / _DOUBT, 1.0)
+        doubt = self._typical_bias * np.minimum(
+            (time - self._last_seen) / self.config.noise.bias_doubt_time, 1.0
+        )
         self.variance = self._variance + doubt**2
-        moved: NDArray[np.float64] = move(self.qpos[None], min(span, _LONGEST_GLIDE) * self._speed[None])[0]
-        shift, turn = (at_once + 0.5 * gain * span**2 for at_once, gain in _WRIST)
-        return Coming(moved, foresee(moved[7:], self._hinges, span), (shift, turn))
+        moved: NDArray[np.float64] = move(
+            self.qpos[None], min(span, motion.longest_extrapolation) * self._velocity[None]
+        )[0]
+        wrist_spread = (
+            motion.wrist_spread + 0.5 * motion.wrist_acceleration * span**2,
+            motion.wrist_rotation_spread + 0.5 * motion.wrist_angular_acceleration * span**2,
+        )
+        joint_prior = predict_joints(moved[7:], self._joint_covariance, span, motion)
+        return Prediction(moved, joint_prior, wrist_spread)
 
     def fit(
-        self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], coming: Coming
+        self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
     ) -> Estimate:
-        """The pose of labeled markers [m]; what they leave open is as it was coming.
+        """Fit the pose to labeled markers; what they leave open follows the prediction.
 
-        With fewer than four of them it is the coming pose, and has no RMS.
+        Args:
+            targets: Labeled markers [m]; NaN where missing. With fewer than four of them the pose is the
+                predicted one and has no RMS.
+            start: A pose near the solution.
+            prediction: The predicted pose.
         """
-        qpos, rms, residuals = coming.qpos, np.nan, np.full_like(targets, np.nan)
+        qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
         if np.isfinite(targets[:, 0]).sum() >= FEWEST_MARKERS:
-            fit = self.solver.follow(
+            fit = self.solver.solve_frame(
                 targets,
                 start,
-                coming.hinges.angles,
-                coming.hinges.spread,
-                coming.qpos[:7],
-                coming.wrist_spread,
+                prediction.joint_prior.angles,
+                prediction.joint_prior.spread,
+                prediction.qpos[:7],
+                prediction.wrist_spread,
             )
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
-        expected = self.solver.expect(
+        predicted = self.solver.predict_markers(
             qpos,
             targets,
-            coming.hinges,
-            wrist_spread=coming.wrist_spread,
+            prediction.joint_prior,
+            wrist_spread=prediction.wrist_spread,
             variance=self.variance,
-            noise=_NOISE,
+            noise=self.config.noise.marker_noise,
         )
-        return Estimate(expected.qpos, rms, residuals, expected)
+        return Estimate(predicted.qpos, rms, residuals, predicted)
 
-    def trust(self, coming: Coming, estimate: Estimate) -> tuple[DigitTrust, DigitTrust]:
-        """What new points of a digit are measured by, and those of one that has not yet had a firm name.
+    def digit_models(self, prediction: Prediction, estimate: Estimate) -> tuple[DigitModel, DigitModel]:
+        """Models for new points of a digit: of one with settled labels, and of one without.
 
-        What a doubtful name made of such a digit must not speak for that name.
+        The second has the resting prior: the pose that a wrong label gave to a digit must not confirm that
+        label.
         """
-        slack = 2.5 * np.sqrt(self.variance) + np.sqrt((self._habit**2).sum(axis=1))
-        worth = worth_of(self.variance)
-        firm = DigitTrust(coming.hinges, estimate.expected, self.variance, worth, slack, self._ranges)
-        return firm, firm._replace(belief=self._rest)
+        association = self.config.association
+        slack = association.bias_slack * np.sqrt(self.variance) + np.sqrt((self._bias**2).sum(axis=1))
+        confirmed = DigitModel(
+            prediction.joint_prior,
+            estimate.predicted,
+            self.variance,
+            peak_log_odds(self.variance, association.stray_density),
+            slack,
+            self._ranges,
+            association.length_tolerance,
+            association.pruning_margin,
+            association.start_distance,
+        )
+        return confirmed, confirmed._replace(joint_prior=self._resting_prior)
 
     @property
     def spread(self) -> float | None:
-        """Of the markers around their places, in each direction [m]; None while little is known of it."""
-        if np.median(self._learned) < _KNOWN:
+        """Standard deviation of the markers in each direction [m]; None while unknown."""
+        if np.median(self._bias_frames) < self.config.noise.learning_frames:
             return None
-        return max(float(np.sqrt(np.median(self._variance))), _NOISE)
+        return max(float(np.sqrt(np.median(self._variance))), self.config.noise.marker_noise)
 
-    def chances(self, born: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
-        """Log chance of each marker to come back when it did, were it the point that was born then [s].
+    def presence_log_odds(self, first_seen: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
+        """Log-odds of a marker coming back when a point appeared, against a stray as old as the point.
 
-        It counts against that of a stray, which would hardly have lived for so long.
+        Args:
+            first_seen: Time at which each point appeared [s].
         """
-        gap = born[:, None] - self._seen
-        chance: NDArray[np.float64] = np.log(np.clip(_RETURN / np.maximum(gap, 1e-3), *_RETURNS))
-        chance[gap < 0.0] = _ELSEWHERE
-        age = np.maximum(self._now - born, 0.0)[:, None]
-        return chance + np.minimum(age / _STRAY_LIFE, _MOST_AGE)
+        presence = self.config.presence
+        gap = first_seen[:, None] - self._last_seen
+        log_odds: NDArray[np.float64] = np.log(
+            np.clip(presence.return_time / np.maximum(gap, 1e-3), presence.return_least, presence.return_most)
+        )
+        log_odds[gap < 0.0] = presence.seen_elsewhere
+        age = np.maximum(self._now - first_seen, 0.0)[:, None]
+        return log_odds + np.minimum(age / presence.stray_lifetime, presence.most_age_log_odds)
 
-    def begin(
+    def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
     ) -> Estimate:
-        """Take up a hand that has just been found; if its habits still hold, they are kept."""
-        self._speed[:] = 0.0
-        self._seen[:] = time
-        self.proven[:] = False
-        nothing = Coming(qpos, self._rest, (1.0, 1.0))
-        estimate = self.fit(targets, qpos, nothing)
-        if not (self._learned.any() and estimate.rms < _AS_EVER):
-            self._habit[:], self._learned[:], self._variance[:] = 0.0, 0.0, 0.0
-            self._adapt()
-            estimate = self.fit(targets, qpos, nothing)
-            self._variance[:] = np.clip(_FIRST_SHARE * estimate.rms, *_FIRST_SPREAD) ** 2
-        self._take(estimate, time)
+        """Start from a pose without history; the biases are kept if they still fit.
+
+        Args:
+            qpos: A pose near the solution.
+            targets: Labeled markers [m]; NaN where missing.
+            time: Time of the frame [s].
+        """
+        noise = self.config.noise
+        self._velocity[:] = 0.0
+        self._last_seen[:] = time
+        self.confirmed[:] = False
+        unknown = Prediction(qpos, self._resting_prior, (1.0, 1.0))
+        estimate = self.fit(targets, qpos, unknown)
+        if not (self._bias_frames.any() and estimate.rms < noise.bias_reuse_rms):
+            self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0
+            self._shift_markers()
+            estimate = self.fit(targets, qpos, unknown)
+            spread = noise.first_spread_factor * estimate.rms
+            self._variance[:] = np.clip(spread, noise.first_spread_least, noise.first_spread_most) ** 2
+        self._store(estimate, time)
         return estimate
 
-    def rms_as_designed(self, estimate: Estimate) -> float:
-        """RMS distance of the markers from where the hand as it was given would have them [m]."""
-        expected = estimate.expected
-        return float(_rms_without_habits(estimate.residuals, expected.turns, self._habit))
+    def rms_without_bias(self, estimate: Estimate) -> float:
+        """RMS distance of the markers from their positions on the hand as it was given [m]."""
+        return float(_rms_without_bias(estimate.residuals, estimate.predicted.rotations, self._bias))
 
-    def carry_on(self, estimate: Estimate, firm: Bool[np.ndarray, "M"], time: float) -> None:
-        """Take over the pose of the next frame, and what it says of the habits of firmly named markers."""
+    def update(self, estimate: Estimate, settled: Bool[np.ndarray, "M"], time: float) -> None:
+        """Take over the pose of the next frame, and learn the biases of markers with settled labels.
+
+        Args:
+            estimate: The fitted pose.
+            settled: Which markers have a settled label.
+            time: Time of the frame [s].
+        """
         assert self.qpos is not None
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
-            self._speed += _SMOOTHING * (velocity_of(self.qpos, qpos, span) - self._speed)
-        self._take(estimate, time)
-        self.proven[self.digits[firm & (self.digits >= 0)]] = True
-        self._learn(estimate, firm)
+            change = velocity_of(self.qpos, qpos, span) - self._velocity
+            self._velocity += self.config.motion.velocity_smoothing * change
+        self._store(estimate, time)
+        self.confirmed[self.digits[settled & (self.digits >= 0)]] = True
+        _learn_bias(
+            estimate.residuals,
+            estimate.predicted.rotations,
+            settled,
+            self.config.noise.averaging_frames,
+            self._bias_frames,
+            self._bias,
+            self._variance,
+        )
+        self._shift_markers()
 
-    def _take(self, estimate: Estimate, time: float) -> None:
-        self.qpos, self.time, self.places = estimate.qpos, time, estimate.places
+    def _store(self, estimate: Estimate, time: float) -> None:
+        """Keep an estimate as the state at a time [s]."""
+        self.qpos, self.time, self.positions = estimate.qpos, time, estimate.positions
         self.rms = estimate.rms
-        self._hinges = estimate.expected.hinges
-        there = np.isfinite(estimate.residuals[:, 0])
-        missing = np.bincount(self.digits[~there & (self.digits >= 0)], minlength=len(DIGITS))
-        self._speed[6:].reshape(len(DIGITS), -1)[missing > 0] *= _FADING
-        self._seen[there] = time
+        self._joint_covariance = estimate.predicted.joint_covariance
+        present = np.isfinite(estimate.residuals[:, 0])
+        missing = np.bincount(self.digits[~present & (self.digits >= 0)], minlength=len(DIGITS))
+        hidden = self._velocity[6:].reshape(len(DIGITS), -1)
+        hidden[missing > 0] *= self.config.motion.hidden_digit_damping
+        self._last_seen[present] = time
 
-    def _learn(self, estimate: Estimate, firm: Bool[np.ndarray, "M"]) -> None:
-        expected = estimate.expected
-        _learn_habits(estimate.residuals, expected.turns, firm, self._learned, self._habit, self._variance)
-        self._adapt()
-
-    def _adapt(self) -> None:
-        self._usual_miss = _adapt_places(
-            self._learned, self._habit, self._variance, self._designed, self.adapted.places
+    def _shift_markers(self) -> None:
+        """Shift the markers of `adapted` by their biases."""
+        noise = self.config.noise
+        self._typical_bias = _shift_markers(
+            self._bias_frames,
+            self._bias,
+            self._designed,
+            noise.least_spread,
+            noise.bias_variation,
+            self._variance,
+            self.adapted.positions,
         )
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _learn_habits(residuals: Any, turns: Any, firm: Any, learned: Any, habit: Any, variance: Any) -> None:
-    """Average what firmly named markers are off by, as their bones see it, and how much that varies."""
-    off = np.empty(3)
+def _learn_bias(
+    residuals: Float[np.ndarray, "M 3"],
+    rotations: Float[np.ndarray, "M 3 3"],
+    settled: Bool[np.ndarray, "M"],
+    averaging_frames: float,
+    bias_frames: Float[np.ndarray, "M"],
+    bias: Float[np.ndarray, "M 3"],
+    variance: Float[np.ndarray, "M"],
+) -> None:
+    """Average the residuals of markers with settled labels in the frames of their bones, and their variance.
+
+    Args:
+        residuals: Model minus marker in the world [m], NaN where a marker is missing.
+        rotations: Rotation of each marker's bone in the world.
+        settled: Which markers have a settled label.
+        averaging_frames: Frames that the averages go over.
+        bias_frames: Frames that each average has seen, at most `averaging_frames`; overwritten.
+        bias: Mean residual of each marker in the frame of its bone [m], overwritten.
+        variance: Variance of each marker in one direction [m^2], overwritten.
+    """
+    residual = np.empty(3)
     for marker in range(len(residuals)):
-        if not firm[marker] or np.isnan(residuals[marker, 0]):
+        if not settled[marker] or np.isnan(residuals[marker, 0]):
             continue
-        learned[marker] = min(learned[marker] + 1.0, _MEMORY)
+        bias_frames[marker] = min(bias_frames[marker] + 1.0, averaging_frames)
         square = 0.0
         for i in range(3):
-            off[i] = 0.0
+            residual[i] = 0.0
             for j in range(3):
-                off[i] += turns[marker, j, i] * residuals[marker, j]
-            habit[marker, i] += off[i] / learned[marker]
-            square += off[i] ** 2
-        variance[marker] += (square - variance[marker]) / learned[marker]
+                residual[i] += rotations[marker, j, i] * residuals[marker, j]
+            bias[marker, i] += residual[i] / bias_frames[marker]
+            square += residual[i] ** 2
+        variance[marker] += (square - variance[marker]) / bias_frames[marker]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _adapt_places(learned: Any, habit: Any, variance: Any, designed: Any, places: Any) -> Any:
-    """Move the hand's markers to where their habits have them; returns how far they are off usually."""
+def _shift_markers(
+    bias_frames: Float[np.ndarray, "M"],
+    bias: Float[np.ndarray, "M 3"],
+    designed: Float[np.ndarray, "M 3"],
+    least_spread: float,
+    variation: float,
+    variance: Float[np.ndarray, "M"],
+    positions: Float[np.ndarray, "M 4 3"],
+) -> float:
+    """Shift the hand's markers by their biases; return the typical bias (RMS over the known ones) [m].
+
+    Args:
+        bias_frames: Frames that each bias was averaged over; zero where it is unknown.
+        bias: Bias of each marker in the frame of its bone [m].
+        designed: Position of each marker in that frame as the glove has it [m].
+        least_spread: See `NoiseConfig` [m].
+        variation: See `NoiseConfig.bias_variation`.
+        variance: Variance of each marker [m^2], overwritten where it is below the least.
+        positions: `HandArrays.positions`; the first of each marker is overwritten.
+    """
     square, count = 0.0, 0
-    for marker in range(len(learned)):
+    for marker in range(len(bias_frames)):
         for i in range(3):
-            places[marker, 0, i] = designed[marker, i] - habit[marker, i]
-            square += habit[marker, i] ** 2 if learned[marker] > 0.0 else 0.0
-        count += learned[marker] > 0.0
+            positions[marker, 0, i] = designed[marker, i] - bias[marker, i]
+            square += bias[marker, i] ** 2 if bias_frames[marker] > 0.0 else 0.0
+        count += bias_frames[marker] > 0.0
     square /= max(count, 1)
-    for marker in range(len(learned)):
-        variance[marker] = max(variance[marker], _LEAST_SPREAD**2 + _UNEVEN**2 * square)
-    return np.sqrt(square)
+    for marker in range(len(bias_frames)):
+        variance[marker] = max(variance[marker], least_spread**2 + variation**2 * square)
+    return np.sqrt(square)  # type: ignore[no-any-return]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _rms_without_habits(residuals: Any, turns: Any, habit: Any) -> Any:
+def _rms_without_bias(
+    residuals: Float[np.ndarray, "M 3"],
+    rotations: Float[np.ndarray, "M 3 3"],
+    bias: Float[np.ndarray, "M 3"],
+) -> float:
+    """RMS of the residuals with the biases added back [m]; the arguments are those of `_learn_bias`."""
     square, count = 0.0, 0
     for marker in range(len(residuals)):
         if np.isnan(residuals[marker, 0]):
             continue
         count += 1
         for i in range(3):
-            off = residuals[marker, i]
+            residual = residuals[marker, i]
             for j in range(3):
-                off += turns[marker, i, j] * habit[marker, j]
-            square += off * off
-    return np.sqrt(square / count)
+                residual += rotations[marker, i, j] * bias[marker, j]
+            square += residual * residual
+    return np.sqrt(square / count)  # type: ignore[no-any-return]

@@ -1,137 +1,165 @@
-"""Digits that reach for the same points: the best namings of all of them together, compiled."""
+"""Joint assignment of points to digits that share candidates, from the hypotheses of each; compiled."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
-from track.association.digit_hypotheses import NEVER
+from track.association.digit_hypotheses import IMPOSSIBLE
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+    from track.association.candidates import DigitCandidates
+    from track.association.digit_hypotheses import DigitHypotheses
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def elect(reach: Any, namings: Any, markers: Any, owners: Any, margins: Any) -> None:
-    """Give points to digits: of all digits that reach for the same points, directly or not, the best choice.
+def assign_jointly(
+    candidates: DigitCandidates,
+    hypotheses: DigitHypotheses,
+    markers: Int[np.ndarray, "D K"],
+    assigned: Int[np.ndarray, "N"],
+    margins: Float[np.ndarray, "N"],
+) -> None:
+    """Assign points to digits: the best combination of hypotheses of all digits that share points.
 
     Args:
-        reach: The points that each digit may take (`track.association.candidates.Reach`).
-        namings: The best naming of every set of them (`track.association.digit_hypotheses.DigitNamings`),
-            digit by digit.
-        markers: The markers of each digit (D, K), counted through the hands; -1 where there are fewer.
-        owners: Marker of each point (N,), -1 for none; overwritten.
-        margins: By how much the next best choice in which a point has another name is worse (N,), log odds;
-            written for points that some digit may take.
+        candidates: Candidate points of each digit.
+        hypotheses: The best assignment of every set of them, digit by digit.
+        markers: Markers of each digit, counted through the hands; -1 where there are fewer.
+        assigned: Marker of each point, -1 for none; overwritten.
+        margins: Log-odds by which the next best combination is worse in which a point has another label;
+            written for candidate points.
     """
-    left = reach.counts > 0
-    group = np.empty(len(left), dtype=np.int64)
-    for first in range(len(left)):
-        if not left[first]:
+    pending = candidates.counts > 0
+    group = np.empty(len(pending), dtype=np.int64)
+    for first in range(len(pending)):
+        if not pending[first]:
             continue
-        group[0], size, place = first, 1, 0
-        left[first] = False
-        while place < size:
-            for other in range(len(left)):
-                if left[other] and _share_points(reach, group[place], other):
-                    left[other] = False
+        group[0], size, index = first, 1, 0
+        pending[first] = False
+        while index < size:
+            for other in range(len(pending)):
+                if pending[other] and _share_points(candidates, group[index], other):
+                    pending[other] = False
                     group[size] = other
                     size += 1
-            place += 1
-        _elect_group(group[:size], reach, namings, markers, owners, margins)
+            index += 1
+        _assign_group(group[:size], candidates, hypotheses, markers, assigned, margins)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _share_points(reach: Any, one: Any, other: Any) -> Any:
-    for place in range(reach.counts[one]):
-        for another in range(reach.counts[other]):
-            if reach.candidates[one, place] == reach.candidates[other, another]:
+def _share_points(candidates: DigitCandidates, one: int, other: int) -> bool:
+    """Whether two digits have a candidate in common."""
+    for index in range(candidates.counts[one]):
+        for second in range(candidates.counts[other]):
+            if candidates.candidates[one, index] == candidates.candidates[other, second]:
                 return True
     return False
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _elect_group(group: Any, reach: Any, namings: Any, markers: Any, owners: Any, margins: Any) -> None:
-    most = namings.scores.shape[1]
+def _assign_group(
+    group: Int[np.ndarray, "G"],
+    candidates: DigitCandidates,
+    hypotheses: DigitHypotheses,
+    markers: Int[np.ndarray, "D K"],
+    assigned: Int[np.ndarray, "N"],
+    margins: Float[np.ndarray, "N"],
+) -> None:
+    """`assign_jointly` for a group of digits that share points, directly or through others."""
+    most = hypotheses.scores.shape[1]
     rows, counts = np.zeros((len(group), most), dtype=np.int64), np.zeros(len(group), dtype=np.int64)
-    scores, sets = np.full((len(group), most), -NEVER), np.zeros((len(group), most), dtype=np.int64)
-    bits = np.full(len(owners), -1)
+    scores, sets = np.full((len(group), most), -IMPOSSIBLE), np.zeros((len(group), most), dtype=np.int64)
+    bits = np.full(len(assigned), -1)
     num_bits = 0  # 61 at most for ten digits with seven candidates, as each shares one with another
-    for place, digit in enumerate(group):
-        for point in reach.candidates[digit, : reach.counts[digit]]:
-            owners[point], margins[point] = -1, np.inf
+    for index, digit in enumerate(group):
+        for point in candidates.candidates[digit, : candidates.counts[digit]]:
+            assigned[point], margins[point] = -1, np.inf
             if bits[point] < 0:
                 bits[point] = num_bits
                 num_bits += 1
-        counts[place] = _sort_rows(namings.scores[digit], rows[place])
-        for rank in range(counts[place]):
-            row = rows[place, rank]
-            scores[place, rank] = namings.scores[digit, row]
-            for number in range(reach.counts[digit]):
+        counts[index] = _sort_rows(hypotheses.scores[digit], rows[index])
+        for rank in range(counts[index]):
+            row = rows[index, rank]
+            scores[index, rank] = hypotheses.scores[digit, row]
+            for number in range(candidates.counts[digit]):
                 if row >> number & 1:
-                    sets[place, rank] |= 1 << bits[reach.candidates[digit, number]]
+                    sets[index, rank] |= 1 << bits[candidates.candidates[digit, number]]
     banned, other = np.full(len(group), -1), np.zeros(len(group), dtype=np.int64)
     best = np.zeros(len(group), dtype=np.int64)
-    total = combine(scores, sets, counts, banned, best)
-    for place, digit in enumerate(group):
-        row = rows[place, best[place]]
+    total = best_combination(scores, sets, counts, banned, best)
+    for index, digit in enumerate(group):
+        row = rows[index, best[index]]
         for number in range(markers.shape[1]):
-            if namings.names[digit, row, number] >= 0:
-                owners[reach.candidates[digit, namings.names[digit, row, number]]] = markers[digit, number]
-        banned[place] = best[place]
-        rival = combine(scores, sets, counts, banned, other)
-        banned[place] = -1
-        rival = max(rival, total - scores[place, best[place]] + namings.runners_up[digit, row])
-        for point in reach.candidates[digit, : reach.counts[digit]]:
-            margins[point] = min(margins[point], total - rival)
+            if hypotheses.assignments[digit, row, number] >= 0:
+                assigned[candidates.candidates[digit, hypotheses.assignments[digit, row, number]]] = markers[
+                    digit, number
+                ]
+        banned[index] = best[index]
+        alternative = best_combination(scores, sets, counts, banned, other)
+        banned[index] = -1
+        alternative = max(alternative, total - scores[index, best[index]] + hypotheses.runners_up[digit, row])
+        for point in candidates.candidates[digit, : candidates.counts[digit]]:
+            margins[point] = min(margins[point], total - alternative)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _sort_rows(scores: Any, rows: Any) -> Any:
-    """Rows that can be, the best first; returns how many."""
+def _sort_rows(scores: Float[np.ndarray, "S"], rows: Int[np.ndarray, "S"]) -> int:
+    """Write the rows that are possible to `rows`, the best first, and return how many there are."""
     count = 0
     for row in range(len(scores)):
-        if scores[row] <= -NEVER:
+        if scores[row] <= -IMPOSSIBLE:
             continue
-        place = count
-        while place > 0 and scores[rows[place - 1]] < scores[row]:
-            rows[place] = rows[place - 1]
-            place -= 1
-        rows[place] = row
+        index = count
+        while index > 0 and scores[rows[index - 1]] < scores[row]:
+            rows[index] = rows[index - 1]
+            index -= 1
+        rows[index] = row
         count += 1
     return count
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def combine(scores: Any, sets: Any, counts: Any, banned: Any, best: Any) -> Any:
-    """The best choice of one row a digit such that no point is used twice.
+def best_combination(
+    scores: Float[np.ndarray, "D S"],
+    sets: Int[np.ndarray, "D S"],
+    counts: Int[np.ndarray, "D"],
+    banned: Int[np.ndarray, "D"],
+    best: Int[np.ndarray, "D"],
+) -> float:
+    """The best choice of one row per digit such that no point is used twice, by branch and bound.
 
     Args:
-        scores: Scores (D, S) of each digit's rows, the best first.
-        sets: Points (D, S) that each row uses, a bit a point.
-        counts: Rows (D,) that each digit has; the last must use no point.
-        banned: A row of each digit (D,) that is not to be chosen; -1 for none.
-        best: The chosen rows (D,), overwritten.
+        scores: Scores of each digit's rows (log-odds), the best first.
+        sets: Points that each row uses, one bit per point.
+        counts: Rows of each digit; the last must use no point.
+        banned: A row of each digit that must not be chosen; -1 for none.
+        best: The chosen rows, overwritten.
 
     Returns:
-        Their total; far below zero if there is no choice.
+        The sum of their scores; `-IMPOSSIBLE` if there is no choice.
     """
     digits = len(scores)
     bound = np.zeros(digits + 1)
     for digit in range(digits - 1, -1, -1):
         bound[digit] = bound[digit + 1] + scores[digit, 0]
     row, total, used = np.full(digits, -1), np.zeros(digits + 1), np.zeros(digits + 1, dtype=np.int64)
-    most, digit = -NEVER, 0
+    most, digit = -IMPOSSIBLE, 0
     while digit >= 0:
         row[digit] += 1
-        now = row[digit]
-        if now >= counts[digit] or total[digit] + scores[digit, now] + bound[digit + 1] <= most:
+        chosen = row[digit]
+        if chosen >= counts[digit] or total[digit] + scores[digit, chosen] + bound[digit + 1] <= most:
             row[digit] = -1
             digit -= 1
             continue
-        if now == banned[digit] or used[digit] & sets[digit, now]:
+        if chosen == banned[digit] or used[digit] & sets[digit, chosen]:
             continue
-        total[digit + 1] = total[digit] + scores[digit, now]
-        used[digit + 1] = used[digit] | sets[digit, now]
+        total[digit + 1] = total[digit] + scores[digit, chosen]
+        used[digit + 1] = used[digit] | sets[digit, chosen]
         if digit + 1 < digits:
             digit += 1
         elif total[digits] > most:

@@ -1,75 +1,96 @@
-"""The points of one hand whose pose is coming: names carried over are checked against it.
+"""Tests of the labels that go along with IDs: gating by the predicted pose, then by the fitted one.
 
-Names are places in the hand's layout; -1 is a point of something else.
+Labels are indices into the hand's layout; -1 is a point that is none of its markers.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from track.association.hand_state import Coming, Estimate, HandMemory
+from track.association.hand_state import Estimate, HandState, Prediction
+from track.config import GatingConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_SURPRISE: Final = 0.004  # [m] by which the coming pose may be wrong where an ID carries a name over
-_MOST_SURPRISES: Final = 0.3  # share of a hand's names that may be wrong at once
-_FIT: Final = 0.0015  # [m] by which a fitted one may be
-_GATE: Final = 16.0  # squared standard deviations
-_BAD: Final = 0.004  # [m] RMS from which a pose may have been sought in the wrong place
-
 
 def targets_of(
-    points: Float[np.ndarray, "N 3"], names: Int[np.ndarray, "N"], count: int
+    points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], count: int
 ) -> Float[np.ndarray, "M 3"]:
-    """Named points in the layout's order [m], NaN where none is."""
+    """Labeled points in the layout's order [m], NaN where a marker has no point.
+
+    Args:
+        points: Points [m].
+        labels: Their labels.
+        count: Markers of the layout.
+    """
     targets = np.full((count, 3), np.nan)
-    targets[names[names >= 0]] = points[names >= 0]
+    targets[labels[labels >= 0]] = points[labels >= 0]
     return targets
 
 
-def forget_surprises(
-    memory: HandMemory,
+def gate_labels(
+    state: HandState,
     points: Float[np.ndarray, "N 3"],
-    names: Int[np.ndarray, "N"],
-    coming: Coming,
+    labels: Int[np.ndarray, "N"],
+    prediction: Prediction,
+    config: GatingConfig,
 ) -> None:
-    """Take away names whose points are nowhere near where their markers were coming to.
+    """Drop labels whose points are outside the gate around their markers at the predicted pose.
 
-    Where that is so of many, it is the pose that was not coming, and the names stay.
+    Where that concerns too many labels, the prediction is wrong, and all labels stay.
+
+    Args:
+        state: The hand.
+        points: The frame's points [m].
+        labels: Their labels, overwritten.
+        prediction: The hand's predicted pose.
+        config: The gate.
     """
-    mine = np.flatnonzero(names >= 0)
-    places = memory.solver.place(coming.qpos)
-    off = ((points[mine] - places[names[mine]]) ** 2).sum(axis=1)
-    wrong = mine[off > _GATE * (memory.variance[names[mine]] + _SURPRISE**2)]
-    if len(wrong) <= _MOST_SURPRISES * len(mine):
-        names[wrong] = -1
+    labeled = np.flatnonzero(labels >= 0)
+    positions = state.solver.marker_positions(prediction.qpos)
+    innovation = ((points[labeled] - positions[labels[labeled]]) ** 2).sum(axis=1)
+    variance = state.variance[labels[labeled]] + config.prediction_spread**2
+    gated = labeled[innovation > config.gate * variance]
+    if len(gated) <= config.most_gated * len(labeled):
+        labels[gated] = -1
 
 
-def fit_names(
-    memory: HandMemory,
+def fit_labels(
+    state: HandState,
     points: Float[np.ndarray, "N 3"],
-    names: Int[np.ndarray, "N"],
-    coming: Coming,
+    labels: Int[np.ndarray, "N"],
+    prediction: Prediction,
+    config: GatingConfig,
 ) -> Estimate:
-    """The pose of the named points; names that do not go with the others are taken away, the worst first."""
-    start, sought_anew = coming.qpos, False
+    """Fit the pose to the labeled points.
+
+    Labels that are inconsistent with the others are dropped, the worst first.
+
+    Args:
+        state: The hand.
+        points: The frame's points [m].
+        labels: Their labels, overwritten.
+        prediction: The hand's predicted pose.
+        config: The gate.
+    """
+    start, restarted = prediction.qpos, False
     while True:
-        mine = np.flatnonzero(names >= 0)
-        targets = targets_of(points, names, memory.num_markers)
-        estimate = memory.fit(targets, start, coming)
-        if len(mine) == 0:
+        labeled = np.flatnonzero(labels >= 0)
+        targets = targets_of(points, labels, state.num_markers)
+        estimate = state.fit(targets, start, prediction)
+        if len(labeled) == 0:
             return estimate
-        off = ((points[mine] - estimate.places[names[mine]]) ** 2).sum(axis=1)
-        off /= memory.variance[names[mine]] + _FIT**2
-        if off.max() < _GATE:
+        squares = ((points[labeled] - estimate.positions[labels[labeled]]) ** 2).sum(axis=1)
+        squares /= state.variance[labels[labeled]] + config.fit_spread**2
+        if squares.max() < config.gate:
             return estimate
-        if estimate.rms > _BAD and not sought_anew:
-            sought_anew = True
-            anew = memory.solver.solve(targets[None])
-            if anew.rms[0] < 0.5 * estimate.rms:
-                start = anew.qpos[0]
+        if estimate.rms > config.restart_rms and not restarted:
+            restarted = True
+            restart = state.solver.solve(targets[None])
+            if restart.rms[0] < 0.5 * estimate.rms:
+                start = restart.qpos[0]
                 continue
-        names[mine[off.argmax()]] = -1
+        labels[labeled[squares.argmax()]] = -1

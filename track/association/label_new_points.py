@@ -1,167 +1,170 @@
-"""Names for the points that have none: the palms' first, then those of all digits in reach, together.
+"""Labels for new points: first the palms' markers, then those of all digits with candidates, jointly.
 
-Every naming of a digit's candidates is tried on the digit (`track.association.digit_hypotheses`); where
-digits reach for the
-same points, of one hand or of two that touch, the best of all their namings together is taken
-(`track.association.joint_assignment`). Names that are still young stand for re-election.
+All assignments of a digit's candidates to its markers are tested on the digit
+(`track.association.digit_hypotheses`). Where digits share candidates, of one hand or of two that touch, the
+best joint assignment is taken (`track.association.joint_assignment`). Labels that are not settled yet can be
+reassigned.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from handsim.hand.topology import DIGITS
-from track.association.candidates import MOST_CANDIDATES, Crowd, Reach, find_reach
-from track.association.digit_hypotheses import DigitNamings, digit_namings, search_digit
-from track.association.hand_state import Coming, Estimate, HandMemory
-from track.association.joint_assignment import elect
-from track.association.point_matching import gains, match
+from track.association.candidates import MAX_CANDIDATES, DigitCandidates, MarkerTable, find_candidates
+from track.association.digit_hypotheses import DigitHypotheses, empty_hypotheses, evaluate_digit
+from track.association.frame_state import FrameState
+from track.association.hand_state import Estimate, HandState, Prediction
+from track.association.joint_assignment import assign_jointly
+from track.association.point_matching import match_log_odds, match_points
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+    from jaxtyping import Float
     from numpy.typing import NDArray
 
 
-class Following(NamedTuple):
-    """A hand whose pose is known so far."""
+@dataclass(frozen=True, slots=True, eq=False)
+class HandTrack:
+    """A hand with a pose in the current frame."""
 
-    number: int
-    memory: HandMemory
-    coming: Coming
+    index: int
+    """Index of the hand."""
+    state: HandState
+    """Its filter state."""
+    prediction: Prediction
+    """The pose before the frame's markers were used."""
     estimate: Estimate
+    """The pose fitted to the labels that IDs carried over."""
 
 
-def name_new(
-    hands: Sequence[Following],
-    points: Float[np.ndarray, "N 3"],
-    names: Int[np.ndarray, "H N"],
-    credit: Float[np.ndarray, "N"],
-    born: Float[np.ndarray, "N"],
-    advice: Mapping[int, Float[np.ndarray, "N M"]],
-) -> Float[np.ndarray, "N"]:
-    """Name points that nobody has named.
+def label_new_points(
+    hands: Sequence[HandTrack], frame: FrameState, queried: Mapping[int, Float[np.ndarray, "P M"]]
+) -> Float[np.ndarray, "P"]:
+    """Label points without a label, and reassign labels that are not settled.
 
     Args:
         hands: The hands that have a pose.
-        points: The frame's points [m].
-        names: Names of every hand, overwritten.
-        credit: What the name of each point is worth for the sake of its ID.
-        born: When each point appeared [s].
-        advice: Log odds of names by what others say, for some hands.
+        frame: The frame; its `labels` are overwritten.
+        queried: Log-odds of labels from the labeler's answers, for some hands.
 
     Returns:
-        How sure each name is that has changed; NaN for those that have not.
+        Confidence in each label that has changed; NaN for the others.
     """
-    sure = np.full(len(points), np.nan)
+    confidence = np.full(len(frame.points), np.nan)
     if not hands:
-        return sure
+        return confidence
     for hand in hands:
-        _name_palm(hand, points, names, born, advice, sure)
-    crowd = _crowd(hands, names)
-    reach = find_reach(points, credit, crowd, len(hands) * len(DIGITS))
-    if not reach.counts.any():
-        return sure
-    markers = _markers_of_digits(crowd.parts, len(reach.counts))
-    namings = digit_namings(len(reach.counts), MOST_CANDIDATES, markers.shape[1])
+        _label_palm(hand, frame, queried, confidence)
+    table = _marker_table(hands, frame)
+    association = hands[0].state.config.association
+    candidates = find_candidates(frame.points, frame.evidence, table, len(hands) * len(DIGITS), association)
+    if not candidates.counts.any():
+        return confidence
+    markers = _markers_of_digits(table.digits, len(candidates.counts))
+    hypotheses = empty_hypotheses(len(candidates.counts), MAX_CANDIDATES, markers.shape[1])
     first = 0
-    for place, hand in enumerate(hands):
-        digits = slice(place * len(DIGITS), (place + 1) * len(DIGITS))
-        part = Reach(*(values[digits] for values in reach))
-        rows = DigitNamings(*(values[digits] for values in namings))
-        _search(hand, points, names[hand.number], part, markers[digits] - first, credit, born, advice, rows)
-        first += hand.memory.num_markers
-    before, margins = crowd.owners.copy(), np.full(len(points), np.nan)
-    elect(reach, namings, markers, crowd.owners, margins)
-    changed = before != crowd.owners
-    sure[changed] = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
-    _write_names(hands, crowd.owners, names)
-    return sure
+    for row, hand in enumerate(hands):
+        digits = slice(row * len(DIGITS), (row + 1) * len(DIGITS))
+        own = DigitCandidates(*(values[digits] for values in candidates))
+        rows = DigitHypotheses(*(values[digits] for values in hypotheses))
+        _evaluate_hand(hand, frame, own, markers[digits] - first, queried, rows)
+        first += hand.state.num_markers
+    before, margins = table.assigned.copy(), np.full(len(frame.points), np.nan)
+    assign_jointly(candidates, hypotheses, markers, table.assigned, margins)
+    changed = before != table.assigned
+    confidence[changed] = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
+    _write_labels(hands, table.assigned, frame)
+    return confidence
 
 
-def _name_palm(
-    hand: Following,
-    points: NDArray[np.float64],
-    names: NDArray[np.int64],
-    born: NDArray[np.float64],
-    advice: Mapping[int, NDArray[np.float64]],
-    sure: NDArray[np.float64],
+def _label_palm(
+    hand: HandTrack,
+    frame: FrameState,
+    queried: Mapping[int, NDArray[np.float64]],
+    confidence: NDArray[np.float64],
 ) -> None:
-    mine = names[hand.number]
-    missing = hand.memory.digits < 0
-    missing[mine[mine >= 0]] = False
+    """Match unlabeled points with the missing markers of a palm; labels and confidence are overwritten."""
+    labels = frame.labels[hand.index]
+    missing = hand.state.digits < 0
+    missing[labels[labels >= 0]] = False
     if not missing.any():
         return
-    palm, free = np.flatnonzero(missing), np.flatnonzero((names < 0).all(axis=0))
+    palm, free = np.flatnonzero(missing), np.flatnonzero(frame.unlabeled)
     if len(free) == 0:
         return
-    odds = gains(points[free], hand.estimate.places[palm], hand.estimate.covariances[palm])
-    odds += hand.memory.chances(born[free])[:, palm]
-    if hand.number in advice:
-        odds += advice[hand.number][free[:, None], palm]
-    found, how_sure = match(odds)
-    chosen = free[found >= 0]
-    mine[chosen], sure[chosen] = palm[found[found >= 0]], how_sure[found >= 0]
+    log_odds = match_log_odds(
+        frame.points[free],
+        hand.estimate.positions[palm],
+        hand.estimate.covariances[palm],
+        hand.state.config.association.stray_density,
+    )
+    log_odds += hand.state.presence_log_odds(frame.first_seen[free])[:, palm]
+    if hand.index in queried:
+        log_odds += queried[hand.index][free[:, None], palm]
+    matched, match_confidence = match_points(log_odds)
+    chosen = free[matched >= 0]
+    labels[chosen], confidence[chosen] = palm[matched[matched >= 0]], match_confidence[matched >= 0]
 
 
-def _crowd(hands: Sequence[Following], names: NDArray[np.int64]) -> Crowd:
-    owners, parts, first = np.full(names.shape[1], -1), [], 0
-    for place, hand in enumerate(hands):
-        mine, digits = names[hand.number], hand.memory.digits
-        owners[mine >= 0] = first + mine[mine >= 0]
-        parts.append(np.where(digits >= 0, place * len(DIGITS) + digits, -1))
-        first += hand.memory.num_markers
-    places = np.concatenate([hand.estimate.places for hand in hands])
-    return Crowd(places, np.concatenate(parts), owners)
+def _marker_table(hands: Sequence[HandTrack], frame: FrameState) -> MarkerTable:
+    """The markers of all hands in a row."""
+    assigned, digits, first = np.full(len(frame.points), -1), [], 0
+    for row, hand in enumerate(hands):
+        labels, own = frame.labels[hand.index], hand.state.digits
+        assigned[labels >= 0] = first + labels[labels >= 0]
+        digits.append(np.where(own >= 0, row * len(DIGITS) + own, -1))
+        first += hand.state.num_markers
+    positions = np.concatenate([hand.estimate.positions for hand in hands])
+    return MarkerTable(positions, np.concatenate(digits), assigned)
 
 
-def _markers_of_digits(parts: NDArray[np.int64], num_digits: int) -> NDArray[np.int64]:
+def _markers_of_digits(digits: NDArray[np.int64], num_digits: int) -> NDArray[np.int64]:
     """Markers of each digit (D, K), -1 where there are fewer."""
-    found = [np.flatnonzero(parts == digit) for digit in range(num_digits)]
-    markers = np.full((num_digits, max(map(len, found))), -1)
-    for row, mine in zip(markers, found, strict=True):
-        row[: len(mine)] = mine
+    members = [np.flatnonzero(digits == digit) for digit in range(num_digits)]
+    markers = np.full((num_digits, max(map(len, members))), -1)
+    for row, own in zip(markers, members, strict=True):
+        row[: len(own)] = own
     return markers
 
 
-def _search(
-    hand: Following,
-    points: NDArray[np.float64],
-    names: NDArray[np.int64],
-    reach: Reach,
+def _evaluate_hand(
+    hand: HandTrack,
+    frame: FrameState,
+    candidates: DigitCandidates,
     markers: NDArray[np.int64],
-    credit: NDArray[np.float64],
-    born: NDArray[np.float64],
-    advice: Mapping[int, NDArray[np.float64]],
-    namings: DigitNamings,
+    queried: Mapping[int, NDArray[np.float64]],
+    hypotheses: DigitHypotheses,
 ) -> None:
-    """Try the points that one hand's digits may take."""
-    if not reach.counts.any():
+    """Evaluate the hypotheses of one hand's digits, which are filled."""
+    if not candidates.counts.any():
         return
-    memory, estimate = hand.memory, hand.estimate
-    odds, named = memory.chances(born), np.flatnonzero(names >= 0)
-    odds[named, names[named]] = credit[named]
-    if hand.number in advice:
-        odds += advice[hand.number]
-    firm, doubtful = memory.trust(hand.coming, estimate)
-    for digit in np.flatnonzero(reach.counts):
-        search_digit(
-            memory.adapted,
-            firm if memory.proven[digit] else doubtful,
+    state, labels = hand.state, frame.labels[hand.index]
+    log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(labels >= 0)
+    log_odds[labeled, labels[labeled]] = frame.evidence[labeled]
+    if hand.index in queried:
+        log_odds += queried[hand.index]
+    confirmed, unconfirmed = state.digit_models(hand.prediction, hand.estimate)
+    for digit in np.flatnonzero(candidates.counts):
+        evaluate_digit(
+            state.adapted,
+            confirmed if state.confirmed[digit] else unconfirmed,
             digit,
             markers[digit, markers[digit] >= 0],
-            points,
-            reach.candidates[digit, : reach.counts[digit]],
-            odds,
-            *(values[digit] for values in namings),
+            frame.points,
+            candidates.candidates[digit, : candidates.counts[digit]],
+            log_odds,
+            *(values[digit] for values in hypotheses),
         )
 
 
-def _write_names(hands: Sequence[Following], owners: NDArray[np.int64], names: NDArray[np.int64]) -> None:
+def _write_labels(hands: Sequence[HandTrack], assigned: NDArray[np.int64], frame: FrameState) -> None:
+    """Write the markers of points, counted through the hands, to the frame's labels."""
     first = 0
     for hand in hands:
-        last = first + hand.memory.num_markers
-        names[hand.number] = np.where((owners >= first) & (owners < last), owners - first, -1)
+        last = first + hand.state.num_markers
+        frame.labels[hand.index] = np.where((assigned >= first) & (assigned < last), assigned - first, -1)
         first = last

@@ -1,8 +1,8 @@
-"""Points without a label meet markers without a point: who belongs to whom, and how surely."""
+"""One-to-one matching of points with markers by log-odds, and how certain each match is."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -10,54 +10,68 @@ from scipy.optimize import linear_sum_assignment
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_STRAYS: Final = 2000.0
-"""Points [1/m^3] near a hand that no marker made and that could be taken for one: one in an 8 cm cube."""
-_NOTHING: Final = np.log(_STRAYS * (2.0 * np.pi) ** 1.5)
 
-
-def gains(
+def match_log_odds(
     points: Float[np.ndarray, "P 3"],
-    places: Float[np.ndarray, "K 3"],
+    positions: Float[np.ndarray, "K 3"],
     covariances: Float[np.ndarray, "K 3 3"],
+    stray_density: float,
 ) -> Float[np.ndarray, "P K"]:
-    """Log odds that a point is a marker rather than a stray.
+    """Log-odds of each point being a marker rather than a stray.
 
     Args:
         points: Points [m].
-        places: Where markers are expected [m].
-        covariances: How far they may be from there [m^2].
+        positions: Predicted positions of markers [m].
+        covariances: Covariances of these [m^2].
+        stray_density: See `AssociationConfig` [1/m^3].
     """
-    off = points[:, None] - places
+    innovation = points[:, None] - positions
     precision = np.linalg.inv(covariances)
-    square = np.einsum("pki,kij,pkj->pk", off, precision, off)
-    odds: np.ndarray = 0.5 * np.log(np.linalg.det(precision)) - 0.5 * square - _NOTHING
-    return odds
+    square = np.einsum("pki,kij,pkj->pk", innovation, precision, innovation)
+    log_odds: np.ndarray = (
+        0.5 * np.log(np.linalg.det(precision)) - 0.5 * square - _stray_log_density(stray_density)
+    )
+    return log_odds
 
 
-def worth_of(variances: Float[np.ndarray, "K"]) -> Float[np.ndarray, "K"]:
-    """Log odds of a point that lies where a marker with this variance [m^2] in each direction is expected."""
-    worth: np.ndarray = -1.5 * np.log(variances) - _NOTHING
-    return worth
+def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Float[np.ndarray, "K"]:
+    """Log-odds of a point exactly at the predicted position of a marker.
+
+    Args:
+        variances: Variance of each marker in each direction [m^2].
+        stray_density: See `AssociationConfig` [1/m^3].
+    """
+    log_odds: np.ndarray = -1.5 * np.log(variances) - _stray_log_density(stray_density)
+    return log_odds
 
 
-def match(
-    odds: Float[np.ndarray, "P K"],
+def match_points(
+    log_odds: Float[np.ndarray, "P K"],
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """The likeliest assignment of points to markers, one to one; either may stay alone.
+    """The most likely assignment of points to markers, one to one; either may stay alone.
+
+    Args:
+        log_odds: Log-odds of each pair.
 
     Returns:
-        Marker of each point, -1 for none, and how sure that is [0, 1], the rivals of both being weighed.
+        Marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the alternatives of
+        both.
     """
-    labels = np.full(len(odds), -1)
-    if 0 in odds.shape:
-        return labels, np.ones(len(odds))
-    gain = np.maximum(odds, 0.0)
+    labels = np.full(len(log_odds), -1)
+    if 0 in log_odds.shape:
+        return labels, np.ones(len(log_odds))
+    gain = np.maximum(log_odds, 0.0)
     rows, columns = linear_sum_assignment(-gain)
-    weights = np.exp(np.minimum(odds, 50.0))
-    rivals = 1.0 + weights.sum(axis=1, keepdims=True) + weights.sum(axis=0) - weights
-    share = weights / rivals
-    real = gain[rows, columns] > 0.0
-    labels[rows[real]] = columns[real]
+    weights = np.exp(np.minimum(log_odds, 50.0))
+    alternatives = 1.0 + weights.sum(axis=1, keepdims=True) + weights.sum(axis=0) - weights
+    share = weights / alternatives
+    matched = gain[rows, columns] > 0.0
+    labels[rows[matched]] = columns[matched]
     confidence = 1.0 - (weights / (1.0 + weights.sum(axis=1, keepdims=True))).sum(axis=1)
-    confidence[rows[real]] = share[rows[real], columns[real]]
+    confidence[rows[matched]] = share[rows[matched], columns[matched]]
     return labels, confidence
+
+
+def _stray_log_density(stray_density: float) -> float:
+    """Log density of strays, less the constant of a normal density."""
+    return float(np.log(stray_density * (2.0 * np.pi) ** 1.5))

@@ -81,7 +81,9 @@ class InitializedTracker:
         positions = np.full((self._first_label[-1], 3), np.inf)
         for number, (hand, pose) in enumerate(zip(self._hands, poses, strict=True)):
             if pose is not None:
-                positions[self._first_label[number] : self._first_label[number + 1]] = hand.solver.place(pose)
+                positions[self._first_label[number] : self._first_label[number + 1]] = (
+                    hand.solver.marker_positions(pose)
+                )
         return positions
 
 

@@ -102,8 +102,8 @@ class PaperTracker:
         positions = np.full((self._first_label[-1], 3), np.inf)
         for number, hand in enumerate(self._hands):
             if hand.qpos is not None:
-                positions[self._first_label[number] : self._first_label[number + 1]] = hand.solver.place(
-                    hand.qpos
+                positions[self._first_label[number] : self._first_label[number + 1]] = (
+                    hand.solver.marker_positions(hand.qpos)
                 )
         positions[labels[labels >= 0]] = np.inf
         proposed = np.full(len(points), -1)

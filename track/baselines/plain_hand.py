@@ -76,7 +76,7 @@ class PlainHand:
             row: Which of them.
         """
         present = labels >= 0
-        markers = self.solver.place(fit.qpos[row])
+        markers = self.solver.marker_positions(fit.qpos[row])
         markers[labels[present]] = points[present]
         filled = np.setdiff1d(np.arange(self.num_markers), labels[present])
         return TrackedHand(self.hand.side, status, fit.qpos[row], float(fit.rms[row]), markers, filled)

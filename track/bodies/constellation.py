@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from track.bodies.body_pose import squared_distance, transform_markers
-from track.kinematics.starting_poses import lay_rigidly
+from track.kinematics.starting_poses import align_rigid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -91,7 +91,7 @@ def _fit_pose(
             count += 1
     if count < FEWEST:
         return count, np.nan, np.nan
-    lay_rigidly(positions, target, np.ones(len(positions)), pose)
+    align_rigid(positions, target, np.ones(len(positions)), pose)
     predicted, total, worst = transform_markers(positions, pose), 0.0, 0.0
     for marker in range(len(positions)):
         if assignment[marker] >= 0:

@@ -90,7 +90,7 @@ def track(
         "user": size or "M" if shape is None else shape.name,
         "labeler": labeler or glove,
     }
-    take = dataclasses.replace(take, settings=settings)
+    take = dataclasses.replace(take, settings={**take.settings, **settings})
     save_tracked_take(out, take)
     if labeled is not None:
         write_capture(labeled, labeled_points(take))

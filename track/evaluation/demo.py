@@ -24,7 +24,9 @@ def track_take(run: DemoRun) -> Section:
     run.report("tracking a simulated capture")
     take = simulate_twin(TwinConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
     names = tuple(f"*{number}" for number in range(take.points.shape[1]))
-    tracked = track_capture(Capture(names, take.points, take.rate), Tracker(true_users(take), load_labeler(GLOVE)))
+    tracked = track_capture(
+        Capture(names, take.points, take.rate), Tracker(true_users(take), load_labeler(GLOVE))
+    )
     save_tracked_take(run.tracked_take, tracked)
     errors = []
     for hand in take.hands:

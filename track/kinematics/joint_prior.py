@@ -1,40 +1,37 @@
-"""What is believed of a hand's hinges before its markers are asked.
+"""Prior of a hand's hinge angles before its markers are used: a normal distribution of all 20 together.
 
-Hinges wander as an Ornstein-Uhlenbeck process whose resting distribution is that of the gestures people make:
-what is not seen for a while spreads to there, and not beyond; and as neighboring fingers bend together,
-those that are seen tell of those that are not.
+The hinges follow an Ornstein-Uhlenbeck process whose resting distribution is that of the gestures people
+make. The uncertainty of a hinge that no marker shows for a while grows to that distribution, and not beyond.
+Neighboring fingers bend together, so the covariance carries information from visible digits to hidden ones.
 """
 
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
 
 from handsim.hand.topology import NUM_JOINTS
 from poses.shapes.library import LIBRARIES, gestures_of
+from track.config import MotionConfig
 from track.kinematics.small_systems import eliminate, invert_positive, solve_positive
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_WANDERING: Final = 1.0  # [s] after which little is known of a hinge
-_OWN_WAYS: Final = np.deg2rad(6.0)  # spread of every hinge beyond what the gestures say
-_LEAST: Final = np.deg2rad(0.5)  # spread of a hinge that was just seen
 
-
-class HingeBelief(NamedTuple):
+class JointPrior(NamedTuple):
     """A normal distribution of the hinges."""
 
     angles: Float[np.ndarray, "20"]
-    """Their mean [rad]."""
+    """Mean [rad]."""
     covariance: Float[np.ndarray, "20 20"]
-    """[rad^2]."""
+    """Covariance [rad^2]."""
     precision: Float[np.ndarray, "20 20"]
-    """Its inverse."""
+    """Inverse of the covariance [1/rad^2]."""
 
     @property
     def spread(self) -> Float[np.ndarray, "20"]:
@@ -52,75 +49,102 @@ def resting_angles() -> Float[np.ndarray, "20"]:
 
 
 @cache
-def resting_covariance() -> Float[np.ndarray, "20 20"]:
-    """Of the hinges over all gestures [rad^2]."""
+def resting_covariance(config: MotionConfig = MotionConfig()) -> Float[np.ndarray, "20 20"]:  # noqa: B008
+    """Covariance of the hinges over all gestures, and a margin for other poses [rad^2]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
-    covariance: NDArray[np.float64] = np.cov(gestures.T) + _OWN_WAYS**2 * np.eye(NUM_JOINTS)
+    covariance: NDArray[np.float64] = np.cov(gestures.T) + config.gesture_margin**2 * np.eye(NUM_JOINTS)
     return covariance
 
 
-def rest() -> HingeBelief:
-    """What is believed of a hand of which nothing is known."""
-    covariance = resting_covariance()
-    return HingeBelief(resting_angles(), covariance, np.linalg.inv(covariance))
+def resting_prior(config: MotionConfig = MotionConfig()) -> JointPrior:  # noqa: B008
+    """Prior of a hand without any history."""
+    covariance = resting_covariance(config)
+    return JointPrior(resting_angles(), covariance, np.linalg.inv(covariance))
 
 
-def foresee(
-    angles: Float[np.ndarray, "20"], covariance: Float[np.ndarray, "20 20"], span: float
-) -> HingeBelief:
-    """What is believed some time after the hinges were known so well.
+def predict_joints(
+    angles: Float[np.ndarray, "20"],
+    covariance: Float[np.ndarray, "20 20"],
+    span: float,
+    config: MotionConfig = MotionConfig(),  # noqa: B008
+) -> JointPrior:
+    """Prior of the hinges some time after they were estimated.
 
     Args:
-        angles: Where they are coming to [rad].
-        covariance: How well they were known [rad^2].
-        span: The time since then [s].
+        angles: Predicted angles [rad].
+        covariance: Covariance of the estimate [rad^2].
+        span: Time since the estimate [s].
+        config: Process model.
     """
-    belief = HingeBelief(angles, np.empty_like(covariance), np.empty_like(covariance))
-    _foresee(covariance, resting_covariance(), np.exp(-2.0 * max(span, 0.0) / _WANDERING), belief)
-    return belief
+    prior = JointPrior(angles, np.empty_like(covariance), np.empty_like(covariance))
+    kept = np.exp(-2.0 * max(span, 0.0) / config.joint_memory)
+    _predict_covariance(covariance, resting_covariance(config), kept, config.joint_spread, prior)
+    return prior
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _foresee(known: Any, resting: Any, kept: Any, belief: Any) -> None:
+def _predict_covariance(
+    known: Float[np.ndarray, "20 20"],
+    resting: Float[np.ndarray, "20 20"],
+    kept: float,
+    least: float,
+    prior: JointPrior,
+) -> None:
+    """Fill covariance and precision of a prior.
+
+    Args:
+        known: Covariance of the estimate [rad^2].
+        resting: Covariance of the resting distribution [rad^2].
+        kept: Share of the first in the result, from 0 to 1.
+        least: Standard deviation that is added to every hinge [rad].
+        prior: Filled, but for its angles.
+    """
     for row in range(len(known)):
         for column in range(len(known)):
-            belief.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
-        belief.covariance[row, row] += _LEAST**2
-    belief.precision[:] = belief.covariance
-    invert_positive(belief.precision)
+            prior.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
+        prior.covariance[row, row] += least**2
+    prior.precision[:] = prior.covariance
+    invert_positive(prior.precision)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def believe_digit(belief: Any, told: Any, pull: Any, digit: Any, angles: Any, trust: Any) -> None:
-    """What the other digits say of one.
+def digit_prior(
+    prior: JointPrior,
+    information_matrix: Float[np.ndarray, "20 20"],
+    information_vector: Float[np.ndarray, "20"],
+    digit: int,
+    angles: Float[np.ndarray, "4"],
+    precision: Float[np.ndarray, "4 4"],
+) -> None:
+    """Prior of one digit's hinges, given the markers of the other digits.
 
     Args:
-        belief: What was believed of the hinges before the markers were asked.
-        told: What the markers tell of the hinges, see `Expectation.told`.
-        pull: See `Expectation.pull`.
-        digit: Which digit.
-        angles: Its angles (4,) [rad], filled.
-        trust: Their precision (4, 4) [1/rad^2], filled.
+        prior: Distribution of the hinges before the markers were used.
+        information_matrix: See `MarkerPrediction`.
+        information_vector: See `MarkerPrediction`.
+        digit: Index of the digit.
+        angles: Its mean [rad], filled.
+        precision: Its precision [1/rad^2], filled.
     """
-    count = len(pull)
-    order, system, rest = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
-    place = 0
+    count = len(information_vector)
+    order, system, right_side = np.empty(count, dtype=np.int64), np.empty((count, count)), np.zeros(count)
+    index = 0
     for hinge in range(count):  # the digit's own hinges last, so that the others are eliminated from them
         own = hinge // 4 == digit
-        order[count - 4 + hinge % 4 if own else place] = hinge
-        place += not own
+        order[count - 4 + hinge % 4 if own else index] = hinge
+        index += not own
     for row in range(count):
         one = order[row]
         for column in range(count):
-            system[row, column] = belief.precision[one, order[column]]
+            system[row, column] = prior.precision[one, order[column]]
         if row < count - 4:
-            rest[row] = pull[one]
+            right_side[row] = information_vector[one]
             for column in range(count):
-                rest[row] -= told[one, order[column]] * belief.angles[order[column]]
+                right_side[row] -= information_matrix[one, order[column]] * prior.angles[order[column]]
             for column in range(count - 4):
-                system[row, column] += told[one, order[column]]
-    eliminate(system, rest, 0, count - 4)
-    trust[:] = system[count - 4 :, count - 4 :]
-    solve_positive(system[count - 4 :, count - 4 :], rest[count - 4 :])
+                system[row, column] += information_matrix[one, order[column]]
+    eliminate(system, right_side, 0, count - 4)
+    precision[:] = system[count - 4 :, count - 4 :]
+    solve_positive(system[count - 4 :, count - 4 :], right_side[count - 4 :])
     for row in range(4):
-        angles[row] = belief.angles[4 * digit + row] + rest[count - 4 + row]
+        angles[row] = prior.angles[4 * digit + row] + right_side[count - 4 + row]

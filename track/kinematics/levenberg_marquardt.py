@@ -1,61 +1,83 @@
-"""Levenberg-Marquardt on one hand's pose, compiled: E_IK with limits, a prior and a robust loss."""
+"""Compiled Levenberg-Marquardt on one hand's pose: E_IK with joint limits, a prior and a robust loss.
+
+The energy is that of Han et al. 2018, section 4.3. These constants are compiled into fast-math kernels, so
+they are not part of `track.config.TrackerConfig`.
+"""
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numba
 import numpy as np
 
 from handsim.hand.topology import NUM_JOINTS
 from handsim.kernels.rotations import rotate_quaternion
-from track.kinematics.marker_kinematics import FAST, NUM_UNKNOWNS, gather, place_markers
+from track.kinematics.marker_kinematics import (
+    FAST,
+    NUM_UNKNOWNS,
+    HandArrays,
+    Workspace,
+    accumulate_normal_equations,
+    compute_markers,
+)
 
-MARKER_NOISE: Final = 0.001  # [m] one standard deviation, which everything else is weighed against
-_MARKER_WEIGHT: Final = MARKER_NOISE**-2
-_LIMIT_WEIGHT: Final = np.deg2rad(2.0) ** -2  # of a hinge beyond its range
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-10, 1e8
-_SMALL_GAIN = (1e-6 / MARKER_NOISE) ** 2  # markers nearer by a micron; what is left after that is far less
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+
+MARKER_NOISE: Final = 0.001
+"""Standard deviation of a marker [m]: the scale of all costs; optical systems and gloves reach about this."""
+_MARKER_PRECISION: Final = MARKER_NOISE**-2  # [1/m^2]
+_LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2  # [1/rad^2] of a hinge beyond its range: a soft limit
+_FIRST_DAMPING: Final = 1e-4  # share of the diagonal; small, because most starts are near the minimum
+_LEAST_DAMPING: Final = 1e-10  # share of the diagonal; keeps the factor positive
+_MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from there on
+_SMALL_GAIN = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron; converged
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def descend(
-    hand: Any,
-    target: Any,
-    qpos: Any,
-    center: Any,
-    pull: Any,
-    tightness: Any,
-    most_steps: Any,
-    work: Any,
-) -> Any:
-    """Bring a pose to a minimum of its cost; returns the cost and how many steps were tried.
+def levenberg_marquardt(
+    hand: HandArrays,
+    target: Float[np.ndarray, "M 3"],
+    qpos: Float[np.ndarray, "27"],
+    prior_mean: Float[np.ndarray, "27"],
+    precision: Float[np.ndarray, "26"],
+    robust_scale: float,
+    most_steps: int,
+    work: Workspace,
+) -> tuple[float, int]:
+    """Bring a pose to a minimum of its cost.
 
     Args:
         hand: The hand and its glove.
-        target: Markers (M, 3) [m]; NaN where missing.
-        qpos: Pose (27,) to start from, overwritten.
-        center: Pose (27,) that the prior draws the hand to.
-        pull: How strongly it does (26,), as a step's unknowns go [1/rad^2, 1/m^2, 1/rad^2].
-        tightness: Squared inverse of the distance from which a marker loses its say [1/m^2]; zero for never.
+        target: Markers in the world [m]; NaN where missing.
+        qpos: Pose to start from, overwritten.
+        prior_mean: Mean of the prior, a pose.
+        precision: Diagonal precision of the prior, in the order of a step's unknowns
+            [1/rad^2, 1/m^2, 1/rad^2]; zero where there is no prior.
+        robust_scale: Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for
+            plain least squares.
         most_steps: Steps at most.
-        work: Room for the arithmetic.
+        work: Buffers, overwritten.
+
+    Returns:
+        The cost (squared standard deviations), and how many steps were tried.
     """
     trial = qpos.copy()
     weights = np.zeros(len(target))
-    cost = _find_cost(hand, target, qpos, center, pull, tightness, work)
-    _linearize(hand, qpos, center, pull, tightness, weights, work)
+    cost = _cost(hand, target, qpos, prior_mean, precision, robust_scale, work)
+    _linearize(hand, qpos, prior_mean, precision, robust_scale, weights, work)
     damping, steps = _FIRST_DAMPING, 0
     while steps < most_steps and damping < _MOST_DAMPING:
         steps += 1
-        gain = _solve(hand.starts, damping, work)
+        gain = _solve(hand.skyline, damping, work)
         if gain < 0.0:
             damping *= 10.0
             continue
         move_wrist(qpos, work.step, trial)
         for hinge in range(NUM_JOINTS):
             trial[7 + hinge] = qpos[7 + hinge] + work.step[hinge]
-        trial_cost = _find_cost(hand, target, trial, center, pull, tightness, work)
+        trial_cost = _cost(hand, target, trial, prior_mean, precision, robust_scale, work)
         better = trial_cost < cost
         if better:
             qpos[:] = trial
@@ -63,15 +85,24 @@ def descend(
         if gain < _SMALL_GAIN:
             break
         if better:
-            _linearize(hand, qpos, center, pull, tightness, weights, work)
+            _linearize(hand, qpos, prior_mean, precision, robust_scale, weights, work)
         damping = max(damping * 0.1, _LEAST_DAMPING) if better else damping * 10.0
     return cost, steps
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def find_misses(hand: Any, target: Any, qpos: Any, work: Any) -> None:
-    """Place the hand's markers and carry those looked for into the wrist's frame."""
-    place_markers(hand, qpos[7:], work)
+def marker_residuals(
+    hand: HandArrays, target: Float[np.ndarray, "M 3"], qpos: Float[np.ndarray, "27"], work: Workspace
+) -> None:
+    """Forward kinematics, and the residuals of the markers in the wrist's frame.
+
+    Args:
+        hand: The hand and its glove.
+        target: Markers in the world [m]; NaN where missing.
+        qpos: The pose.
+        work: Filled as by `compute_markers`, and `residuals` too.
+    """
+    compute_markers(hand, qpos[7:], work)
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     for marker in range(len(target)):
         a, b, c = (
@@ -79,73 +110,99 @@ def find_misses(hand: Any, target: Any, qpos: Any, work: Any) -> None:
             target[marker, 1] - qpos[1],
             target[marker, 2] - qpos[2],
         )
-        # The inverse turn: v + 2 w (v x u) + 2 (v x u) x u, with u the quaternion's vector.
+        # The inverse rotation: v + 2 w (v x u) + 2 (v x u) x u, with u the quaternion's vector part.
         i, j, k = b * z - c * y, c * x - a * z, a * y - b * x
-        place, miss = work.markers[marker], work.misses[marker]
-        miss[0] = place[0] - a - 2.0 * (w * i + j * z - k * y)
-        miss[1] = place[1] - b - 2.0 * (w * j + k * x - i * z)
-        miss[2] = place[2] - c - 2.0 * (w * k + i * y - j * x)
+        position, residual = work.markers[marker], work.residuals[marker]
+        residual[0] = position[0] - a - 2.0 * (w * i + j * z - k * y)
+        residual[1] = position[1] - b - 2.0 * (w * j + k * x - i * z)
+        residual[2] = position[2] - c - 2.0 * (w * k + i * y - j * x)
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _find_cost(hand: Any, target: Any, qpos: Any, center: Any, pull: Any, tightness: Any, work: Any) -> Any:
-    find_misses(hand, target, qpos, work)
+def _cost(
+    hand: HandArrays,
+    target: Float[np.ndarray, "M 3"],
+    qpos: Float[np.ndarray, "27"],
+    prior_mean: Float[np.ndarray, "27"],
+    precision: Float[np.ndarray, "26"],
+    robust_scale: float,
+    work: Workspace,
+) -> float:
+    """Cost of a pose (squared standard deviations); fills `work` as `marker_residuals` does."""
+    marker_residuals(hand, target, qpos, work)
     cost = 0.0
     for marker in range(len(target)):
-        miss = work.misses[marker]
-        square = miss[0] * miss[0] + miss[1] * miss[1] + miss[2] * miss[2]
+        residual = work.residuals[marker]
+        square = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2]
         if not np.isnan(square):
-            cost += _MARKER_WEIGHT * square / (1.0 + tightness * square)  # Geman and McClure 1987
+            cost += _MARKER_PRECISION * square / (1.0 + robust_scale * square)  # Geman and McClure 1987
     for hinge in range(NUM_JOINTS):
         angle = qpos[7 + hinge]
-        off = angle - center[7 + hinge]
+        deviation = angle - prior_mean[7 + hinge]
         beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
-        cost += pull[hinge] * off * off + _LIMIT_WEIGHT * beyond * beyond
-    if pull[NUM_JOINTS] > 0.0:
-        wrist_offsets(center, qpos, work.step)
+        cost += precision[hinge] * deviation * deviation + _LIMIT_PRECISION * beyond * beyond
+    if precision[NUM_JOINTS] > 0.0:
+        wrist_offsets(prior_mean, qpos, work.step)
         for unknown in range(NUM_JOINTS, NUM_UNKNOWNS):
-            cost += pull[unknown] * work.step[unknown] ** 2
+            cost += precision[unknown] * work.step[unknown] ** 2
     return cost
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _linearize(hand: Any, qpos: Any, center: Any, pull: Any, tightness: Any, weights: Any, work: Any) -> None:
-    """Normal matrix and half the gradient where `find_misses` was last called."""
+def _linearize(
+    hand: HandArrays,
+    qpos: Float[np.ndarray, "27"],
+    prior_mean: Float[np.ndarray, "27"],
+    precision: Float[np.ndarray, "26"],
+    robust_scale: float,
+    weights: Float[np.ndarray, "M"],
+    work: Workspace,
+) -> None:
+    """Normal matrix and half gradient at the pose for which `marker_residuals` was last called.
+
+    The robust loss is taken into account by reweighting; `weights` [1/m^2] is a buffer and is overwritten.
+    """
     for marker in range(len(weights)):
-        miss = work.misses[marker]
-        square = miss[0] * miss[0] + miss[1] * miss[1] + miss[2] * miss[2]
-        weights[marker] = 0.0 if np.isnan(square) else _MARKER_WEIGHT / (1.0 + tightness * square) ** 2
-    gather(hand, weights, work)
+        residual = work.residuals[marker]
+        square = residual[0] * residual[0] + residual[1] * residual[1] + residual[2] * residual[2]
+        weights[marker] = 0.0 if np.isnan(square) else _MARKER_PRECISION / (1.0 + robust_scale * square) ** 2
+    accumulate_normal_equations(hand, weights, work)
     for hinge in range(NUM_JOINTS):
         angle = qpos[7 + hinge]
-        work.gradient[hinge] += pull[hinge] * (angle - center[7 + hinge])
-        work.normal[hinge, hinge] += pull[hinge]
+        work.gradient[hinge] += precision[hinge] * (angle - prior_mean[7 + hinge])
+        work.normal[hinge, hinge] += precision[hinge]
         beyond = max(angle - hand.ranges[hinge, 1], 0.0) + min(angle - hand.ranges[hinge, 0], 0.0)
         if beyond != 0.0:
-            work.gradient[hinge] += _LIMIT_WEIGHT * beyond
-            work.normal[hinge, hinge] += _LIMIT_WEIGHT
-    if pull[NUM_JOINTS] > 0.0:
-        wrist_offsets(center, qpos, work.step)
+            work.gradient[hinge] += _LIMIT_PRECISION * beyond
+            work.normal[hinge, hinge] += _LIMIT_PRECISION
+    if precision[NUM_JOINTS] > 0.0:
+        wrist_offsets(prior_mean, qpos, work.step)
         for unknown in range(NUM_JOINTS, NUM_UNKNOWNS):
-            work.gradient[unknown] += pull[unknown] * work.step[unknown]
-            work.normal[unknown, unknown] += pull[unknown]
+            work.gradient[unknown] += precision[unknown] * work.step[unknown]
+            work.normal[unknown, unknown] += precision[unknown]
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _solve(starts: Any, damping: Any, work: Any) -> Any:
-    """Step down the damped normal equations by a skyline Cholesky factor.
+def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
+    """Solve the damped normal equations by a skyline Cholesky factor; `factor` and `step` are filled.
 
-    Returns by how much the cost should fall; a negative number when there is no factor.
+    Args:
+        skyline: First column of each row, see `HandArrays`.
+        damping: Share of the diagonal that is added to it.
+        work: `normal` and `gradient` are read.
+
+    Returns:
+        The expected decrease of the cost; a negative number when the matrix has no factor.
     """
     factor, step, gain = work.factor, work.step, 0.0
     for row in range(NUM_UNKNOWNS):
-        start, own = starts[row], factor[row]
+        start, own = skyline[row], factor[row]
         rest = -work.gradient[row]
         pivot = work.normal[row, row] * (1.0 + damping)
         for column in range(start, row):
             other = factor[column]
             entry = work.normal[column, row]
-            for k in range(max(start, starts[column]), column):
+            for k in range(max(start, skyline[column]), column):
                 entry -= own[k] * other[k]
             entry *= other[column]
             own[column] = entry
@@ -158,14 +215,22 @@ def _solve(starts: Any, damping: Any, work: Any) -> Any:
         gain += step[row] * step[row]
     for row in range(NUM_UNKNOWNS - 1, -1, -1):
         step[row] *= factor[row, row]
-        for column in range(starts[row], row):
+        for column in range(skyline[row], row):
             step[column] -= factor[row, column] * step[row]
     return gain
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def move_wrist(qpos: Any, step: Any, moved: Any) -> None:
-    """Shift and turn the wrist along its own axes, which are the last six of a step."""
+def move_wrist(
+    qpos: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"], moved: Float[np.ndarray, "27"]
+) -> None:
+    """Translate and rotate the wrist along its own axes by the last six unknowns of a step.
+
+    Args:
+        qpos: The pose before.
+        step: The step [rad, m, rad].
+        moved: The pose after; only its first seven numbers are written.
+    """
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     a, b, c = step[NUM_JOINTS], step[NUM_JOINTS + 1], step[NUM_JOINTS + 2]
     i, j, k = y * c - z * b, z * a - x * c, x * b - y * a
@@ -176,8 +241,17 @@ def move_wrist(qpos: Any, step: Any, moved: Any) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def wrist_offsets(before: Any, now: Any, step: Any) -> None:
-    """How the wrist moved and turned, along its own axes now: the last six of a step; the first stay."""
+def wrist_offsets(
+    before: Float[np.ndarray, "27"], now: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"]
+) -> None:
+    """Translation and rotation of the wrist between two poses, along its axes in the second.
+
+    Args:
+        before: The first pose.
+        now: The second pose.
+        step: Its last six numbers are filled [m, rad]; the rotation is to first order, twice the vector part
+            of the quaternion.
+    """
     w, x, y, z = now[3], now[4], now[5], now[6]
     a, b, c = now[0] - before[0], now[1] - before[1], now[2] - before[2]
     i, j, k = b * z - c * y, c * x - a * z, a * y - b * x

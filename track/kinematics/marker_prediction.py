@@ -1,51 +1,61 @@
-"""Where a pose has its markers and how surely: the covariance that the fit leaves them, compiled.
+"""Predicted positions of a pose's markers and their covariances, from the normal matrix of the fit; compiled.
 
-A marker that is missing may still be nearly pinned down by its neighbors, or free along the arc of one
-hinge; the normal matrix of the fit knows which, together with what is believed of the hinges themselves.
+The neighbors of a missing marker may determine its position nearly, or leave it free along the arc of one
+hinge. The normal matrix of the fit together with the prior of the hinges tells which.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numba
 import numpy as np
 
 from handsim.hand.topology import NUM_JOINTS
-from track.kinematics.levenberg_marquardt import find_misses
-from track.kinematics.marker_kinematics import NUM_UNKNOWNS, gather, place_markers, workspace
+from track.kinematics.levenberg_marquardt import marker_residuals
+from track.kinematics.marker_kinematics import (
+    NUM_UNKNOWNS,
+    HandArrays,
+    Workspace,
+    accumulate_normal_equations,
+    compute_markers,
+    workspace,
+)
 from track.kinematics.small_systems import invert_positive, solve_positive
-from track.kinematics.starting_poses import write_rotation
+from track.kinematics.starting_poses import write_rotation_matrix
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
-_FEWEST_ON_A_DIGIT: Final = 3  # markers that tell its four hinges also when it is straight
-_ARC: Final = 0.04  # [m] radius of the arcs that markers move on
+    from track.kinematics.joint_prior import JointPrior
+
+_FEWEST_ON_DIGIT: Final = 3  # markers that determine the four hinges of a digit, also when it is straight
+_ARC: Final = 0.04  # [m] usual radius of the arcs that markers move on: the length of a finger's bones
+_LEAST_INFORMATION: Final = 1e-9  # share of a marker's precision on the diagonal, so that it has an inverse
 
 
-class Expectation(NamedTuple):
-    """Markers and hinges as a fitted pose has them."""
+class MarkerPrediction(NamedTuple):
+    """Positions of the markers and angles of the hinges at a fitted pose, with their covariances."""
 
     qpos: Float[np.ndarray, "27"]
-    """The pose, digits that lack markers being settled between those and what is believed."""
-    places: Float[np.ndarray, "M 3"]
-    """[m] in the world."""
+    """The pose; hinges of digits that lack markers are moved to the optimum of markers and prior."""
+    positions: Float[np.ndarray, "M 3"]
+    """Markers in the world [m]."""
     covariances: Float[np.ndarray, "M 3 3"]
-    """How far they may be from there [m^2], in the world: what the fit leaves open, and how they tremble."""
-    turns: Float[np.ndarray, "M 3 3"]
-    """Rotations of the bones that carry most of each marker, in the world."""
-    hinges: Float[np.ndarray, "20 20"]
+    """Covariance of each marker in the world [m^2]: that of the pose, and the marker's own variance."""
+    rotations: Float[np.ndarray, "M 3 3"]
+    """Rotation in the world of the bone with the largest weight of each marker."""
+    joint_covariance: Float[np.ndarray, "20 20"]
     """Covariance of the hinges [rad^2]."""
-    told: Float[np.ndarray, "20 20"]
-    """What the markers alone tell of the hinges, the palm being held: an information matrix [1/rad^2]."""
-    pull: Float[np.ndarray, "20"]
-    """Where the markers draw the hinges to: that matrix times the angles at which they would rest [1/rad]."""
+    information_matrix: Float[np.ndarray, "20 20"]
+    """Information of the markers alone on the hinges, the palm being held [1/rad^2]."""
+    information_vector: Float[np.ndarray, "20"]
+    """The matrix times the angles that the markers alone would give [1/rad]."""
 
 
-def expectation(num_markers: int) -> Expectation:
-    """Room for one."""
-    return Expectation(
+def empty_prediction(num_markers: int) -> MarkerPrediction:
+    """A `MarkerPrediction` to be filled."""
+    return MarkerPrediction(
         np.empty(7 + NUM_JOINTS),
         np.empty((num_markers, 3)),
         np.empty((num_markers, 3, 3)),
@@ -57,84 +67,100 @@ def expectation(num_markers: int) -> Expectation:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def expect_markers(
-    hand: Any,
-    on_part: Any,
-    pose: Any,
-    target: Any,
-    belief: Any,
-    wrist_spread: Any,
-    variance: Any,
-    noise: Any,
-    out: Any,
+def predict_markers(
+    hand: HandArrays,
+    on_part: Int[np.ndarray, "6"],
+    pose: Float[np.ndarray, "27"],
+    target: Float[np.ndarray, "M 3"],
+    joint_prior: JointPrior,
+    wrist_spread: tuple[float, float],
+    variance: Float[np.ndarray, "M"],
+    noise: float,
+    out: MarkerPrediction,
 ) -> None:
-    """Fill an `Expectation`.
+    """Fill a `MarkerPrediction`.
 
     Args:
         hand: The hand and its glove.
-        on_part: Markers on each digit, and the palm (6,).
-        pose: The fitted pose (27,).
-        target: The markers it was fitted to (M, 3) [m]; NaN where missing.
-        belief: What was believed of the hinges before that, a `HingeBelief`.
-        wrist_spread: How far the wrist may be from where the pose has it, [m] and [rad].
-        variance: Of each marker around its place on the hand (M,) [m^2].
+        on_part: Markers on each digit, and on the palm (last).
+        pose: The fitted pose.
+        target: The markers it was fitted to [m]; NaN where missing.
+        joint_prior: Distribution of the hinges before the fit.
+        wrist_spread: Standard deviations of the wrist's position [m] and orientation [rad] before the fit.
+        variance: Variance of each marker around its position on the hand [m^2].
         noise: Standard deviation of the markers around the pose's [m].
-        out: What is filled.
+        out: The prediction that is filled.
     """
     count = len(target)
     work, wrist, weights = workspace(count), np.empty((3, 3)), np.zeros(count)
-    write_rotation(pose[3:7], wrist)
+    write_rotation_matrix(pose[3:7], wrist)
     out.qpos[:] = pose
-    find_misses(hand, target, pose, work)
+    marker_residuals(hand, target, pose, work)
     seen = np.zeros(len(on_part), dtype=np.int64)
     for marker in range(count):
-        if not np.isnan(work.misses[marker, 0]):
+        if not np.isnan(work.residuals[marker, 0]):
             weights[marker] = 1.0 / noise**2
             seen[hand.digits[marker]] += 1
-    gather(hand, weights, work)
-    if _settle(hand, seen, on_part, belief, work, out.qpos):
-        find_misses(hand, target, out.qpos, work)
-        gather(hand, weights, work)
+    accumulate_normal_equations(hand, weights, work)
+    if _settle(hand, seen, on_part, joint_prior, work, out.qpos):
+        marker_residuals(hand, target, out.qpos, work)
+        accumulate_normal_equations(hand, weights, work)
     posterior = work.factor
     for row in range(NUM_UNKNOWNS):
         for column in range(row + 1):
             posterior[row, column] = work.normal[column, row]
-        posterior[row, row] += 1e-9 / noise**2
+        posterior[row, row] += _LEAST_INFORMATION / noise**2
         if row >= NUM_JOINTS:
             posterior[row, row] += wrist_spread[(row - NUM_JOINTS) // 3] ** -2.0
     for row in range(NUM_JOINTS):
-        out.pull[row] = -work.gradient[row]
+        out.information_vector[row] = -work.gradient[row]
         for column in range(NUM_JOINTS):
-            out.told[row, column] = posterior[max(row, column), min(row, column)]
-            out.pull[row] += out.told[row, column] * out.qpos[7 + column]
-    posterior[:NUM_JOINTS, :NUM_JOINTS] += belief.precision
+            out.information_matrix[row, column] = posterior[max(row, column), min(row, column)]
+            out.information_vector[row] += out.information_matrix[row, column] * out.qpos[7 + column]
+    posterior[:NUM_JOINTS, :NUM_JOINTS] += joint_prior.precision
     invert_positive(posterior)
-    out.hinges[:] = posterior[:NUM_JOINTS, :NUM_JOINTS]
+    out.joint_covariance[:] = posterior[:NUM_JOINTS, :NUM_JOINTS]
     for marker in range(count):
-        _spread(hand, marker, posterior, wrist, variance[marker], work, out.covariances[marker])
+        _marker_covariance(hand, marker, posterior, wrist, variance[marker], work, out.covariances[marker])
         bone = work.rotations[hand.bones[marker, 0]]
         for i in range(3):
-            out.places[marker, i] = pose[i]
+            out.positions[marker, i] = pose[i]
             for j in range(3):
-                out.places[marker, i] += wrist[i, j] * work.markers[marker, j]
-                out.turns[marker, i, j] = 0.0
+                out.positions[marker, i] += wrist[i, j] * work.markers[marker, j]
+                out.rotations[marker, i, j] = 0.0
                 for k in range(3):
-                    out.turns[marker, i, j] += wrist[i, k] * bone[k, j]
+                    out.rotations[marker, i, j] += wrist[i, k] * bone[k, j]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _spread(
-    hand: Any, marker: Any, posterior: Any, wrist: Any, variance: Any, work: Any, covariance: Any
+def _marker_covariance(
+    hand: HandArrays,
+    marker: int,
+    posterior: Float[np.ndarray, "26 26"],
+    wrist: Float[np.ndarray, "3 3"],
+    variance: float,
+    work: Workspace,
+    covariance: Float[np.ndarray, "3 3"],
 ) -> None:
-    """How far a marker may be from where the pose has it, in the world."""
-    first, last = hand.reach[marker, 0], hand.reach[marker, 1]
+    """Covariance of a marker in the world [m^2], written to `covariance`.
+
+    Args:
+        hand: The hand and its glove.
+        marker: Index of the marker.
+        posterior: Covariance of the unknowns [rad^2, m^2].
+        wrist: Rotation of the wrist in the world.
+        variance: The marker's own variance in each direction [m^2].
+        work: Its `jacobian` is read.
+        covariance: Filled.
+    """
+    first, last = hand.hinge_span[marker, 0], hand.hinge_span[marker, 1]
     count = last - first + 6
-    slopes, turned = work.slopes[marker], np.zeros((3, count))
+    jacobian, in_world = work.jacobian[marker], np.zeros((3, count))
     for number in range(count):
         unknown = first + number if number < last - first else NUM_JOINTS + number - (last - first)
         for i in range(3):
             for j in range(3):
-                turned[i, number] += wrist[i, j] * slopes[j, unknown]
+                in_world[i, number] += wrist[i, j] * jacobian[j, unknown]
     covariance[:] = 0.0
     for one in range(count):
         row = first + one if one < last - first else NUM_JOINTS + one - (last - first)
@@ -143,51 +169,73 @@ def _spread(
             share = posterior[row, column]
             for i in range(3):
                 for j in range(3):
-                    covariance[i, j] += turned[i, one] * share * turned[j, other]
-    # An arc leaves its tangent: open along it means open across it, by the square over twice its radius.
+                    covariance[i, j] += in_world[i, one] * share * in_world[j, other]
+    # A marker moves on an arc, not on its tangent: a variance along the tangent means a deviation
+    # across it, by the square over twice the radius.
     bend = (covariance[0, 0] + covariance[1, 1] + covariance[2, 2]) / (2.0 * _ARC)
     for i in range(3):
         covariance[i, i] += variance + bend**2
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _settle(hand: Any, seen: Any, on_part: Any, belief: Any, work: Any, qpos: Any) -> Any:
-    """Move the hinges of digits that lack markers to where belief and markers balance; whether any did.
+def _settle(
+    hand: HandArrays,
+    seen: Int[np.ndarray, "6"],
+    on_part: Int[np.ndarray, "6"],
+    joint_prior: JointPrior,
+    work: Workspace,
+    qpos: Float[np.ndarray, "27"],
+) -> bool:
+    """Move the hinges of digits that lack markers to the optimum of prior and markers.
 
-    The others' are given: what is seen of one finger tells of the next.
+    The hinges of the other digits are held, and inform those of their neighbors through the prior's
+    covariance.
+
+    Args:
+        hand: The hand and its glove.
+        seen: Markers that are present on each digit, and on the palm (last).
+        on_part: All markers on each of them.
+        joint_prior: Distribution of the hinges before the fit.
+        work: Its `normal` and `gradient` are read.
+        qpos: The fitted pose; its hinges [rad] are overwritten.
+
+    Returns:
+        Whether there are such digits.
     """
     weak = np.zeros(NUM_JOINTS, dtype=np.int64)
     count = 0
     for hinge in range(NUM_JOINTS):
         digit = hinge // 4
-        if seen[digit] < max(on_part[digit], _FEWEST_ON_A_DIGIT):
+        if seen[digit] < max(on_part[digit], _FEWEST_ON_DIGIT):
             weak[count] = hinge
             count += 1
     if count == 0:
         return False
-    matrix, rest = np.empty((count, count)), np.empty(count)
+    matrix, change = np.empty((count, count)), np.empty(count)
     for row in range(count):
         one = weak[row]
-        rest[row] = -work.gradient[one]
+        change[row] = -work.gradient[one]
         for hinge in range(NUM_JOINTS):
-            rest[row] -= belief.precision[one, hinge] * (qpos[7 + hinge] - belief.angles[hinge])
+            change[row] -= joint_prior.precision[one, hinge] * (qpos[7 + hinge] - joint_prior.angles[hinge])
         for column in range(count):
             other = weak[column]
-            told = work.normal[min(one, other), max(one, other)]
-            matrix[row, column] = told + belief.precision[one, other]
-    solve_positive(matrix, rest)
+            information = work.normal[min(one, other), max(one, other)]
+            matrix[row, column] = information + joint_prior.precision[one, other]
+    solve_positive(matrix, change)
     for row in range(count):
         hinge = weak[row]
         low, high = hand.ranges[hinge, 0], hand.ranges[hinge, 1]
-        qpos[7 + hinge] = min(max(qpos[7 + hinge] + rest[row], low), high)
+        qpos[7 + hinge] = min(max(qpos[7 + hinge] + change[row], low), high)
     return True
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def carry_markers(hand: Any, pose: Any, places: Any) -> None:
-    """Places (M, 3) [m] of a pose's markers in the world."""
-    work, wrist = workspace(len(places)), np.empty((3, 3))
-    write_rotation(pose[3:7], wrist)
-    place_markers(hand, pose[7:], work)
-    for marker in range(len(places)):
-        places[marker] = pose[:3] + wrist @ work.markers[marker]
+def world_markers(
+    hand: HandArrays, pose: Float[np.ndarray, "27"], positions: Float[np.ndarray, "M 3"]
+) -> None:
+    """Write the positions of a pose's markers in the world [m] to `positions`."""
+    work, wrist = workspace(len(positions)), np.empty((3, 3))
+    write_rotation_matrix(pose[3:7], wrist)
+    compute_markers(hand, pose[7:], work)
+    for marker in range(len(positions)):
+        positions[marker] = pose[:3] + wrist @ work.markers[marker]

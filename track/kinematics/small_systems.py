@@ -1,18 +1,21 @@
-"""Small positive-definite systems, compiled: a call of LAPACK costs more than solving them does."""
+"""Compiled solvers of small positive-definite systems: a call of LAPACK costs more than their solution."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
 from track.kinematics.marker_kinematics import FAST
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def invert_positive(matrix: Any) -> None:
-    """Overwrite a symmetric positive-definite matrix (N, N) by its inverse; its lower triangle is read."""
+def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
+    """Overwrite a symmetric positive-definite matrix by its inverse; only its lower triangle is read."""
     count = len(matrix)
     for row in range(count):
         for column in range(row + 1):
@@ -38,14 +41,18 @@ def invert_positive(matrix: Any) -> None:
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def eliminate(matrix: Any, rest: Any, first: Any, last: Any) -> None:
-    """Eliminate unknowns of a symmetric positive system, of which all below is kept whole (Schur complement).
+def eliminate(
+    matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
+) -> None:
+    """Eliminate unknowns of a symmetric positive-definite system (Schur complement).
+
+    The block below and right of the eliminated unknowns stays symmetric and complete.
 
     Args:
-        matrix: The system (N, N), overwritten.
-        rest: Its right side (N,), overwritten.
+        matrix: The matrix, overwritten.
+        right_side: The right side, overwritten.
         first: The first unknown that is eliminated from those after it.
-        last: The first that is not.
+        last: The first unknown that is not eliminated.
     """
     for pivot in range(first, last):
         scale = 1.0 / matrix[pivot, pivot]
@@ -54,15 +61,15 @@ def eliminate(matrix: Any, rest: Any, first: Any, last: Any) -> None:
             if share != 0.0:
                 for column in range(pivot + 1, len(matrix)):
                     matrix[row, column] -= share * matrix[pivot, column]
-                rest[row] -= share * rest[pivot]
+                right_side[row] -= share * right_side[pivot]
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def solve_positive(matrix: Any, rest: Any) -> None:
-    """Solve a symmetric positive system (N, N), overwritten, in place of its right side (N,)."""
+def solve_positive(matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"]) -> None:
+    """Solve a symmetric positive-definite system; both are overwritten, the right side by the solution."""
     count = len(matrix)
-    eliminate(matrix, rest, 0, count)
+    eliminate(matrix, right_side, 0, count)
     for row in range(count - 1, -1, -1):
         for column in range(row + 1, count):
-            rest[row] -= matrix[row, column] * rest[column]
-        rest[row] /= matrix[row, row]
+            right_side[row] -= matrix[row, column] * right_side[column]
+        right_side[row] /= matrix[row, row]

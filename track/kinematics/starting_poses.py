@@ -1,8 +1,8 @@
-"""Where a fit begins when no earlier pose is known: a hand put together from a few shapes, digit by digit."""
+"""Initial poses of a fit without an earlier pose: a hand put together from a few shapes, digit by digit."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numba
 import numpy as np
@@ -12,9 +12,10 @@ from handsim.hand.model import join_qpos
 from handsim.hand.topology import NUM_QPOS
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
+"""Hinge angles of a relaxed hand [rad]."""
 # Six ways to hold a digit [deg], in the order of its hinges: relaxed, straight, half closed, bent in the
 # knuckle alone, bent in all others, closed; for the thumb relaxed, away from the palm, beside the index
 # finger, opposed, opposed and bent, across the palm.
@@ -34,17 +35,19 @@ _THUMB: Final = (
     (20, 25, 45, 60),
     (-20, 35, 50, 40),
 )
-_ROUNDS: Final = 3
-_STEADY: Final = 0.005  # [m]
+_ROUNDS: Final = 3  # of choosing digits and aligning again; the choice is settled after these
+_STEADY: Final = 0.005  # [m] spread of a marker that is the same in all shapes: bounds its weight
 
 
 class StartingShapes(NamedTuple):
-    """Hand shapes with the wrist at the origin, and where they have their markers."""
+    """K hand shapes with the wrist at the origin, and the positions of their markers."""
 
     angles: Float[np.ndarray, "K 20"]
+    """Hinge angles [rad]."""
     markers: Float[np.ndarray, "K M 3"]
-    steadiness: Float[np.ndarray, "M"]
-    """How much each marker counts where a whole hand is laid: little if it differs between the shapes."""
+    """Markers in the wrist's frame [m]."""
+    weights: Float[np.ndarray, "M"]
+    """Weight of each marker where a whole hand is aligned [1/m^2]: small if it differs between the shapes."""
 
 
 def starting_shapes(fit: GloveFit) -> StartingShapes:
@@ -55,37 +58,58 @@ def starting_shapes(fit: GloveFit) -> StartingShapes:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def lay_shapes(shapes: Any, digits: Any, target: Any) -> Any:
-    """Poses to start from (K + 1, 27) for one frame's markers (M, 3), the most likely one first.
+def initial_poses(
+    shapes: StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
+) -> Float[np.ndarray, "S 27"]:
+    """Poses to start from (K + 1, 27) for the markers of one frame, the most likely one first.
 
-    The first takes every digit from the shape that has it nearest; the others are whole shapes, those first
-    that can be laid on the markers best.
+    The first takes every digit from the shape that has it nearest; the others are whole shapes, the best
+    aligned with the markers first.
+
+    Args:
+        shapes: The shapes.
+        digits: Digit of each marker, -1 for the palm.
+        target: Markers in the world [m]; NaN where missing.
     """
     count = len(shapes.angles)
-    laid, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))
+    aligned, poses = np.empty((count, NUM_QPOS)), np.empty((count + 1, NUM_QPOS))
     squares = np.empty(count)
     for number in range(count):
-        laid[number, 7:] = shapes.angles[number]
-        squares[number] = lay_rigidly(shapes.markers[number], target, shapes.steadiness, laid[number])
+        aligned[number, 7:] = shapes.angles[number]
+        squares[number] = align_rigid(shapes.markers[number], target, shapes.weights, aligned[number])
     for number in range(count):
         better = 0
         for other in range(count):
             if squares[other] < squares[number] or (squares[other] == squares[number] and other < number):
                 better += 1
-        poses[1 + better] = laid[number]
+        poses[1 + better] = aligned[number]
     markers = np.empty_like(target)
     poses[0] = poses[1]
     for _ in range(_ROUNDS):
         _choose_digits(shapes, digits, target, poses[0], markers)
-        lay_rigidly(markers, target, shapes.steadiness, poses[0])
+        align_rigid(markers, target, shapes.weights, poses[0])
     return poses
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _choose_digits(shapes: Any, digits: Any, target: Any, pose: Any, markers: Any) -> None:
-    """Take each digit from the shape whose markers are nearest, the wrist held."""
-    turn = np.empty((3, 3))
-    write_rotation(pose[3:7], turn)
+def _choose_digits(
+    shapes: StartingShapes,
+    digits: Int[np.ndarray, "M"],
+    target: Float[np.ndarray, "M 3"],
+    pose: Float[np.ndarray, "27"],
+    markers: Float[np.ndarray, "M 3"],
+) -> None:
+    """Take each digit from the shape whose markers are nearest, the wrist held.
+
+    Args:
+        shapes: The shapes.
+        digits: Digit of each marker, -1 for the palm.
+        target: Markers in the world [m]; NaN where missing.
+        pose: Its wrist is read, its hinge angles are overwritten.
+        markers: Markers of the result in the wrist's frame [m], filled.
+    """
+    rotation = np.empty((3, 3))
+    write_rotation_matrix(pose[3:7], rotation)
     squares = np.zeros((5, len(shapes.angles)))
     for marker in range(len(target)):
         if digits[marker] < 0 or np.isnan(target[marker, 0]):
@@ -93,7 +117,7 @@ def _choose_digits(shapes: Any, digits: Any, target: Any, pose: Any, markers: An
         for i in range(3):
             local = 0.0
             for j in range(3):
-                local += turn[j, i] * (target[marker, j] - pose[j])
+                local += rotation[j, i] * (target[marker, j] - pose[j])
             for number in range(len(shapes.angles)):
                 squares[digits[marker], number] += (shapes.markers[number, marker, i] - local) ** 2
     for digit in range(5):
@@ -108,10 +132,25 @@ def _choose_digits(shapes: Any, digits: Any, target: Any, pose: Any, markers: An
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def lay_rigidly(source: Any, target: Any, weights: Any, pose: Any) -> Any:
-    """Position and orientation that bring points nearest to those there, and the weighted squares left.
+def align_rigid(
+    source: Float[np.ndarray, "N 3"],
+    target: Float[np.ndarray, "N 3"],
+    weights: Float[np.ndarray, "N"],
+    pose: Float[np.ndarray, "7"],
+) -> float:
+    """Rigid transform with the least weighted squared distances between two point sets.
 
     Horn, Closed-form solution of absolute orientation using unit quaternions (1987).
+
+    Args:
+        source: Points in the body's frame [m].
+        target: The same points in the world [m]; NaN where missing.
+        weights: Weight of each pair.
+        pose: Position [m] and orientation (wxyz) of the body in the world; the first seven numbers
+            are filled.
+
+    Returns:
+        The weighted sum of squared distances that is left.
     """
     total, size = 0.0, 0.0
     centers, products = np.zeros((2, 3)), np.zeros((3, 3))
@@ -139,20 +178,32 @@ def lay_rigidly(source: Any, target: Any, weights: Any, pose: Any) -> Any:
         ]
     )
     values, vectors = np.linalg.eigh(form)
-    turn = np.empty((3, 3))
+    rotation = np.empty((3, 3))
     pose[3:7] = vectors[:, 3]
-    write_rotation(pose[3:7], turn)
+    write_rotation_matrix(pose[3:7], rotation)
     for i in range(3):
         pose[i] = centers[1, i]
         for j in range(3):
-            pose[i] -= turn[i, j] * centers[0, j]
-    return size - 2.0 * values[3]
+            pose[i] -= rotation[i, j] * centers[0, j]
+    return size - 2.0 * values[3]  # type: ignore[no-any-return]
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def write_rotation(quaternion: Any, turn: Any) -> None:
-    """The matrix of a unit quaternion."""
+def write_rotation_matrix(quaternion: Float[np.ndarray, "4"], rotation: Float[np.ndarray, "3 3"]) -> None:
+    """Write the matrix of a unit quaternion (wxyz) to `rotation`."""
     w, x, y, z = quaternion
-    turn[0, 0], turn[0, 1], turn[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    turn[1, 0], turn[1, 1], turn[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    turn[2, 0], turn[2, 1], turn[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    rotation[1, 0], rotation[1, 1], rotation[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    rotation[2, 0], rotation[2, 1], rotation[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )

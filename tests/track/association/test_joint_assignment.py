@@ -9,16 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from track.association.digit_hypotheses import NEVER
-from track.association.joint_assignment import combine
+from track.association.digit_hypotheses import IMPOSSIBLE
+from track.association.joint_assignment import best_combination
 
 
 @st.composite
 def tables(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Scores, sets, counts and bans of up to five digits that reach for up to ten points."""
+    """Scores, sets, counts and bans of up to five digits with up to ten candidate points."""
     digits, points = draw(st.integers(1, 5)), draw(st.integers(1, 10))
     counts = np.array(draw(st.lists(st.integers(1, 6), min_size=digits, max_size=digits)))
-    scores, sets = np.full((digits, counts.max()), -NEVER), np.zeros((digits, counts.max()), dtype=np.int64)
+    scores, sets = (
+        np.full((digits, counts.max()), -IMPOSSIBLE),
+        np.zeros((digits, counts.max()), dtype=np.int64),
+    )
     for digit, count in enumerate(counts.tolist()):
         row = draw(st.lists(st.integers(-20, 40), min_size=count, max_size=count))
         scores[digit, :count] = sorted(row, reverse=True)
@@ -45,9 +48,9 @@ def best_of_all(scores: np.ndarray, sets: np.ndarray, counts: np.ndarray, banned
 def test_no_other_choice_is_better(table):
     scores, sets, counts, banned = table
     best = np.full(len(counts), -7)
-    total, wanted = combine(scores, sets, counts, banned, best), best_of_all(*table)
+    total, wanted = best_combination(scores, sets, counts, banned, best), best_of_all(*table)
     if wanted is None:
-        assert total <= -NEVER / 2
+        assert total <= -IMPOSSIBLE / 2
         return
     assert total == pytest.approx(wanted)
     chosen = np.arange(len(counts)), best
@@ -59,14 +62,14 @@ def test_no_other_choice_is_better(table):
 def test_without_a_conflict_everybody_has_the_best():
     scores, sets = np.tile([9.0, 5.0, 0.0], (5, 1)), np.array([[1 << k, 1 << k, 0] for k in range(5)])
     best = np.zeros(5, dtype=np.int64)
-    assert combine(scores, sets, np.full(5, 3), np.full(5, -1), best) == 45.0
+    assert best_combination(scores, sets, np.full(5, 3), np.full(5, -1), best) == 45.0
     assert best.tolist() == [0] * 5
 
 
 def test_a_point_goes_to_whom_it_is_worth_more():
     scores, sets = np.array([[9.0, 8.0, 0.0], [9.0, 1.0, 0.0]]), np.array([[1, 2, 0], [1, 4, 0]])
     best = np.zeros(2, dtype=np.int64)
-    assert combine(scores, sets, np.array([3, 3]), np.array([-1, -1]), best) == 17.0
+    assert best_combination(scores, sets, np.array([3, 3]), np.array([-1, -1]), best) == 17.0
     assert best.tolist() == [1, 0]
-    assert combine(scores, sets, np.array([3, 3]), np.array([-1, 0]), best) == 10.0
+    assert best_combination(scores, sets, np.array([3, 3]), np.array([-1, 0]), best) == 10.0
     assert best.tolist() == [0, 1]

@@ -19,7 +19,7 @@ from handsim.kernels.integration import move
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.motion.motions import sample_motion
 from poses.shapes.validity import resting_angles, sample_valid_angles
-from track.kinematics.pose_solver import PoseSolver, Prediction, solve_poses
+from track.kinematics.pose_solver import AnglePrior, PoseSolver, solve_pose
 
 INDEX = slice(11, 15)  # of qpos
 
@@ -112,7 +112,7 @@ def test_missing_markers_are_done_without(rng):
     for row in markers:
         row[rng.choice(16, size=2, replace=False)] = np.nan
     given_markers = markers.copy()
-    fit = solve_poses(GloveFit(model, glove), markers)
+    fit = solve_pose(GloveFit(model, glove), markers)
     np.testing.assert_array_equal(markers, given_markers)
     assert np.percentile(fit.rms, 95) < 0.0005
     missing = np.isnan(markers).any(axis=-1)
@@ -140,7 +140,7 @@ def test_noise_stays_noise(rng):
     model, glove = gloved("right", rng)
     qpos = random_poses(model, 50, rng)
     markers = markers_of(model, glove, qpos)
-    fit = solve_poses(GloveFit(model, glove), markers + rng.uniform(-0.003, 0.003, markers.shape))
+    fit = solve_pose(GloveFit(model, glove), markers + rng.uniform(-0.003, 0.003, markers.shape))
     # 57 coordinates of 1.73 mm standard deviation, less what 26 freedoms take of it.
     assert 0.0018 < np.median(fit.rms) < 0.0026
 
@@ -153,7 +153,7 @@ def test_a_hidden_digit_stays_where_it_is_thought_to_be(rng):
     near = move(qpos, 0.01 * rng.standard_normal((20, 26)))
     thought = qpos[:, 7:] + 0.02 * rng.standard_normal((20, 20))
     solver = PoseSolver(GloveFit(model, glove))
-    fit = solver.solve(markers, near, prediction=Prediction(thought, 0.1))
+    fit = solver.solve(markers, near, prior=AnglePrior(thought, 0.1))
     apart = np.rad2deg(np.abs(fit.qpos[:, INDEX] - thought[:, 4:8]))
     assert apart.max() < 1.0  # what rest pulls, 90 degrees of spread against 0.1 rad
     others = np.r_[7:11, 15:27]
@@ -168,8 +168,8 @@ def test_a_prediction_is_not_heard_where_all_markers_are(rng):
     qpos = random_poses(model, 5, rng)
     markers = markers_of(model, glove, qpos)
     solver = PoseSolver(GloveFit(model, glove))
-    told = solver.solve(markers, qpos, prediction=Prediction(np.zeros(20), 1e-3))
-    np.testing.assert_array_equal(told.qpos, solver.solve(markers, qpos).qpos)
+    informed = solver.solve(markers, qpos, prior=AnglePrior(np.zeros(20), 1e-3))
+    np.testing.assert_array_equal(informed.qpos, solver.solve(markers, qpos).qpos)
 
 
 def test_a_sparse_glove_is_steadied_by_a_prediction(rng):
@@ -177,9 +177,11 @@ def test_a_sparse_glove_is_steadied_by_a_prediction(rng):
     qpos = random_poses(model, 30, rng)
     markers = markers_of(model, glove, qpos) + rng.normal(scale=0.0005, size=(30, 13, 3))
     solver = PoseSolver(GloveFit(model, glove))
-    told = solver.solve(markers, qpos, prediction=Prediction(qpos[:, 7:], np.full(20, 0.05)))
-    error, told_error = (np.abs(fit.qpos - qpos)[:, 7:].mean() for fit in (solver.solve(markers, qpos), told))
-    assert told_error < 0.5 * error
+    informed = solver.solve(markers, qpos, prior=AnglePrior(qpos[:, 7:], np.full(20, 0.05)))
+    error, informed_error = (
+        np.abs(fit.qpos - qpos)[:, 7:].mean() for fit in (solver.solve(markers, qpos), informed)
+    )
+    assert informed_error < 0.5 * error
 
 
 def test_frames_and_starts_know_nothing_of_each_other(rng):
@@ -219,11 +221,11 @@ def test_limits_are_kept(rng):
     qpos = random_poses(model, 10, rng)
     markers = markers_of(model, glove, qpos) + rng.normal(scale=0.004, size=(10, 19, 3))
     markers[:, [3, 6, 9]] = np.nan
-    fit = solve_poses(GloveFit(model, glove), markers)
+    fit = solve_pose(GloveFit(model, glove), markers)
     assert np.rad2deg(np.maximum(fit.qpos[:, 7:] - high, low - fit.qpos[:, 7:])).max() < 6.0
     beyond = qpos.copy()
     beyond[:, 13] = high[6] + 0.5  # asked of the index finger by markers alone
-    fit = solve_poses(GloveFit(model, glove), markers_of(model, glove, beyond), initial=beyond)
+    fit = solve_pose(GloveFit(model, glove), markers_of(model, glove, beyond), initial=beyond)
     assert (fit.qpos[:, 13] < high[6] + 0.4).all()
 
 
@@ -250,7 +252,7 @@ def test_a_robust_fit_does_not_mind_swapped_labels(rng):
 
 def test_no_frames_are_no_poses(rng):
     model, glove = gloved("right", rng)
-    fit = solve_poses(GloveFit(model, glove), np.zeros((0, 19, 3)))
+    fit = solve_pose(GloveFit(model, glove), np.zeros((0, 19, 3)))
     assert fit.qpos.shape == (0, 27)
     assert fit.rms.shape == fit.iterations.shape == (0,)
     assert fit.residuals.shape == (0, 19, 3)
@@ -259,11 +261,11 @@ def test_no_frames_are_no_poses(rng):
 def test_bad_targets_are_told(rng):
     model, glove = gloved("right", rng)
     with pytest.raises(ArgumentError, match=r"targets have shape \(2, 13, 3\), expected \(T, 19, 3\)"):
-        solve_poses(GloveFit(model, glove), np.zeros((2, 13, 3)))
+        solve_pose(GloveFit(model, glove), np.zeros((2, 13, 3)))
     few = np.full((2, 19, 3), np.nan)
     few[0], few[1, :3] = glove.points, 0.1
     with pytest.raises(ArgumentError, match="frame 1 has 3 markers, expected at least 4"):
-        solve_poses(GloveFit(model, glove), few)
+        solve_pose(GloveFit(model, glove), few)
 
 
 def test_bad_starts_predictions_and_distances_are_told(rng):
@@ -281,9 +283,9 @@ def test_bad_starts_predictions_and_distances_are_told(rng):
         solver.solve(targets, np.zeros((1, 26)))
     with pytest.raises(ArgumentError, match="initial has a quaternion of length zero in frame 0"):
         solver.solve(targets, np.zeros((1, 27)))
-    with pytest.raises(ArgumentError, match=r"prediction\.spread is 0 rad, expected positive"):
-        solver.solve(targets, flat, prediction=Prediction(np.zeros(20), 0.0))
-    with pytest.raises(ArgumentError, match=r"prediction has angles of shape \(3, 20\)"):
-        solver.solve(targets, flat, prediction=Prediction(np.zeros((3, 20)), 0.1))
+    with pytest.raises(ArgumentError, match=r"prior\.spread is 0 rad, expected positive"):
+        solver.solve(targets, flat, prior=AnglePrior(np.zeros(20), 0.0))
+    with pytest.raises(ArgumentError, match=r"prior has angles of shape \(3, 20\)"):
+        solver.solve(targets, flat, prior=AnglePrior(np.zeros((3, 20)), 0.1))
     with pytest.raises(ArgumentError, match="outlier_distance is -1 m, expected a positive distance"):
         PoseSolver(GloveFit(model, glove), outlier_distance=-1.0)

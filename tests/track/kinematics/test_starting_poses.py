@@ -10,7 +10,7 @@ from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import quaternion_matrix, random_quaternions, rigid_fit
 from track.kinematics.marker_kinematics import hand_arrays
-from track.kinematics.starting_poses import lay_rigidly, lay_shapes, starting_shapes
+from track.kinematics.starting_poses import align_rigid, initial_poses, starting_shapes
 
 
 def test_rigid_fits_are_the_best_ones(rng):
@@ -18,7 +18,7 @@ def test_rigid_fits_are_the_best_ones(rng):
         source, target = rng.normal(size=(2, 19, 3))
         target[rng.choice(19, size=5, replace=False)] = np.nan
         weights, pose = rng.integers(1, 4, size=19).astype(float), np.zeros(27)
-        squares = lay_rigidly(source, target, weights, pose)
+        squares = align_rigid(source, target, weights, pose)
         there = np.repeat(
             np.arange(19), weights.astype(int) * np.isfinite(target[:, 0])
         )  # weights by counting
@@ -41,7 +41,7 @@ def test_every_digit_is_taken_from_the_nearest_shape(rng):
         angles = shapes.angles[chosen, np.arange(20)]
         qpos = join_qpos(angles[None], position=rng.normal(size=3), quaternion=random_quaternions(1, rng=rng))
         target = glove.centers(model, model.forward_kinematics(qpos))[0]
-        poses = lay_shapes(shapes, digits, target)
+        poses = initial_poses(shapes, digits, target)
         np.testing.assert_allclose(poses[0, 7:], angles)
         np.testing.assert_allclose(
             poses[0, :3], qpos[0, :3], atol=0.003
