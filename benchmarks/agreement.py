@@ -25,7 +25,7 @@ from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.validity import sample_valid_angles
 from train.simulation.synthesis import sample_hands
 
-CHECKED = 20  # frames a hand that MuJoCo repeats
+CHECKED = 20  # frames per hand that MuJoCo repeats
 
 
 def blocked_rays(

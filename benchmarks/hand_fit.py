@@ -1,11 +1,11 @@
-"""How well the hand model fits real people: one shape and one marker placement a person, one pose a frame.
+"""Fit of the hand model to real people: one shape and one marker placement per person, one pose per frame.
 
     python benchmarks/hand_fit.py CAPTURES [--frames 400 --held-out 400 --seed 0]
 
 CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (right hands, *_right.trc). Shape
 (bone lengths, knuckles, directions of digits) and marker places are fitted together with the poses of some
 frames by Gauss-Newton with the poses eliminated; then other frames are fitted with shape and places held.
-Priors keep the shape near the mean hand. Residuals are told by marker, hinges by how often they leave their
+Priors keep the shape near the mean hand. Residuals are listed by marker, joints by how often they leave their
 range.
 """
 
@@ -106,7 +106,7 @@ def fit_person(markers: np.ndarray, layout: MarkerLayout) -> tuple[Person, np.nd
 
 
 def tell(name: str, person: Person, parameters: np.ndarray, fit: PoseFit) -> None:
-    """Print one person's residuals, worst markers, and hinges out of range."""
+    """Print one person's residuals, worst markers, and joints out of range."""
     rms = 1e3 * fit.rms
     print(f"{name}: {len(rms)} held-out frames, 3D RMS median {np.median(rms):.2f} mm, "
           f"p95 {np.percentile(rms, 95):.2f} mm, worst {rms.max():.2f} mm")  # fmt: skip

@@ -5,7 +5,7 @@
 CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (such as the public
 Mocap_SIG18_Data); only right hands, named *_right.trc, are used. Sampled poses of the mean hand are scaled to
 each person's mean BackHand1-IndexMCP distance, aligned rigidly (Kabsch) and compared by the 3D RMS over the
-19 markers. Candidates come from the nearest pair-distance vectors, 200 a frame; more change nothing.
+19 markers. Candidates come from the nearest pair-distance vectors, 200 per frame; more change nothing.
 """
 
 from __future__ import annotations

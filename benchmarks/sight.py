@@ -121,7 +121,7 @@ def rigs(poses: int, rng: np.random.Generator) -> None:
 
 
 def cost(job: Callable[[], object]) -> float:
-    """Processor time [us] a frame of a job over CHUNK frames, median of nine."""
+    """Processor time [us] per frame of a job over CHUNK frames, median of nine."""
     job()
     times = []
     for _ in range(9):
@@ -168,7 +168,7 @@ def speeds(rng: np.random.Generator) -> None:
     body = cost(lambda: clear_of_body(tree, poses, markers, cameras, wanted))
     whole = bones + skinning + refit + rays
     print(f"\ntwo hands, {markers.shape[1]} markers, {len(cameras)} cameras, two skins of "
-          f"{len(tree.vertices):,} vertices, {len(tree.faces):,} triangles, us a frame")  # fmt: skip
+          f"{len(tree.vertices):,} vertices, {len(tree.faces):,} triangles, us per frame")  # fmt: skip
     print(f"  bones {bones:.0f}, skinning {skinning:.0f}, refit {refit:.0f}, rays {rays:.0f} "
           f"({count:.0f} lines, each past two skins: {rays / count * 1e3:.0f} ns): {whole:.0f}")  # fmt: skip
     print(f"  {1e6 / whole:,.0f} frames/s; floor without a single line {1e6 / (whole - rays):,.0f} frames/s")

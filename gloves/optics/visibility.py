@@ -99,21 +99,21 @@ def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
     free = np.ones((frames, count, len(cameras)), dtype=np.bool_)
     capsules = len(radii)
     centers, reach = np.empty((capsules, 3)), np.empty(capsules)
-    way, gap, margin = np.empty((3, capsules)), np.empty(capsules), np.empty(capsules)
+    offset, gap, margin = np.empty((3, capsules)), np.empty(capsules), np.empty(capsules)
     for t in range(frames):
         bounding_spheres(segments[t], radii, centers, reach)
         for m in range(count):
             marker = markers[t, m]
             for k in range(capsules):
                 for i in range(3):
-                    way[i, k] = centers[k, i] - marker[i]
-                gap[k] = way[0, k] ** 2 + way[1, k] ** 2 + way[2, k] ** 2 - reach[k] ** 2
+                    offset[i, k] = centers[k, i] - marker[i]
+                gap[k] = offset[0, k] ** 2 + offset[1, k] ** 2 + offset[2, k] ** 2 - reach[k] ** 2
             for c in range(len(cameras)):
                 dx, dy, dz = (cameras[c, 0] - marker[0], cameras[c, 1] - marker[1], cameras[c, 2] - marker[2])
                 squared = dx * dx + dy * dy + dz * dz
                 inverse = 1.0 / squared
                 for k in range(capsules):  # a capsule whose bounding sphere the ray misses cannot be met
-                    along = way[0, k] * dx + way[1, k] * dy + way[2, k] * dz
+                    along = offset[0, k] * dx + offset[1, k] * dy + offset[2, k] * dz
                     share = min(1.0, max(0.0, along * inverse))
                     margin[k] = gap[k] - share * (2.0 * along - share * squared)
                 for k in range(capsules):

@@ -49,7 +49,7 @@ class RigidObject:
     """Convex pieces that fingers touch."""
     marker_names: tuple[str, ...]
     markers: Float[np.ndarray, "Q 3"]
-    """Centers of its own retro-reflective markers [m]; none for most things."""
+    """Centers of its own retro-reflective markers [m]; none for most objects."""
     marker_normals: Float[np.ndarray, "Q 3"]
     """Outward unit normals of the surface under them."""
     mass: float

@@ -19,7 +19,7 @@ _CAMERA_KEYS: Final = ("position", "target", "T_world_camera")
 
 
 class RigTable(NamedTuple):
-    """A rig as written in its file; `CameraRig` checks whether cameras can stand like that."""
+    """A rig as written in its file; `CameraRig` checks whether it can be set up."""
 
     name: str
     field_of_view: float

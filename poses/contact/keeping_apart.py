@@ -57,7 +57,7 @@ def point_pen(
 def keep_apart(
     holder: HandModel,
     other: HandModel,
-    thing: RigidObject,
+    obj: RigidObject,
     held: tuple[HandMotion, BodyMotion],
     other_motion: HandMotion,
     direction: Float[np.ndarray, "T 3"],
@@ -67,7 +67,7 @@ def keep_apart(
     Args:
         holder: The hand with the object.
         other: The hand to stay clear of.
-        thing: The object.
+        obj: The object.
         held: Motion of hand and object before they are drawn back.
         other_motion: Motion of the other hand.
         direction: Unit directions to draw back in.
@@ -86,7 +86,7 @@ def keep_apart(
                 holder.capsules, holder.forward_kinematics(qpos),
                 other.capsules, other.forward_kinematics(other_motion.qpos),
             ),
-            object_penetration(other, thing, other_motion.qpos, poses),
+            object_penetration(other, obj, other_motion.qpos, poses),
         )  # fmt: skip
         if deep.max() <= MAX_PENETRATION:
             return HandMotion(qpos, motion.rate), BodyMotion(poses, motion.rate)

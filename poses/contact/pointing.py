@@ -37,7 +37,7 @@ class PointingConfig:
     """Distance that the tip draws back between two targets [m]."""
     stay: tuple[float, float] = (0.15, 0.6)
     """Shortest and longest time at a target [s]."""
-    way: tuple[float, float] = (0.4, 0.9)
+    path: tuple[float, float] = (0.4, 0.9)
     """Shortest and longest time from target to target [s]."""
     tilt: float = 0.6
     """Lean of the pen from the outward direction, standard deviation of the tangent."""
@@ -51,7 +51,7 @@ class PointingConfig:
             check_number(name, getattr(self, name), 0.0, above=True)
         for name in ("retreat", "tilt"):
             check_number(name, getattr(self, name), 0.0)
-        for name in ("distance", "stay", "way"):
+        for name in ("distance", "stay", "path"):
             check_span(name, getattr(self, name))
 
 
@@ -123,7 +123,7 @@ def _plan(
         next_axis = _axes(outward[frame, following], next_lean)
         turn = float(np.arccos(np.clip(axis @ next_axis, -1.0, 1.0)))
         seconds = max(
-            rng.uniform(*config.way),
+            rng.uniform(*config.path),
             PEAK_SPEED * float(np.linalg.norm(here[following] - here[target])) / config.speed,
             PEAK_SPEED * turn / config.turning,
         )

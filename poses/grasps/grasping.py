@@ -96,9 +96,9 @@ def try_hold(scene: GraspScene, style: HoldStyle, *, rng: np.random.Generator) -
         return "it slips"
     angles, pose = np.clip(data.qpos[:NUM_JOINTS], LOW, HIGH), scene.object_pose(data)
     if not is_valid(scene.hand, angles[None])[0]:
-        return "the fingers dig into each other"
+        return "the fingers penetrate each other"
     if scene.depth(angles[None], pose[None])[0] > _DEEPEST:
-        return "the fingers dig into it"
+        return "the fingers penetrate it"
     contacts = _contacts(scene, angles, pose)
     why = why_not_held(style, set(contacts))
     if why:

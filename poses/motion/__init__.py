@@ -1,7 +1,7 @@
 """Motions of one hand.
 
 - minimum_jerk: profile, limits of speed, straight paths
-- rest_paths: paths to rest around what is in the way
+- rest_paths: valid paths from a pose to rest
 - wrist_paths: paths of the wrist
 - motions: random motion, and motion through given poses
 - scripts: spelling, counting, touching, typing

@@ -82,15 +82,15 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
     indices = [int(np.flatnonzero(capsules.bones == bone)[0]) for bone in bones]
     segments, radii = capsules.posed(frames)[:, indices], capsules.radii[indices]
     ends = _nearest_points(segments)
-    way = ends[:, 1] - ends[:, 0]
-    distance = np.linalg.norm(way, axis=1)
-    way /= distance[:, None]
+    direction = ends[:, 1] - ends[:, 0]
+    distance = np.linalg.norm(direction, axis=1)
+    direction /= distance[:, None]
     points, facing = [], []
     for number, sign in enumerate((1.0, -1.0)):
         frame = frames[:, bones[number]]
-        surface = ends[:, number] + sign * radii[number] * way - frame[:, :3, 3]
+        surface = ends[:, number] + sign * radii[number] * direction - frame[:, :3, 3]
         points.append(np.einsum("tji,tj->ti", frame[:, :3, :3], surface))
-        facing.append(-sign * (frame[:, :3, 2] * way).sum(axis=1))
+        facing.append(-sign * (frame[:, :3, 2] * direction).sum(axis=1))
     return ThumbContact(finger, radii.sum() - distance, points[0], points[1], np.stack(facing, axis=1))
 
 

@@ -88,7 +88,7 @@ def test_whatever_it_points_at_the_pen_never_jumps(seed):
     square = path[:, :3, :3] @ np.swapaxes(path[:, :3, :3], 1, 2)
     np.testing.assert_allclose(square, np.tile(np.eye(3), (FRAMES, 1, 1)), atol=1e-9)
     assert (np.linalg.det(path[:, :3, :3]) > 0.0).all()
-    lifting = 2.6 * config.retreat / config.way[0] * 1.875
+    lifting = 2.6 * config.retreat / config.path[0] * 1.875
     assert speeds(path[:, :3, 3]).max() < config.speed + lifting + 0.1
     assert turns(path).max() < 2.0 * config.turning
 
