@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 from gloves.attachment import Attachment, attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
@@ -184,7 +184,7 @@ def somebody(rng: np.random.Generator, number: int) -> HandModel:
         model = HandModel(sample_shape(side=SIDES[number % 2], rng=rng))
         try:
             resting_angles(model)
-        except ArgumentError:
+        except PoseError:
             continue
         return model
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES, Side
@@ -97,7 +97,7 @@ def pose_somebody(name: str, side: Side, rng: np.random.Generator) -> tuple[Hand
         angles = np.clip(gesture(name) + np.deg2rad(rng.normal(0.0, 3.0, 20)), low, high)
         try:
             return model, join_qpos(make_valid(model, angles[None]))[0]
-        except ArgumentError:  # fingers too thick for so narrow a palm
+        except PoseError:  # fingers too thick for so narrow a palm
             continue
 
 

@@ -18,6 +18,10 @@ class ArgumentError(HandSimError):
     """A hand, a pose or an array that is not what it should be."""
 
 
+class PoseError(HandSimError):
+    """A pose, grasp, touch or path that a hand cannot reach."""
+
+
 class LayoutError(HandSimError):
     """A marker layout that cannot be worn."""
 

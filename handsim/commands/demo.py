@@ -105,13 +105,15 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
 
 def _run_chain(folder: Path, seed: int, num_frames: int, status: Any) -> _Chain:
     labeler = load("train.labelers.storage:load_labeler")(GLOVE)  # before the work, should it be missing
-    config = load("train.simulation.synthesis:DatasetConfig")(glove=GLOVE, num_frames=num_frames, seed=seed)
+    config = load("train.simulation.dataset_config:DatasetConfig")(
+        glove=GLOVE, num_frames=num_frames, seed=seed
+    )
 
     def told(done: int, total: int) -> None:
         status.update(f"generating frames: {done} of {total}")
 
     start = time.perf_counter()
-    load("train.simulation.synthesis:generate_dataset")(config, folder, progress=told)
+    load("train.simulation.generation:generate_dataset")(config, folder, progress=told)
     generated = num_frames / (time.perf_counter() - start)
     dataset = load("train.data.shards:Dataset")(folder)
     rows = dataset.rows()
@@ -226,8 +228,8 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
 def _draw_pictures(out: Path, chain: _Chain, seed: int, status: Any) -> Section:
     """A simulated capture, tracked and drawn."""
     status.update("tracking a simulated capture")
-    truth = load("train.simulation.twins:simulate_twin")(
-        load("train.simulation.twins:TwinConfig")(kind="hand-hand", num_frames=_TRACKED, seed=seed)
+    truth = load("train.simulation.takes:simulate_take")(
+        load("train.simulation.takes:TakeConfig")(kind="hand-hand", num_frames=_TRACKED, seed=seed)
     )
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = load("gloves.captures:Capture")(columns, truth.points, truth.rate)

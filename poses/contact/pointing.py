@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d, uniform_filter1d
 
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.contact import overlap_between
 from handsim.hand.model import HandModel
 from handsim.hand.motion import BodyMotion, HandMotion
@@ -247,7 +247,7 @@ def keep_apart(
         needed = np.where(deep > 0.5 * MAX_PENETRATION, back + deep + _RETREAT_STEP, back)
         window = 2 * int(_SMOOTHING * motion.rate / 2) + 1
         back = uniform_filter1d(maximum_filter1d(needed, window), window)
-    raise ArgumentError("the hands touch, however far one of them draws back")
+    raise PoseError("the hands touch, however far one of them draws back")
 
 
 def _turned_to_the_arm(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.contact import overlap_between
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import HandMotion
@@ -143,7 +143,7 @@ def sample_two_hand_poses(
             volume = TwoHandConfig().volume
             places = ROOM_CENTER + rng.uniform(-volume, volume, size=(count, 3))
             return _in_world(whole, places, Rotation.from_quat(random_quaternions(count, rng=rng)))
-    raise ArgumentError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
+    raise PoseError(f"no valid pose of these two hands was found in {_MOST_DRAWS} tries")
 
 
 def _next_passages(
@@ -167,7 +167,7 @@ def _next_passages(
             way = way_between(right, left, last, meeting.at([0]), config, rng=rng)
             if way is not None:
                 return [way, meeting]
-    raise ArgumentError(f"no valid way was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
+    raise PoseError(f"no valid way was found in {_MOST_DRAWS} tries to bring these hands to '{name}'")
 
 
 def _travel(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import mujoco
 import numpy as np
 
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, NUM_JOINTS
 from handsim.space.objects import RigidObject
@@ -71,7 +71,7 @@ def settle_hold(
         if isinstance(settled, Hold):
             return settled
         why = settled
-    raise ArgumentError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
+    raise PoseError(f"this hand does not get hold of the {obj.name} in {_MOST_TRIES} tries: {why}")
 
 
 def _varied(style: HoldStyle, attempt: int, rng: np.random.Generator) -> HoldStyle:

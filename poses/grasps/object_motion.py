@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.motion import BodyMotion, HandMotion
 from handsim.space.objects import RigidObject
@@ -116,9 +116,7 @@ class _Player:
             for part in (*ways, self._way(start, self._home(current))):
                 if is_held_valid(self.scene, part).all():
                     return self._rested(part), current
-        raise ArgumentError(
-            f"no valid way out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries"
-        )
+        raise PoseError(f"no valid way out of a hold of the {obj.name} in {_MOST_DRAWS * _VARIANTS} tries")
 
     def _home(self, number: int) -> Held:
         return Held(self.holds[number].angles[None], self.holds[number].T_wrist_object[None])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, NUM_JOINTS
 from poses.motion.minimum_jerk import MotionConfig, straight_way
@@ -40,7 +40,7 @@ def way_to_rest(
         way = np.concatenate([straight_way(*pair, config, rng) for pair in pairwise([start, *stops])])
         if is_valid(model, way).all():
             return way
-    raise ArgumentError("no valid way leads from one of the poses to this hand's rest")
+    raise PoseError("no valid way leads from one of the poses to this hand's rest")
 
 
 def _detours(start: NDArray[np.float64], resting: NDArray[np.float64]) -> Iterator[list[NDArray[np.float64]]]:
@@ -66,7 +66,7 @@ def can_be_left(model: HandModel, poses: Float[np.ndarray, "K 20"]) -> Bool[np.n
     free: NDArray[np.bool_] = np.all(valid.reshape(-1, len(shares)), axis=1)
     one_pace, unused = MotionConfig(durations=(0.4, 0.4)), np.random.default_rng(0)
     for number in np.flatnonzero(~free):
-        with contextlib.suppress(ArgumentError):
+        with contextlib.suppress(PoseError):
             way_to_rest(model, poses[number], one_pace, unused)
             free[number] = True
     return free

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion
 from handsim.hand.topology import NUM_JOINTS
@@ -104,14 +104,14 @@ def script_poses(model: HandModel, script: str) -> Float[np.ndarray, "K 20"]:
         poses = make_valid(model, np.stack([gesture(name) for name in entry["gestures"]]))
     poses = poses[np.flatnonzero(can_be_left(model, poses))]
     if len(poses) < 2:
-        raise ArgumentError(f"this hand can strike {len(poses)} poses of '{script}', expected at least 2")
+        raise PoseError(f"this hand can strike {len(poses)} poses of '{script}', expected at least 2")
     return poses
 
 
 def _touches(model: HandModel, fingers: list[str]) -> NDArray[np.float64]:
     found: list[NDArray[np.float64]] = []
     for finger in fingers:
-        with contextlib.suppress(ArgumentError):  # another finger will do
+        with contextlib.suppress(PoseError):  # another finger will do
             found.append(touching_angles(model, finger))
     touches: NDArray[np.float64] = np.array(found).reshape(-1, NUM_JOINTS)
     return touches

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from handsim._checks import check_array
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.capsules import Capsules
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
@@ -124,7 +124,7 @@ def touching_angles(
             angles = _solve(model, finger, angles)
             if is_touching(model, angles[None], finger)[0]:
                 return angles
-    raise ArgumentError(
+    raise PoseError(
         f"this hand's thumb and {finger} finger could not be brought to touch pad to pad: "
         "another start or finger may do"
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.errors import ArgumentError
+from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import JOINTS
 from poses.shapes.couplings import HIGH, LOW
@@ -38,14 +38,14 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     """A valid relaxed pose of this hand, its fingers fanned just as far as its girth asks for.
 
     Raises:
-        ArgumentError: No fan makes room for these fingers.
+        PoseError: No fan makes room for these fingers.
     """
     fans = np.arange(0.0, 13.0, 2.0)
     tries = np.tile(gesture("relaxed"), (len(fans), 1))
     tries[:, 4::4] += fans[:, None] * _FAN
     valid = is_valid(model, tries, max_penetration=0.8 * MAX_PENETRATION)
     if not valid.any():
-        raise ArgumentError("this hand's fingers overlap at rest: its girths are too large for its breadth")
+        raise PoseError("this hand's fingers overlap at rest: its girths are too large for its breadth")
     resting: NDArray[np.float64] = tries[valid.argmax()]
     return resting
 

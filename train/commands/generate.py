@@ -11,8 +11,9 @@ from rich.console import Console
 from handsim.app.progress import progress_bar
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
-from train.simulation.synthesis import DatasetConfig, generate_dataset
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
+from train.simulation.takes import TakeConfig, simulate_take
 
 _TAKE: Final = 1200  # frames of the continuous take that the report's gaps are from
 
@@ -36,8 +37,8 @@ def generate(
         )
     # Not in generate_dataset: the set is whole without its report, whose bytes hang on matplotlib's version.
     with Console(stderr=True).status("drawing the report"):
-        take = simulate_twin(
-            TwinConfig(kind="hand-hand", num_frames=_TAKE, glove=config.glove, rig=config.rig)
+        take = simulate_take(
+            TakeConfig(kind="hand-hand", num_frames=_TAKE, glove=config.glove, rig=config.rig)
         )
         report = write_report(Dataset(out), present=take.markers_present(), rate=take.rate)
     Console().print(f"{manifest.num_frames} frames of {config.glove} in {out}")

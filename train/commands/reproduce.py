@@ -27,8 +27,8 @@ from train.evaluation.tables import (
     simulate_takes,
 )
 from train.labelers.storage import labeler_for_glove, shipped_labelers
-from train.simulation.twins import KINDS, TWINS
-from train.simulation.unseen import unseen_markers
+from train.simulation.held_out import held_out_markers
+from train.simulation.room_settings import KINDS, TWINS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -61,7 +61,7 @@ def table2(
     """
     dataset = Dataset(data)
     names, glove = dataset.marker_names, str(dataset.manifest.config["glove"])
-    tests = {"unseen simulated frames": unseen_markers(glove, num_frames, seed=seed)}
+    tests = {"unseen simulated frames": held_out_markers(glove, num_frames, seed=seed)}
     if captures:
         files = find_captures(captures)
         tests[f"{len(files)} captures"] = read_markers(files, names)
@@ -159,7 +159,7 @@ def _print_tests(
         name: labeler_for_glove(glove, name if name in shipped_labelers() else Path(name))
         for name in labelers
     }
-    stills = {"synthetic": unseen_markers(glove, num_frames, seed=seed)}
+    stills = {"synthetic": held_out_markers(glove, num_frames, seed=seed)}
     takes = _simulate(glove, seed)
     if captures:
         names = next(iter(found.values())).marker_names

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -61,6 +62,8 @@ class Manifest:
     """Cameras that must see a marker before it exists."""
     files: dict[str, str]
     """SHA-256 of every file, by name."""
+    redrawn: dict[str, int] | None = None
+    """How often people or scenes had to be drawn again, by reason; None in a set that did not count them."""
     units: str = "metres, radians, world frame"
     schema: int = SCHEMA
 
@@ -73,6 +76,25 @@ def rows_name(shard: int) -> str:
 def hands_name(shard: int) -> str:
     """File of a shard's hands."""
     return f"hands-{shard:05d}.npy"
+
+
+def redrawn_name(shard: int) -> str:
+    """File of a shard's counts of what was drawn again."""
+    return f"redrawn-{shard:05d}.json"
+
+
+def load_redrawn(path: Path, num_shards: int) -> dict[str, int] | None:
+    """How often people or scenes were drawn again in all shards, by reason.
+
+    None where a shard has no counts, as those of earlier versions.
+    """
+    files = [path / redrawn_name(shard) for shard in range(num_shards)]
+    if not all(file.is_file() for file in files):
+        return None
+    total: Counter[str] = Counter()
+    for file in files:
+        total.update(load_json(file))
+    return dict(sorted(total.items()))
 
 
 def save_array(path: Path, array: NDArray[Any]) -> None:

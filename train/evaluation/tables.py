@@ -13,7 +13,8 @@ from train.data.batches import paper_corruption
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler, evaluate_takes
 from train.evaluation.paper import AUGMENTATIONS, TABLE2, TEST_SETS
 from train.labelers.protocol import Labeler
-from train.simulation.twins import KINDS, TwinConfig, simulate_twin
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import TakeConfig, simulate_take
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -56,7 +57,7 @@ def simulate_takes(glove: str, seed: int, done: Callable[[], None]) -> dict[str,
     """The twins of the paper's four captures."""
     takes: dict[str, Take] = {}
     for kind in KINDS:
-        takes[kind] = simulate_twin(TwinConfig(kind=kind, glove=glove, seed=seed))
+        takes[kind] = simulate_take(TakeConfig(kind=kind, glove=glove, seed=seed))
         done()
     return takes
 

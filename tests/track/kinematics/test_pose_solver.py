@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
@@ -29,7 +29,7 @@ def gloved(side, rng, layout="dense19"):
         model = HandModel(sample_shape(side=side, rng=rng))
         try:
             resting_angles(model)
-        except ArgumentError:
+        except PoseError:
             continue
         return model, attach_markers(load_layout(layout), model)
 

@@ -16,42 +16,44 @@ from handsim.errors import DatasetError, LayoutError
 from handsim.hand.model import HandModel, join_qpos
 from poses.shapes.couplings import HIGH, LOW
 from train.data.shards import Dataset, checksum, hands_name, rows_name
-from train.simulation import synthesis
-from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation import generation
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
 
 CONFIG = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
 import sys
 from pathlib import Path
-from train.simulation import synthesis
-synthesis.ROWS_PER_SHARD = 200
+from train.simulation import generation
+from train.simulation.dataset_config import DatasetConfig
+generation.ROWS_PER_SHARD = 200
 if __name__ == "__main__":
-    config = synthesis.DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
-    synthesis.generate_dataset(config, Path(sys.argv[1]), workers=1)
+    config = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+    generation.generate_dataset(config, Path(sys.argv[1]), workers=1)
 """
 
 # A pause after each shard, so that the kill comes before the end however busy the machine is.
 SLOWLY = """
 import time
-make_shard = synthesis.make_shard
+make_shard = generation.make_shard
 def make_slowly(*arguments):
     shard = make_shard(*arguments)
     time.sleep(1.0)
     return shard
-synthesis.make_shard = make_slowly
+generation.make_shard = make_slowly
 """
 
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch):
-    monkeypatch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+    monkeypatch.setattr(generation, "ROWS_PER_SHARD", 200)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "undisturbed"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+        patch.setattr(generation, "ROWS_PER_SHARD", 200)
         generate_dataset(CONFIG, out, workers=1)
     return out
 
@@ -87,7 +89,7 @@ def test_rows_are_what_they_say(finished):
 
 
 def test_two_workers_make_the_same_bytes(finished, tmp_path, monkeypatch):
-    monkeypatch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+    monkeypatch.setattr(generation, "ROWS_PER_SHARD", 200)
     out = tmp_path / "two"
     script = tmp_path / "make.py"
     script.write_text(COMMAND.replace("workers=1", "workers=2"))
