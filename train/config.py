@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from handsim.errors import HandSimError
 
@@ -73,18 +73,19 @@ class TrainConfig:
 
 
 Preset = Literal["han2018"]
+PRESETS: Final[tuple[Preset, ...]] = get_args(Preset)
 EPOCHS: Final = 75
 
 
-def with_preset(preset: Preset, config: TrainConfig, num_frames: int) -> TrainConfig:
-    """The settings of a published recipe for a training set of `num_frames`; what `config` changes holds.
+def preset_config(preset: Preset, num_frames: int) -> TrainConfig:
+    """The settings of a published recipe for a training set of `num_frames`.
 
     `han2018` is section 3.3 of Han et al. 2018: plain SGD from 0.6, batches of 256, 75 epochs, random drops
-    and ghosts; the jitter, which the paper does not tell, is that of its published data (±3 mm). Its numbers
-    are of 16 bits, which is three times as quick on a CPU that has them, and not the paper's.
+    and ghosts. The paper does not give the jitter; ours is that of its published data (±3 mm). The 16-bit
+    precision is not the paper's either; it is three times as fast on a CPU that has it.
     """
     del preset  # one so far
-    recipe = TrainConfig(
+    return TrainConfig(
         labeler="cnn",
         samples=EPOCHS * num_frames,
         optimizer="sgd",
@@ -97,7 +98,3 @@ def with_preset(preset: Preset, config: TrainConfig, num_frames: int) -> TrainCo
         rig_share=0.0,
         anisotropy=0.0,
     )
-    usual = TrainConfig()
-    given = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    changed = {key: value for key, value in given.items() if value != getattr(usual, key)}
-    return dataclasses.replace(recipe, **changed)

@@ -15,7 +15,7 @@ from gloves.captures.collection import find_captures, read_markers
 from gloves.captures.gaps import count_gaps, run_lengths
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError
-from train.config import Kind, TrainConfig, with_preset
+from train.config import Kind, TrainConfig, preset_config
 from train.data.shards import Dataset
 from train.evaluation.paper import AUGMENTATIONS, TABLE4, TABLE6
 from train.evaluation.tables import (
@@ -81,9 +81,10 @@ def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samp
     from train.loop import train_labeler
 
     drawn = augmentations(len(dataset.marker_names))[name]
-    usual = TrainConfig(labeler=kind, samples=samples, seed=seed)
-    recipe = with_preset("han2018", usual, dataset.manifest.num_frames) if kind == "cnn" else usual
-    config = dataclasses.replace(recipe, rig_share=0.0, occlude=drawn.occlude, ghosts=drawn.ghosts)
+    recipe = preset_config("han2018", dataset.manifest.num_frames) if kind == "cnn" else TrainConfig()
+    config = dataclasses.replace(
+        recipe, samples=samples, seed=seed, rig_share=0.0, occlude=drawn.occlude, ghosts=drawn.ghosts
+    )
     with progress_bar("samples") as (bar, task):
         train_labeler(
             dataset,

@@ -116,6 +116,27 @@ def save_manifest(out: Path, manifest: Manifest) -> None:
     save_json(out / MANIFEST, dataclasses.asdict(manifest))
 
 
+def load_manifest(path: Path) -> Manifest:
+    """The manifest of a finished training set; its files are not checked.
+
+    Args:
+        path: The folder that `handsim generate` wrote.
+
+    Raises:
+        DatasetError: Not a training set, unfinished, of another schema, or the manifest is damaged.
+    """
+    if not (path / MANIFEST).is_file():
+        hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
+        raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
+    content = load_json(path / MANIFEST)
+    if content.get("schema") != SCHEMA:
+        raise DatasetError(f"{path} has schema {content.get('schema')}, expected {SCHEMA}")
+    try:
+        return Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
+    except (TypeError, KeyError) as error:
+        raise DatasetError(f"{path / MANIFEST} is damaged: a field is missing or unknown") from error
+
+
 class Dataset:
     """A finished training set, its rows memory-mapped.
 
@@ -127,16 +148,7 @@ class Dataset:
     """
 
     def __init__(self, path: Path) -> None:
-        if not (path / MANIFEST).is_file():
-            hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
-            raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
-        content = load_json(path / MANIFEST)
-        if content.get("schema") != SCHEMA:
-            raise DatasetError(f"{path} has schema {content.get('schema')}, expected {SCHEMA}")
-        try:
-            self.manifest = Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
-        except (TypeError, KeyError) as error:
-            raise DatasetError(f"{path / MANIFEST} is damaged: a field is missing or unknown") from error
+        self.manifest = load_manifest(path)
         for name, wanted in self.manifest.files.items():
             file = path / name
             if not file.is_file():

@@ -116,7 +116,7 @@ def test_markers_are_seen_as_embree_sees_them(name, rng):
         meshes = [
             trimesh.Trimesh(vertices, faces, process=False)
             for vertices, faces in (
-                *((skin[frame], hand.model.surface.faces) for skin, hand in skins),
+                *((skin[frame], hand.fit.model.surface.faces) for skin, hand in skins),
                 (vertices_of_thing, thing.rigid_object.faces),
             )
         ]  # fmt: skip

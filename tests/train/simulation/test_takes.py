@@ -9,7 +9,7 @@ import pytest
 
 from gloves.captures.gaps import count_gaps
 from gloves.takes.take import Take
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.objects import named_object
@@ -17,6 +17,7 @@ from handsim.space.transforms import quaternion_matrix
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.object_motion import object_penetration
 from poses.shapes.couplings import HIGH, LOW
+from train.simulation import takes
 from train.simulation.motion import RATE
 from train.simulation.room_settings import KINDS, TWINS
 from train.simulation.takes import WRIST_VOLUME, TakeConfig, simulate_take
@@ -106,6 +107,26 @@ def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
 def test_a_single_frame_is_a_capture(kind):
     take = simulate_take(TakeConfig(kind=kind, num_frames=1))
     assert take.num_frames == 1 and (take.labels >= 0).sum() > 30
+
+
+def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
+    tried = []
+
+    def out_of_reach(kind, fits, num_frames, *, rng):
+        tried.append(fits)
+        raise PoseError("this hand does not get hold of the pen")
+
+    monkeypatch.setattr(takes, "sample_scene_motion", out_of_reach)
+    with pytest.raises(PoseError, match="none of 10 people can do 'hand-pen'; the last: this hand does not"):
+        simulate_take(TakeConfig(kind="hand-pen", num_frames=5))
+    assert len(tried) == 10
+
+    def broken(kind, fits, num_frames, *, rng):
+        raise ArgumentError("qpos has shape (3,), expected (..., 27)")
+
+    monkeypatch.setattr(takes, "sample_scene_motion", broken)
+    with pytest.raises(ArgumentError, match="qpos has shape"):
+        simulate_take(TakeConfig(kind="hand-pen", num_frames=5))
 
 
 @pytest.mark.parametrize(
