@@ -1,4 +1,4 @@
-"""Settings of the labelers and their training; free of torch, so that a command's help is quick."""
+"""Settings of the labelers and their training; without torch, so that a command's help is fast."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class SetLabelerConfig:
     width: int = 64
     """Channels of a point."""
     gates: int = 16
-    """Message channels share a gate in groups: this many groups."""
+    """Groups of message channels; the channels of a group share a gate."""
     depth: int = 5
     """Rounds of messages."""
     num_distances: int = 24
-    """Gaussian bumps a distance is spread over."""
+    """Gaussian basis functions that encode a distance."""
     reach: float = 0.24
-    """Largest distance [m] that has a bump of its own; a hand's markers span about this much."""
+    """Largest distance [m] with a basis function of its own; a hand's markers span about this much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,32 +37,32 @@ class TrainConfig:
     labeler: Kind = "set"
     """Kind of network."""
     samples: int = 5_000_000
-    """Clouds to learn from; rows come round again, corrupted anew each time."""
+    """Clouds to learn from; rows are used repeatedly, corrupted anew each time."""
     batch: int = 256
     optimizer: Literal["adamw", "sgd"] = "adamw"
     learning_rate: float = 2e-3
-    """Peak."""
+    """Peak learning rate."""
     schedule: Literal["cosine", "steps"] = "cosine"
     """`cosine` warms up over the first hundredth and falls to zero as a half cosine; `steps` falls tenfold
     at 2/3 and 14/15 of the way, the paper's epochs 50 and 70 of 75."""
     weight_decay: float = 0.01
     average: float = 0.999
-    """Decay of the running mean of the weights, which is what is kept; 0 keeps the last ones."""
+    """Decay of the running mean of the weights, which is what is saved; 0 saves the last weights."""
     precision: Literal["32", "bf16"] = "32"
-    """Numbers of the forward pass; bf16 is quicker on hardware that has it, and coarser."""
+    """Precision of the forward pass; bf16 is faster on hardware that has it, and less accurate."""
     devices: int = 1
     """GPUs to share each batch, where there are any."""
     jitter: float = 0.005
-    """Largest half width of the uniform noise on each coordinate [m]; each batch draws its own."""
+    """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: float = 0.5
-    """Share of batches that are what the simulated rig saw; the others go through the paper's recipe."""
+    """Share of batches that are what the simulated rig sees; the others get the paper's corruption."""
     occlude: int | None = None
-    """Most draws of a marker to drop in the paper's recipe; a quarter of the markers when not given, which
-    is what the paper drew of its 19 and its 13."""
+    """Most draws of a marker to drop in the paper's corruption; a quarter of the markers when not given, as
+    in the paper for its 19 and 13 markers."""
     ghosts: int = 2
-    """Most ghosts added in the paper's recipe."""
+    """Most ghosts added in the paper's corruption."""
     anisotropy: float = 0.06
-    """Stretch of each hand along three random directions, log standard deviation."""
+    """Log standard deviation of the stretch of each hand along three random directions."""
     seed: int = 0
     network: SetLabelerConfig = dataclasses.field(default_factory=SetLabelerConfig)
 

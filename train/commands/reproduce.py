@@ -52,16 +52,16 @@ def table2(
 
     Args:
         data: Training set that handsim generate wrote.
-        out: Folder for the runs; the same command goes on where it was stopped.
+        out: Folder for the runs; the same command continues where it was stopped.
         kinds: Networks to train: set, cnn (by the paper's recipe) or both.
-        samples: Clouds that each network learns from (the paper: 12.8 million).
-        num_frames: Test frames of people and poses that the training set does not hold.
-        captures: Labeled captures or folders of them; a second table is of these.
+        samples: Clouds that each network is trained on (the paper: 12.8 million).
+        num_frames: Test frames of people and poses that are not in the training set.
+        captures: Labeled captures or folders of them, for a second table.
         seed: Seed of the training, the test frames and their corruption.
     """
     dataset = Dataset(data)
     names, glove = dataset.marker_names, str(dataset.manifest.config["glove"])
-    tests = {"unseen simulated frames": held_out_markers(glove, num_frames, seed=seed)}
+    tests = {"held-out simulated frames": held_out_markers(glove, num_frames, seed=seed)}
     if captures:
         files = find_captures(captures)
         tests[f"{len(files)} captures"] = read_markers(files, names)
@@ -118,8 +118,8 @@ def table4(
 
     Args:
         labelers: Shipped names, folders of trained labelers, or exported .onnx files.
-        num_frames: Test frames of people and poses that no training set holds, with the paper's recipe.
-        captures: Labeled captures or folders of them; a column is theirs, with the paper's recipe.
+        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
+        captures: Labeled captures or folders of them, for another column with the paper's recipe.
         seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
     """
     _print_tests("Table 4", "dense19", TABLE4, labelers, num_frames, captures, seed)
@@ -135,8 +135,8 @@ def table6(
 
     Args:
         labelers: Shipped names, folders of trained labelers, or exported .onnx files.
-        num_frames: Test frames of people and poses that no training set holds, with the paper's recipe.
-        captures: Labeled captures or folders of them; a column is theirs, with the paper's recipe.
+        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
+        captures: Labeled captures or folders of them, for another column with the paper's recipe.
         seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
     """
     _print_tests("Table 6", "sparse13", TABLE6, labelers, num_frames, captures, seed)
@@ -198,7 +198,7 @@ def _table3(takes: dict[str, Take]) -> Table:
 
 
 def _by_marker(takes: dict[str, Take]) -> Table:
-    table = Table(title="Missing share and gap lengths, a marker at a time")
+    table = Table(title="Missing share and gap lengths per marker")
     for column in ("Test set", "mean", "least", "most", "median gap", "p90", "p99 [frames]"):
         table.add_column(
             column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"

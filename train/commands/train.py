@@ -26,7 +26,7 @@ def _train(
     config: Annotated[TrainConfig, tyro.conf.arg(name="")],
     preset: Preset | None = None,
 ) -> None:
-    """Train a labeler on a training set and draw a page about it; run it again to go on where it was stopped.
+    """Train a labeler on a training set and write a page about it; run it again to continue a stopped run.
 
     Args:
         dataset: Folder that `handsim generate` wrote.

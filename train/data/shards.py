@@ -1,6 +1,6 @@
 """Training sets on disk: `.npy` shards of rows and hands, and a manifest that names and checks them.
 
-A row is clean: what the hand did and what the rig saw of it. Jitter, drops and a shuffled order are drawn
+A row is clean: the pose of the hand and what the rig sees of it. Jitter, drops and a shuffled order are drawn
 when training (`train.data.augmentation`).
 """
 
@@ -35,8 +35,9 @@ CONFIG: Final = "config.json"
 def row_dtype(num_markers: int) -> np.dtype[np.void]:
     """One frame of one hand.
 
-    qpos, hand (its place in the shard), true markers [m], cameras with a free view of each (bits), where the
-    optical system puts them [m] (NaN where it loses them), ghosts [m].
+    `qpos` (position [m], quaternion wxyz, 20 joint angles [rad]), `hand` (its index in the shard's hands),
+    true `markers` (M, 3) [m], `cameras` with a free view of each marker (bits), positions `observed` by the
+    optical system (M, 3) [m] (NaN where it loses the marker), `ghosts` (4, 3) [m] (NaN where there is none).
     """
     return np.dtype(
         [
@@ -99,7 +100,7 @@ def load_redrawn(path: Path, num_shards: int) -> dict[str, int] | None:
 
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an `.npy` file, whole or not at all."""
-    # By hand, because numpy.save tells a full disk as "8192 requested and 6690 written", without its errno.
+    # Not numpy.save: it reports a full disk as "8192 requested and 6690 written", without its errno.
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
         file.write(np.ascontiguousarray(array).tobytes())
@@ -149,13 +150,13 @@ class Dataset:
 
     def __init__(self, path: Path) -> None:
         self.manifest = load_manifest(path)
-        for name, wanted in self.manifest.files.items():
+        for name, expected in self.manifest.files.items():
             file = path / name
             if not file.is_file():
                 raise DatasetError(
                     f"{file} is missing; delete {path / MANIFEST} and run handsim generate again"
                 )
-            if checksum(file) != wanted:
+            if checksum(file) != expected:
                 raise DatasetError(
                     f"{file} is damaged (its checksum is not the manifest's); delete it together with "
                     f"{MANIFEST} and run handsim generate again"
@@ -170,9 +171,9 @@ class Dataset:
         return self.manifest.marker_names
 
     def rows(self) -> Shaped[np.ndarray, "T"]:
-        """All rows in order, read into memory."""
+        """All T rows in order, read into memory; see `row_dtype` for their fields."""
         return np.concatenate(self.shards)
 
     def hands(self, shard: int) -> list[HandShape]:
-        """The hands of a shard, which its rows count from 0."""
+        """The hands of a shard; the `hand` of its rows is an index into them."""
         return [unpack_hand(record) for record in np.load(self.path / hands_name(shard), allow_pickle=False)]

@@ -1,4 +1,4 @@
-"""The paper's tables of labeling: the same tests for our labelers, its figures beside ours."""
+"""Tables of labeling: the paper's tests for our labelers, with its figures beside ours."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ def measure_tests(
     """Tables 4 and 6 for one labeler.
 
     Args:
-        labeler: What to measure.
-        stills: Sets of true markers [m] that the paper's recipe is drawn on, by name.
+        labeler: The labeler to evaluate.
+        stills: Sets of true markers [m] that get the paper's corruption, by name.
         takes: Simulated captures, by name.
-        seed: Seed of the recipe.
+        seed: Seed of the corruption.
     """
     recipe = paper_corruption(len(labeler.marker_names))
     reports = {

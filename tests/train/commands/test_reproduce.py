@@ -66,7 +66,7 @@ def test_table_2_trains_and_tests_four_networks(tmp_path, capsys, monkeypatch):
         f"{kind}-{name}" for kind in ("set", "cnn") for name in AUGMENTATIONS
     )
     for kind in ("set", "cnn"):
-        assert f"Table 2, {kind}: unseen simulated frames" in said
+        assert f"Table 2, {kind}: held-out simulated frames" in said
     first = said[: said.index("Table 2, cnn")]
     for test in AUGMENTATIONS:
         for cell, paper in zip(cells(first, test), TABLE2[test], strict=True):
