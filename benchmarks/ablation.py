@@ -21,7 +21,8 @@ from gloves.captures.collection import find_captures, read_markers
 from train.data.augmentation import Corruption
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler, evaluate_takes
 from train.labelers.storage import load_labeler
-from train.simulation.twins import KINDS, TwinConfig, simulate_twin
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import TakeConfig, simulate_take
 
 FIGURES = {
     "slot_accuracy": "slot accuracy",
@@ -37,7 +38,7 @@ def main(runs: tuple[str, ...], captures: Path | None = None) -> None:
     labelers = {run: load_labeler(Path(run) if Path(run).is_dir() else run) for run in runs}
     tests: dict[str, dict[str, Report]] = {}
     for kind in KINDS:
-        take = simulate_twin(TwinConfig(kind=kind))
+        take = simulate_take(TakeConfig(kind=kind))
         tests[kind] = {run: evaluate_takes(labeler, [take]) for run, labeler in labelers.items()}
     if captures is not None:
         markers = read_markers(find_captures([captures]), next(iter(labelers.values())).marker_names)

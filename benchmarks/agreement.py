@@ -23,7 +23,7 @@ from handsim.space.cameras import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.validity import sample_valid_angles
-from train.simulation.synthesis import sample_hands
+from train.simulation.people import sample_hands
 
 CHECKED = 20  # frames per hand that MuJoCo repeats
 

@@ -24,7 +24,7 @@ import numpy as np
 from gloves.optics.identities import number_runs
 from gloves.optics.mirrors import reflect
 from gloves.takes.take import Take
-from train.simulation.room import _owned
+from train.simulation.room import label_false_points
 
 NUMBER = 20  # ghosts a frame
 BORN = (0.010, 0.050)  # [m] from a marker
@@ -46,7 +46,7 @@ def with_drum(take: Take, first: int, *, rng: np.random.Generator) -> Take:
             frame, turn = frame + len(life), 1 - turn
     there = take.markers_present()
     found = SimpleNamespace(false_points=ghosts, rays=there.astype(int))
-    owned = _owned(cast(Any, found), markers, np.arange(markers.shape[1]), OWNED)
+    owned = label_false_points(cast(Any, found), markers, np.arange(markers.shape[1]), OWNED)
     runs = number_runs(np.isfinite(ghosts[..., 0]))
     ids = np.where(runs >= 0, runs + take.ids.max() + 1, -1)
     order = rng.permutation(take.points.shape[1] + ghosts.shape[1])

@@ -22,8 +22,9 @@ from train.evaluation.paper import AUGMENTATIONS, TABLE2
 from train.evaluation.tables import measure_augmentations
 from train.labelers.kinds import labeler_of
 from train.loop import start_fabric
-from train.simulation.synthesis import DatasetConfig, generate_dataset
-from train.simulation.unseen import unseen_markers
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
+from train.simulation.held_out import held_out_markers
 from train.training_state import TrainingState
 
 GLOVE = "dense19"
@@ -39,7 +40,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=400_000)
     options = parser.parse_args()
     print(describe("torch", "mujoco"))
-    tests = {"unseen simulated": unseen_markers(GLOVE, FRAMES, seed=1)}
+    tests = {"unseen simulated": held_out_markers(GLOVE, FRAMES, seed=1)}
     if options.captures is not None:
         markers = read_markers(find_captures([options.captures]), load_layout(GLOVE).names)
         tests["captures"] = markers[:: -(-len(markers) // FRAMES)]

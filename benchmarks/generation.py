@@ -3,10 +3,9 @@
     python benchmarks/generation.py [--frames 170330]
 
 The floor of a frame is what cannot be left out: its rays, 19 markers x 16 cameras, each against 21 capsules,
-and its row on the disk. Then come the stages of `train.simulation.synthesis` for a hand alone, a new person
-every 128
-frames, in microseconds of processor time a frame, and `handsim generate` whole: single hands with one worker
-and with two, then the default mix of hands alone, together and holding something.
+and its row on the disk. Then come the stages of `train.simulation.generation` for a hand alone, a new
+person every 128 frames, in microseconds of processor time per frame, and `handsim generate` whole: single
+hands with one worker and with two, then the default mix of hands alone, together and holding something.
 """
 
 from __future__ import annotations
@@ -32,8 +31,10 @@ from handsim.space.cameras import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
 from train.data.shards import row_dtype
-from train.simulation.scenes import SceneMix
-from train.simulation.synthesis import DatasetConfig, generate_dataset, sample_hands
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.frame_scenes import SceneMix
+from train.simulation.generation import generate_dataset
+from train.simulation.people import sample_hands
 
 CONFIG = DatasetConfig()
 HANDS = 48
@@ -59,7 +60,7 @@ class Stopwatch:
 
 
 def one_hand(watch: Stopwatch, rng: np.random.Generator) -> None:
-    """What `train.simulation.synthesis` does for one person, stage by stage."""
+    """What `train.simulation.generation` does for one person, stage by stage."""
     layout, rig = load_layout(CONFIG.glove), named_rig(CONFIG.rig)
     with watch.stage("person: shape, skeleton, room at rest"):
         model = sample_hands(CONFIG.population, rng=rng)[0]

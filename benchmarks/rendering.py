@@ -41,7 +41,7 @@ from render.session import RenderConfig, draw_frames
 from render.shown_take import ShownTake, show_simulated
 from render.skin.look import ALL_TONES
 from render.studio import Studio
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
@@ -57,7 +57,7 @@ KINDS: Final = {
 
 @functools.lru_cache(maxsize=1)
 def a_take(frames: int) -> ShownTake:
-    return show_simulated(simulate_twin(TwinConfig(kind="hand-hand", num_frames=frames)))
+    return show_simulated(simulate_take(TakeConfig(kind="hand-hand", num_frames=frames)))
 
 
 def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:

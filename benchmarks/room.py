@@ -31,9 +31,13 @@ from handsim.hand.model import join_qpos
 from handsim.space.cameras import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
-from train.simulation.room import _SKINS, Room
-from train.simulation.synthesis import DatasetConfig, sample_hands
-from train.simulation.twins import TWINS, TwinConfig, _cast, simulate_twin
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.light_sources import mirror_images, sample_light_sources, stray_reflections
+from train.simulation.people import sample_hands
+from train.simulation.room import pack_take
+from train.simulation.room_settings import TWINS
+from train.simulation.sight import SKIN_CHUNK, SceneSight
+from train.simulation.takes import TakeConfig, sample_scene, simulate_take
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"
@@ -103,59 +107,67 @@ def one_hand(frames: int, seed: int, watch: Stopwatch) -> None:
 
 
 def room_of(kind: str, frames: int, seed: int, watch: Stopwatch) -> None:
-    """The stages of `train.simulation.twins.simulate_twin`."""
+    """The stages of `train.simulation.takes.simulate_take`."""
     rng = np.random.default_rng(seed)
     rig, config = named_rig("figure5"), TWINS[kind].room
-    cast = watch("people, gloves, motions", lambda: _cast(kind, load_layout("dense19"), frames, rng))
-    room = watch("bones, markers", lambda: _opened(Room(*cast, rig, config)))
-    watch("all lines of sight", lambda: room.markers_seen(rng=rng))
-    watch("mirrors and strays", lambda: (room._images(rng), room._strays(rng)))
+    layout, optics = load_layout("dense19"), config.optics
+    scene = watch("people, gloves, motions", lambda: sample_scene(kind, layout, frames, rng=rng))
+    sight = watch("bones, markers", lambda: _prepared(SceneSight(scene, rig)))
+    radius = optics.partial * optics.marker_radius
+    watch("all lines of sight", lambda: sight.visible_markers(radius, rng=rng))
+    watch(
+        "mirrors and strays",
+        lambda: (
+            mirror_images(sight, config.reflectance, rng=rng),
+            stray_reflections(sight, config, rng=rng),
+        ),
+    )
     state = rng.bit_generator.state
-    sources = room.sources(rng=rng)
-    optics = config.optics
-    watch("optics", lambda: reconstruct(sources.places, sources.seen, rig, optics, continuous=True, rng=rng))
+    sources = sample_light_sources(sight, config, rng=rng)
+    positions, visible = sources.positions, sources.visible
+    watch("optics", lambda: reconstruct(positions, visible, rig, optics, continuous=True, rng=rng))
     rng.bit_generator.state = state
     start = time.process_time()
-    room.take({}, rng=rng)
+    pack_take(scene, sample_light_sources(sight, config, rng=rng), rig, config, {}, rng=rng)
     taken = time.process_time() - start
     watch.note("packing", taken - watch.last("all lines of sight", "mirrors and strays", "optics"))
     watch.note("whole", taken + watch.last("people, gloves, motions", "bones, markers"))
-    _lines(room, watch)
+    _lines(sight, watch)
 
 
-def _opened(room: Room) -> Room:
+def _prepared(sight: SceneSight) -> SceneSight:
     """With what is computed once."""
-    _ = room.markers, room._bodies
-    return room
+    _ = sight.markers, sight.obstacles
+    return sight
 
 
-def _lines(room: Room, watch: Stopwatch) -> None:
+def _lines(sight: SceneSight, watch: Stopwatch) -> None:
     """Parts of the lines of sight: facing and spots, skins, boxes refitted, and the lines themselves."""
-    markers, normals = room.markers
-    cameras = room.rig.positions
-    wanted = facing_cameras(markers, normals, room.rig)
-    pieces = [slice(first, first + _SKINS) for first in range(0, room.num_frames, _SKINS)]
+    markers, normals = sight.markers
+    cameras = sight.rig.positions
+    facing = facing_cameras(markers, normals, sight.rig)
+    pieces = [slice(first, first + SKIN_CHUNK) for first in range(0, sight.scene.num_frames, SKIN_CHUNK)]
     starts = np.repeat(markers[:, :, None], len(cameras), axis=2)
-    nothing = np.zeros_like(wanted[:_SKINS])
+    nothing = np.zeros_like(facing[:SKIN_CHUNK])
 
     def skins() -> None:
         for piece in pieces:
-            for hand in room.hands:
+            for hand in sight.scene.hands:
                 hand.fit.model.skin(hand.qpos[piece])
 
     def refits() -> None:
         for piece in pieces:
             few = len(starts[piece])
-            for hand in room.hands:
+            for hand in sight.scene.hands:
                 skin = hand.fit.model.skin(hand.qpos[piece])
                 clear_of_mesh(hand_tree(), skin, starts[piece], cameras, nothing[:few])
 
     watch("  skins", skins)
     watch("  boxes refitted", refits)
     watch.times["  boxes refitted"][-1] -= watch.last("  skins")
-    watch("  lines", lambda: [room._past_all(piece, starts[piece], wanted[piece]) for piece in pieces])
+    watch("  lines", lambda: [sight.clear_lines(piece, starts[piece], facing[piece]) for piece in pieces])
     watch.times["  lines"][-1] -= watch.last("  skins", "  boxes refitted")
-    watch.lines.append(int(wanted.sum()))
+    watch.lines.append(int(facing.sum()))
     watch.note(
         "  facing, spots of markers",
         watch.last("all lines of sight") - watch.last("  skins", "  boxes refitted", "  lines"),
@@ -182,26 +194,26 @@ def boxes_met(starts: Any, ends: Any, skip: Any, boxes: Any) -> int:
 def floor(frames: int) -> None:
     """Lines, boxes and bytes of a frame of two hands and a controller."""
     rng = np.random.default_rng(0)
-    cast = _cast("hand-controller", load_layout("dense19"), frames, rng)
-    room = Room(*cast, named_rig("figure5"), TWINS["hand-controller"].room)
-    markers, normals = room.markers
-    wanted = facing_cameras(markers, normals, room.rig)
+    scene = sample_scene("hand-controller", load_layout("dense19"), frames, rng=rng)
+    sight = SceneSight(scene, named_rig("figure5"))
+    markers, normals = sight.markers
+    facing = facing_cameras(markers, normals, sight.rig)
     tree, tested = hand_tree(), 0
     for frame in range(frames):
-        marker, camera = np.nonzero(wanted[frame])
-        starts, ends = markers[frame, marker], room.rig.positions[camera]
-        for hand in room.hands:
+        marker, camera = np.nonzero(facing[frame])
+        starts, ends = markers[frame, marker], sight.rig.positions[camera]
+        for hand in sight.scene.hands:
             skin = hand.fit.model.skin(hand.qpos[frame : frame + 1])
             clear_of_mesh(
-                tree, skin, markers[frame : frame + 1], room.rig.positions, wanted[frame : frame + 1]
+                tree, skin, markers[frame : frame + 1], sight.rig.positions, facing[frame : frame + 1]
             )
             corners = skin[0][tree.faces]
             tested += boxes_met(starts, ends, tree.skip, _boxes(corners, tree))
-    lines = wanted.sum() / frames
-    size = len(room.hands) * tree.vertices.nbytes
+    lines = facing.sum() / frames
+    size = len(scene.hands) * tree.vertices.nbytes
     print(
         f"floor of a frame of two hands and a controller: {markers.shape[1]} markers x "
-        f"{len(room.rig.positions)} cameras, {lines:.0f} lines in view and facing, each past two skins: "
+        f"{len(sight.rig.positions)} cameras, {lines:.0f} lines in view and facing, each past two skins: "
         f"{tested / frames:,.0f} boxes tested ({tested / frames / lines:.0f} a line), "
         f"{2 * len(tree.skip):,} boxes moved, {size:,} bytes of skin written and read"
     )
@@ -223,7 +235,7 @@ def whole(kind: str, frames: int, seed: int) -> None:
     if kind == ALONE:
         one_hand(frames, seed, Stopwatch())
     else:
-        simulate_twin(TwinConfig(kind=kind, num_frames=frames, seed=seed))  # type: ignore[arg-type]
+        simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed))  # type: ignore[arg-type]
 
 
 def worker(kind: str, frames: int, seeds: list[int], barrier: Any, queue: Any) -> None:

@@ -54,7 +54,8 @@ from track.user import load_user
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
-from train.simulation.twins import KINDS, Kind, TwinConfig, simulate_twin
+from train.simulation.room_settings import KINDS, Kind
+from train.simulation.takes import TakeConfig, simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
@@ -66,7 +67,7 @@ HANDS = {"true": true_users, "uncalibrated": nominal_users}
 
 @cache
 def twin(kind: Kind, frames: int | None, seed: int) -> Take:
-    return without_body(simulate_twin(TwinConfig(kind=kind, num_frames=frames, seed=seed)))
+    return without_body(simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)))
 
 
 @cache

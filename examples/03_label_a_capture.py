@@ -17,7 +17,8 @@ from train.data.augmentation import Corruption
 from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import evaluate_labeler
 from train.labelers.storage import load_labeler
-from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
 
 
 def main() -> None:

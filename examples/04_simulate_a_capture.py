@@ -13,11 +13,12 @@ import numpy as np
 from gloves.captures.gaps import count_gaps
 from train.evaluation.labeler_evaluation import evaluate_takes
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TWINS, TwinConfig, simulate_twin
+from train.simulation.room_settings import TWINS
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 def main() -> None:
-    take = simulate_twin(TwinConfig(kind="hand-pen", num_frames=300))  # 2.5 s at 120 Hz
+    take = simulate_take(TakeConfig(kind="hand-pen", num_frames=300))  # 2.5 s at 120 Hz
     ghosts = np.isfinite(take.points[..., 0]) & (take.labels < 0)  # (300, N)
     ours, paper = count_gaps(take.markers_present()), TWINS["hand-pen"].paper
     print(f"{ours.gaps} gaps in {ours.frames} frames (the paper: {paper.gaps} in {paper.frames})")

@@ -16,8 +16,9 @@ from train.data.shards import Dataset
 from train.evaluation.tables import measure_augmentations
 from train.labelers.storage import load_labeler
 from train.loop import train_labeler
-from train.simulation.synthesis import DatasetConfig, generate_dataset
-from train.simulation.unseen import unseen_markers
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
+from train.simulation.held_out import held_out_markers
 
 GLOVE = str(Path(__file__).parent / "ten_markers.toml")
 
@@ -29,7 +30,7 @@ def main() -> None:
         generate_dataset(DatasetConfig(glove=GLOVE, num_frames=6000, frames_per_hand=60), data, workers=1)
         train_labeler(Dataset(data), TrainConfig(samples=40_000, network=network), run)
         labeler = load_labeler(run)
-    strangers = unseen_markers(GLOVE, 500, seed=0)  # (500, 10, 3)
+    strangers = held_out_markers(GLOVE, 500, seed=0)  # (500, 10, 3)
     for test, report in measure_augmentations(labeler, strangers, seed=0).items():
         print(f"{test}: {100 * report.figures['slot_accuracy']:.1f} % of slots right")
 

@@ -19,7 +19,7 @@ from handsim.hand.model import HandModel
 from track.capture_tracking import track_capture
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 def joints(hand: HandModel, qpos: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ def tell(name: str, take: TrackedTake, truth: Take) -> None:
 
 
 def main() -> None:
-    truth = simulate_twin(TwinConfig(kind="hand-controller", num_frames=240))  # 2 s at 120 Hz
+    truth = simulate_take(TakeConfig(kind="hand-controller", num_frames=240))  # 2 s at 120 Hz
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)  # no names, many gaps, some ghosts
     labeler = load_labeler("dense19")

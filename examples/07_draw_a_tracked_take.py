@@ -25,11 +25,11 @@ from render.session import RenderConfig, render_take
 from track.capture_tracking import track_capture
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 def main() -> None:
-    truth = simulate_twin(TwinConfig(kind="hand-hand", num_frames=120))  # 1 s at 120 Hz
+    truth = simulate_take(TakeConfig(kind="hand-hand", num_frames=120))  # 1 s at 120 Hz
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)
     hands = [nominal_fit(hand.layout, "M", hand.side) for hand in truth.hands]  # nobody was calibrated

@@ -13,7 +13,8 @@ from handsim._lazy import lazy_exports
 if TYPE_CHECKING:
     from poses.motion.motions import sample_motion
     from poses.shapes.library import load_gestures
-    from poses.shapes.sampling import PoseSampler, sample_poses, validate
+    from poses.shapes.sampling import PoseSampler, sample_poses
+    from poses.shapes.validity import validate
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
@@ -22,7 +23,7 @@ __getattr__, __dir__ = lazy_exports(
         "load_gestures": "poses.shapes.library",
         "sample_motion": "poses.motion.motions",
         "sample_poses": "poses.shapes.sampling",
-        "validate": "poses.shapes.sampling",
+        "validate": "poses.shapes.validity",
     },
 )
 

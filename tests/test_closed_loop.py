@@ -18,7 +18,7 @@ from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.commands.simulate import simulate
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig
+from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0
 MOST_PIXELS = 2.0
@@ -28,7 +28,7 @@ FRAMES = 120
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
     folder = tmp_path_factory.mktemp("loop")
-    simulate(folder / "take.c3d", TwinConfig(kind="hand-hand", num_frames=FRAMES))
+    simulate(folder / "take.c3d", TakeConfig(kind="hand-hand", num_frames=FRAMES))
     return load_take(folder / "take.truth.npz"), folder
 
 

@@ -18,23 +18,24 @@ if TYPE_CHECKING:
     from train.labelers.protocol import Labeler
     from train.labelers.storage import load_labeler
     from train.loop import train_labeler
-    from train.simulation.synthesis import DatasetConfig, generate_dataset
-    from train.simulation.twins import TakeConfig, simulate_take
+    from train.simulation.dataset_config import DatasetConfig
+    from train.simulation.generation import generate_dataset
+    from train.simulation.takes import TakeConfig, simulate_take
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
         "Corruption": "train.data.augmentation",
         "Dataset": "train.data.shards",
-        "DatasetConfig": "train.simulation.synthesis",
+        "DatasetConfig": "train.simulation.dataset_config",
         "Labeler": "train.labelers.protocol",
-        "TakeConfig": "train.simulation.twins",
+        "TakeConfig": "train.simulation.takes",
         "TrainConfig": "train.config",
         "corrupt": "train.data.augmentation",
         "evaluate_labeler": "train.evaluation.labeler_evaluation",
-        "generate_dataset": "train.simulation.synthesis",
+        "generate_dataset": "train.simulation.generation",
         "load_labeler": "train.labelers.storage",
-        "simulate_take": "train.simulation.twins",
+        "simulate_take": "train.simulation.takes",
         "train_labeler": "train.loop",
     },
 )

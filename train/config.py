@@ -1,10 +1,10 @@
-"""Settings of the labelers and their training; free of torch, so that a command's help is quick."""
+"""Settings of the labelers and their training; without torch, so that a command's help is fast."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from handsim.errors import HandSimError
 
@@ -21,13 +21,13 @@ class SetLabelerConfig:
     width: int = 64
     """Channels of a point."""
     gates: int = 16
-    """Message channels share a gate in groups: this many groups."""
+    """Groups of message channels; the channels of a group share a gate."""
     depth: int = 5
     """Rounds of messages."""
     num_distances: int = 24
-    """Gaussian bumps a distance is spread over."""
+    """Gaussian basis functions that encode a distance."""
     reach: float = 0.24
-    """Largest distance [m] that has a bump of its own; a hand's markers span about this much."""
+    """Largest distance [m] with a basis function of its own; a hand's markers span about this much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,32 +37,32 @@ class TrainConfig:
     labeler: Kind = "set"
     """Kind of network."""
     samples: int = 5_000_000
-    """Clouds to learn from; rows come round again, corrupted anew each time."""
+    """Clouds to learn from; rows are used repeatedly, corrupted anew each time."""
     batch: int = 256
     optimizer: Literal["adamw", "sgd"] = "adamw"
     learning_rate: float = 2e-3
-    """Peak."""
+    """Peak learning rate."""
     schedule: Literal["cosine", "steps"] = "cosine"
     """`cosine` warms up over the first hundredth and falls to zero as a half cosine; `steps` falls tenfold
     at 2/3 and 14/15 of the way, the paper's epochs 50 and 70 of 75."""
     weight_decay: float = 0.01
     average: float = 0.999
-    """Decay of the running mean of the weights, which is what is kept; 0 keeps the last ones."""
+    """Decay of the running mean of the weights, which is what is saved; 0 saves the last weights."""
     precision: Literal["32", "bf16"] = "32"
-    """Numbers of the forward pass; bf16 is quicker on hardware that has it, and coarser."""
+    """Precision of the forward pass; bf16 is faster on hardware that has it, and less accurate."""
     devices: int = 1
     """GPUs to share each batch, where there are any."""
     jitter: float = 0.005
-    """Largest half width of the uniform noise on each coordinate [m]; each batch draws its own."""
+    """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: float = 0.5
-    """Share of batches that are what the simulated rig saw; the others go through the paper's recipe."""
+    """Share of batches that are what the simulated rig sees; the others get the paper's corruption."""
     occlude: int | None = None
-    """Most draws of a marker to drop in the paper's recipe; a quarter of the markers when not given, which
-    is what the paper drew of its 19 and its 13."""
+    """Most draws of a marker to drop in the paper's corruption; a quarter of the markers when not given, as
+    in the paper for its 19 and 13 markers."""
     ghosts: int = 2
-    """Most ghosts added in the paper's recipe."""
+    """Most ghosts added in the paper's corruption."""
     anisotropy: float = 0.06
-    """Stretch of each hand along three random directions, log standard deviation."""
+    """Log standard deviation of the stretch of each hand along three random directions."""
     seed: int = 0
     network: SetLabelerConfig = dataclasses.field(default_factory=SetLabelerConfig)
 
@@ -73,18 +73,19 @@ class TrainConfig:
 
 
 Preset = Literal["han2018"]
+PRESETS: Final[tuple[Preset, ...]] = get_args(Preset)
 EPOCHS: Final = 75
 
 
-def with_preset(preset: Preset, config: TrainConfig, num_frames: int) -> TrainConfig:
-    """The settings of a published recipe for a training set of `num_frames`; what `config` changes holds.
+def preset_config(preset: Preset, num_frames: int) -> TrainConfig:
+    """The settings of a published recipe for a training set of `num_frames`.
 
     `han2018` is section 3.3 of Han et al. 2018: plain SGD from 0.6, batches of 256, 75 epochs, random drops
-    and ghosts; the jitter, which the paper does not tell, is that of its published data (±3 mm). Its numbers
-    are of 16 bits, which is three times as quick on a CPU that has them, and not the paper's.
+    and ghosts. The paper does not give the jitter; ours is that of its published data (±3 mm). The 16-bit
+    precision is not the paper's either; it is three times as fast on a CPU that has it.
     """
     del preset  # one so far
-    recipe = TrainConfig(
+    return TrainConfig(
         labeler="cnn",
         samples=EPOCHS * num_frames,
         optimizer="sgd",
@@ -97,7 +98,3 @@ def with_preset(preset: Preset, config: TrainConfig, num_frames: int) -> TrainCo
         rig_share=0.0,
         anisotropy=0.0,
     )
-    usual = TrainConfig()
-    given = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    changed = {key: value for key, value in given.items() if value != getattr(usual, key)}
-    return dataclasses.replace(recipe, **changed)

@@ -1,4 +1,4 @@
-"""The training loop, top to bottom: rows, corruption, network, resume, weights, and a page about the run."""
+"""The training loop: rows, corruption, network, checkpoints, weights, and a page about the run."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 CHECKPOINT: Final = "checkpoint.pt"
 _CONFIG: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
-_MOST_HELD_OUT: Final = 8192
-_LOOKS: Final = 10  # at held-out frames in the course of a run
-_MOST_LOOKED_AT: Final = 512
+_MAX_HELD_OUT: Final = 8192
+_NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
+_MAX_EVALUATED: Final = 512
 
 Progress = Callable[[int, int, float], None]
-"""Called with samples done, samples wanted, and the loss."""
+"""Called with samples done, samples expected, and the loss."""
 
 
 def train_labeler(
@@ -51,7 +51,17 @@ def train_labeler(
     progress: Progress | None = None,
     save_every: float = 60.0,
 ) -> dict[str, Any]:
-    """Train a labeler and leave weights, card, curves and a page in `out`; goes on from a checkpoint there.
+    """Train a labeler and write weights, card, curves and a page to `out`; continues from a checkpoint there.
+
+    Args:
+        dataset: The training set.
+        config: How to train.
+        out: Folder of the run.
+        progress: Called after every step.
+        save_every: Time between checkpoints [s].
+
+    Returns:
+        The model card.
 
     Raises:
         DatasetError: The set is too small to train on.
@@ -69,12 +79,12 @@ def train_labeler(
     state.restore(out / CHECKPOINT)
     saved = time.monotonic()
     while state.done < config.samples:
-        # One generator a step, so that a resumed run draws what it would have.
+        # One generator per step, so that a resumed run makes the same draws.
         rng = np.random.default_rng((config.seed, state.done, fabric.global_rank))
         share = dataclasses.replace(config, batch=config.batch // fabric.world_size)
         loss = state.step(draw_batch(rows, share, rng=rng), rng=rng)
-        if fabric.is_global_zero and passed(state.done, config, _LOOKS):
-            state.look(held_out[:: -(-len(held_out) // _MOST_LOOKED_AT)], names)
+        if fabric.is_global_zero and passed(state.done, config, _NUM_EVALUATIONS):
+            state.evaluate(held_out[:: -(-len(held_out) // _MAX_EVALUATED)], names)
         if progress is not None and fabric.is_global_zero:
             progress(min(state.done, config.samples), config.samples, loss)
         if time.monotonic() - saved > save_every:
@@ -92,16 +102,16 @@ def train_labeler(
 def _split(dataset: Dataset, batch: int) -> tuple[NDArray[np.void], NDArray[np.void]]:
     """Rows to train on, and the held-out ones."""
     rows = dataset.rows()
-    held_out = min(_MOST_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
+    held_out = min(_MAX_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
     if len(rows) - held_out < batch:
         raise DatasetError(f"{dataset.path} has {len(rows)} frames, expected at least {batch + held_out + 1}")
     return rows[:-held_out], rows[-held_out:]
 
 
 def start_fabric(config: TrainConfig, out: Path) -> Fabric:
-    """Where the numbers are crunched: on GPUs where there are any, and what the curves are written with."""
+    """The devices to train on, GPUs where there are any, and the writer of the curves."""
     torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its greetings are not about this run
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its messages are not about this run
     warnings.filterwarnings("ignore", module="lightning_fabric")
     fabric = Fabric(
         accelerator="cuda" if torch.cuda.is_available() else "cpu",
@@ -116,10 +126,10 @@ def start_fabric(config: TrainConfig, out: Path) -> Fabric:
 def _card(
     network: nn.Module, rows: NDArray[np.void], config: TrainConfig, dataset: Dataset
 ) -> tuple[dict[str, Any], Report]:
-    """Model card: where the weights come from and what they reach on held-out simulated frames.
+    """Model card: where the weights come from, and their figures on held-out simulated frames.
 
     Returns:
-        The card, and all that was found with the paper's corruption.
+        The card, and the evaluation with the paper's corruption.
     """
     labeler = labeler_of(network, dataset.marker_names)
     markers = rows["markers"].astype(np.float64)

@@ -1,4 +1,4 @@
-"""What a training run carries from step to step, and how one step is made."""
+"""The state of a training run: network, optimizer, mean weights, history; one step; checkpoints."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CURVE: Final = 200  # points of the loss curve
 
 
 class TrainingState:
-    """What a run carries from step to step, and a checkpoint from run to run."""
+    """The state that a run carries from step to step and a checkpoint keeps."""
 
     def __init__(self, config: TrainConfig, fabric: Fabric) -> None:
         self.config = config
@@ -42,7 +42,7 @@ class TrainingState:
         self.began = time.monotonic(), 0
 
     def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
-        """One gradient step; the loss before it."""
+        """Make one gradient step and return the loss before it."""
         rate = self.config.learning_rate * _rate(self.config, self.done / self.config.samples)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -79,8 +79,8 @@ class TrainingState:
             {"loss": loss, "learning_rate": rate, "samples_per_second": speed}, step=self.done
         )
 
-    def look(self, rows: NDArray[np.void], names: tuple[str, ...]) -> None:
-        """Note how the mean weights do on a few held-out rows, the same each time."""
+    def evaluate(self, rows: NDArray[np.void], names: tuple[str, ...]) -> None:
+        """Record the slot accuracy of the mean weights on a few held-out rows, the same each time."""
         report = paper_report(labeler_of(self.averaged(), names), rows)
         accuracy = report.figures["slot_accuracy"]
         self.history.accuracies.append((self.done, accuracy))
@@ -88,7 +88,7 @@ class TrainingState:
 
     def averaged(self) -> nn.Module:
         """The network with the mean weights."""
-        with torch.random.fork_rng(devices=[]):  # its first weights are drawn for nothing
+        with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
             network = new_network(self.config.labeler, self.config.network)
         network.load_state_dict({name: tensor.cpu() for name, tensor in self.mean.items()})
         return network.eval()
@@ -107,7 +107,11 @@ class TrainingState:
                 torch.save(content, temporary)
 
     def restore(self, path: Path) -> None:
-        """Go on from a checkpoint, if there is one."""
+        """Continue from a checkpoint, if there is one.
+
+        Raises:
+            WeightsError: The checkpoint is damaged.
+        """
         if not path.is_file():
             return
         try:
@@ -137,13 +141,13 @@ def _rate(config: TrainConfig, progress: float) -> float:
 
 
 def passed(done: int, config: TrainConfig, parts: int) -> bool:
-    """Whether the last step ended one of so many parts of the run, each at least a step long."""
+    """Whether the last step ended one of this many parts of the run, each at least one step long."""
     part = max(config.batch, config.samples // parts)
     return (done - config.batch) // part != done // part
 
 
 def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
-    """What a labeler reaches on these rows with the paper's corruption, the same each time."""
+    """Evaluation of a labeler on these rows with the paper's corruption, the same each time."""
     markers = rows["markers"].astype(np.float64)
     corruption = paper_corruption(markers.shape[1])
     return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from handsim._version import __version__
 from handsim.app.command_table import COMMANDS, load
+from handsim.app.presets import PresetCommand
 from handsim.errors import HandSimError, choices
 
 
@@ -100,7 +101,9 @@ def _call(target: str, *, prog: str, help_line: str, args: Sequence[str]) -> int
     """Load "module:name", hand it the arguments through tyro, and return its exit code."""
     import tyro
 
-    command: Callable[..., Any] | dict[str, Callable[..., Any]] = load(target)
+    command: Callable[..., Any] | PresetCommand | dict[str, Callable[..., Any]] = load(target)
+    if isinstance(command, PresetCommand):
+        command = command.choose(args, prog)
     if isinstance(command, dict):
         result = tyro.extras.subcommand_cli_from_dict(command, prog=prog, description=help_line, args=args)
     else:

@@ -22,13 +22,13 @@ from render.sensors.depth_noise import DepthNoiseConfig
 from render.session import SHEET, RenderConfig, draw_shard, render_take
 from render.shown_take import load_shown_take
 from render.skin.look import TONES
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     file = tmp_path_factory.mktemp("take") / "take.truth.npz"
-    save_take(file, simulate_twin(TwinConfig(kind="hand-controller", num_frames=48)))
+    save_take(file, simulate_take(TakeConfig(kind="hand-controller", num_frames=48)))
     return file
 
 

@@ -31,7 +31,7 @@ from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 FRAMES = 60
 
@@ -43,7 +43,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def truth() -> Take:
-    return simulate_twin(TwinConfig(kind="hand-controller", num_frames=FRAMES))
+    return simulate_take(TakeConfig(kind="hand-controller", num_frames=FRAMES))
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from handsim.hand.model import HandModel
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_twin(TwinConfig(kind="hand-controller", num_frames=240))
+    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240))
 
 
 def users(take: Take) -> list[GloveFit]:

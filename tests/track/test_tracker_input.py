@@ -21,7 +21,7 @@ from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 NUM_MARKERS = 38
 SURE = Status.TRACKED, Status.FOUND
@@ -51,7 +51,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_twin(TwinConfig(kind="hand-controller", num_frames=240))
+    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240))
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.data.shards import Dataset
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 SMALL = [
     "--samples",
@@ -102,7 +102,7 @@ def test_empty_frames_are_labeled_as_empty(run):
 
 
 def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
-    truth = simulate_twin(TwinConfig(num_frames=240))
+    truth = simulate_take(TakeConfig(num_frames=240))
     save_take(run / "one.truth.npz", truth)
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)

@@ -53,5 +53,5 @@ def test_damaged_weights_are_told(tmp_path):
     folder = resources.files("train").joinpath("weights")
     (tmp_path / "labeler.json").write_bytes(folder.joinpath("dense19.json").read_bytes())
     (tmp_path / "labeler.safetensors").write_bytes(folder.joinpath("dense19.safetensors").read_bytes()[:-100])
-    with pytest.raises(WeightsError, match=r"labeler\.safetensors is damaged or no labeler's"):
+    with pytest.raises(WeightsError, match=r"labeler\.safetensors is damaged or not a labeler's"):
         load_labeler(tmp_path)

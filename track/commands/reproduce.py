@@ -14,7 +14,8 @@ from handsim.app.progress import progress_bar
 from handsim.files.json_files import save_json
 from train.commands.labeling_tables import LABELING_TABLES
 from train.labelers.storage import labeler_for_glove
-from train.simulation.twins import KINDS, TwinConfig, simulate_twin
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import TakeConfig, simulate_take
 
 if TYPE_CHECKING:
     from gloves.takes.take import Take
@@ -84,7 +85,7 @@ def cameras(config: _Config, rig: str = "six") -> None:
     from track.evaluation.tables import print_cameras
 
     num_frames = CAMERAS_FRAMES if config.num_frames is None else config.num_frames
-    twin = TwinConfig("single-hand", num_frames, config.glove, rig, config.seed)
+    twin = TakeConfig("single-hand", num_frames, config.glove, rig, config.seed)
     takes, measured = _measure_on({"single-hand": twin}, config)
     missing = 1.0 - takes["single-hand"].markers_present().mean()
     with_paper = config.glove == _PAPERS_GLOVE
@@ -99,14 +100,14 @@ REPRODUCE: Final = dict(sorted({**LABELING_TABLES, "table5": table5, "table7": t
 
 def _measure(config: TableConfig, *, trials: int = 0) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures of all kinds, and run all trackers over them."""
-    twins: dict[str, TwinConfig] = {
-        kind: TwinConfig(kind, config.num_frames, config.glove, seed=config.seed) for kind in KINDS
+    twins: dict[str, TakeConfig] = {
+        kind: TakeConfig(kind, config.num_frames, config.glove, seed=config.seed) for kind in KINDS
     }
     return _measure_on(twins, config, trials=trials)
 
 
 def _measure_on(
-    twins: Mapping[str, TwinConfig], config: TableConfig, *, trials: int = 0
+    twins: Mapping[str, TakeConfig], config: TableConfig, *, trials: int = 0
 ) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
     from track.evaluation.comparison import USERS, compare_trackers, trackers
@@ -117,7 +118,7 @@ def _measure_on(
     with progress_bar("captures") as (bar, task):
         bar.update(task, total=len(twins))
         for kind, twin in twins.items():
-            takes[kind] = simulate_twin(twin)
+            takes[kind] = simulate_take(twin)
             bar.advance(task)
     bare = {kind: without_body(take) for kind, take in takes.items()}
     frames = sum(take.num_frames for take in takes.values())

@@ -14,7 +14,7 @@ from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 _FRAMES: Final = 120
 
@@ -22,7 +22,7 @@ _FRAMES: Final = 120
 def track_take(run: DemoRun) -> Section:
     """Track a simulated capture and say how far its joints are off."""
     run.report("tracking a simulated capture")
-    take = simulate_twin(TwinConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
+    take = simulate_take(TakeConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
     names = tuple(f"*{number}" for number in range(take.points.shape[1]))
     tracked = track_capture(
         Capture(names, take.points, take.rate), Tracker(true_users(take), load_labeler(GLOVE))

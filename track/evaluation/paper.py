@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from train.simulation.twins import Kind
+from train.simulation.room_settings import Kind
 
 FRAMES: Final[dict[Kind, int]] = {
     "single-hand": 4785,

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from track.evaluation.comparison import Measurement
 from track.evaluation.paper import CAMERAS, HAN, TABLE5, TABLE7
-from train.simulation.twins import KINDS
+from train.simulation.room_settings import KINDS
 
 if TYPE_CHECKING:
     from jaxtyping import Float

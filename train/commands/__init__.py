@@ -1,1 +1,10 @@
-"""TODO map."""
+"""The commands of this package, one per file.
+
+- generate: `handsim generate` makes a training set.
+- train: `handsim train` trains a labeler on it.
+- label: `handsim label` labels a capture.
+- evaluate: `handsim evaluate` measures a labeler.
+- simulate: `handsim simulate` simulates a capture with its truth.
+- export: `handsim export` writes a labeler as an ONNX file.
+- reproduce: `handsim reproduce` prints the paper's tables of labeling beside ours.
+"""

@@ -61,7 +61,7 @@ def evaluate(
     _print_report(report.figures, by_marker, title)
     if json is not None:
         drawn = {"glove": glove, "occlude": occlude, "ghosts": ghosts, "seed": seed}
-        # JSON knows no NaN, which stands where there was nothing to count.
+        # JSON has no NaN, which stands where there was nothing to count.
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
         found = {"frames": report.num_frames, "figures": figures, "slot_accuracy_by_marker": by_marker}
         save_json(json, {**drawn, **found})

@@ -11,16 +11,17 @@ from rich.console import Console
 from handsim.app.progress import progress_bar
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
-from train.simulation.synthesis import DatasetConfig, generate_dataset
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
+from train.simulation.takes import TakeConfig, simulate_take
 
-_TAKE: Final = 1200  # frames of the continuous take that the report's gaps are from
+_TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 
 
 def generate(
     out: Path, config: Annotated[DatasetConfig, tyro.conf.arg(name="")], workers: int | None = None
 ) -> None:
-    """Make a training set and a page of plots of it; run it again to go on where it was stopped.
+    """Make a training set and a page of plots of it; run it again to continue where it was stopped.
 
     Args:
         out: Folder for the shards, their manifest and report.html.
@@ -34,10 +35,10 @@ def generate(
             workers=workers,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    # Not in generate_dataset: the set is whole without its report, whose bytes hang on matplotlib's version.
+    # Not in generate_dataset: a set is complete without its report, whose bytes depend on matplotlib.
     with Console(stderr=True).status("drawing the report"):
-        take = simulate_twin(
-            TwinConfig(kind="hand-hand", num_frames=_TAKE, glove=config.glove, rig=config.rig)
+        take = simulate_take(
+            TakeConfig(kind="hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
         )
         report = write_report(Dataset(out), present=take.markers_present(), rate=take.rate)
     Console().print(f"{manifest.num_frames} frames of {config.glove} in {out}")

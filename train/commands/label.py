@@ -28,7 +28,7 @@ def label(
 
     Args:
         capture: A .trc, .c3d or Motive .csv file.
-        out: Labeled .trc or .c3d file; points that are no markers become columns Unlabeled1, Unlabeled2, ...
+        out: Labeled .trc or .c3d file; points that are not markers become columns Unlabeled1, Unlabeled2, ...
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
     """
@@ -43,21 +43,21 @@ def label(
             bar.update(task, completed=len(labelings), total=len(frames))
     labels = [labeling.labels for labeling in labelings]
     write_capture(out, labeled_capture(frames, labels, network.marker_names, source.rate))
-    named = sum(int((label >= 0).sum()) for label in labels)
+    labeled = sum(int((label >= 0).sum()) for label in labels)
     points = sum(len(label) for label in labels)
-    sure = np.concatenate([labeling.confidence for labeling in labelings]) if points else np.ones(1)
+    confidence = np.concatenate([labeling.confidence for labeling in labelings]) if points else np.ones(1)
     Console().print(
-        f"{out}: {len(frames)} frames, {named} of {points} points labeled, "
-        f"median confidence {np.median(sure):.3f}{_side(glove, frames, labels)}"
+        f"{out}: {len(frames)} frames, {labeled} of {points} points labeled, "
+        f"median confidence {np.median(confidence):.3f}{_side(glove, frames, labels)}"
     )
 
 
 def _side(glove: str, frames: list[np.ndarray], labels: list[np.ndarray]) -> str:
-    """Whose hand it looks like, from a few frames with the most markers."""
-    from train.labelers.side import SideTeller
+    """Which hand it probably is, from the frames with the most markers."""
+    from train.labelers.side import SideClassifier
 
     best = sorted(range(len(frames)), key=lambda frame: -int((labels[frame] >= 0).sum()))[:_SIDE_FRAMES]
-    teller = SideTeller(load_layout(glove), rng=np.random.default_rng(0))
-    sides = [teller.tell(frames[frame], labels[frame]) for frame in best]
+    classifier = SideClassifier(load_layout(glove), rng=np.random.default_rng(0))
+    sides = [classifier.classify(frames[frame], labels[frame]) for frame in best]
     votes = sum(clear if side == "right" else -clear for side, clear in sides)
     return "" if votes == 0.0 else f", a {'right' if votes > 0.0 else 'left'} hand"

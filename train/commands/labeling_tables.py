@@ -15,7 +15,7 @@ from gloves.captures.collection import find_captures, read_markers
 from gloves.captures.gaps import count_gaps, run_lengths
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError
-from train.config import Kind, TrainConfig, with_preset
+from train.config import Kind, TrainConfig, preset_config
 from train.data.shards import Dataset
 from train.evaluation.paper import AUGMENTATIONS, TABLE4, TABLE6
 from train.evaluation.tables import (
@@ -27,8 +27,8 @@ from train.evaluation.tables import (
     simulate_takes,
 )
 from train.labelers.storage import labeler_for_glove, shipped_labelers
-from train.simulation.twins import KINDS, TWINS
-from train.simulation.unseen import unseen_markers
+from train.simulation.held_out import held_out_markers
+from train.simulation.room_settings import KINDS, TWINS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -52,16 +52,16 @@ def table2(
 
     Args:
         data: Training set that handsim generate wrote.
-        out: Folder for the runs; the same command goes on where it was stopped.
+        out: Folder for the runs; the same command continues where it was stopped.
         kinds: Networks to train: set, cnn (by the paper's recipe) or both.
-        samples: Clouds that each network learns from (the paper: 12.8 million).
-        num_frames: Test frames of people and poses that the training set does not hold.
-        captures: Labeled captures or folders of them; a second table is of these.
+        samples: Clouds that each network is trained on (the paper: 12.8 million).
+        num_frames: Test frames of people and poses that are not in the training set.
+        captures: Labeled captures or folders of them, for a second table.
         seed: Seed of the training, the test frames and their corruption.
     """
     dataset = Dataset(data)
     names, glove = dataset.marker_names, str(dataset.manifest.config["glove"])
-    tests = {"unseen simulated frames": unseen_markers(glove, num_frames, seed=seed)}
+    tests = {"held-out simulated frames": held_out_markers(glove, num_frames, seed=seed)}
     if captures:
         files = find_captures(captures)
         tests[f"{len(files)} captures"] = read_markers(files, names)
@@ -81,9 +81,10 @@ def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samp
     from train.loop import train_labeler
 
     drawn = augmentations(len(dataset.marker_names))[name]
-    usual = TrainConfig(labeler=kind, samples=samples, seed=seed)
-    recipe = with_preset("han2018", usual, dataset.manifest.num_frames) if kind == "cnn" else usual
-    config = dataclasses.replace(recipe, rig_share=0.0, occlude=drawn.occlude, ghosts=drawn.ghosts)
+    recipe = preset_config("han2018", dataset.manifest.num_frames) if kind == "cnn" else TrainConfig()
+    config = dataclasses.replace(
+        recipe, samples=samples, seed=seed, rig_share=0.0, occlude=drawn.occlude, ghosts=drawn.ghosts
+    )
     with progress_bar("samples") as (bar, task):
         train_labeler(
             dataset,
@@ -117,8 +118,8 @@ def table4(
 
     Args:
         labelers: Shipped names, folders of trained labelers, or exported .onnx files.
-        num_frames: Test frames of people and poses that no training set holds, with the paper's recipe.
-        captures: Labeled captures or folders of them; a column is theirs, with the paper's recipe.
+        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
+        captures: Labeled captures or folders of them, for another column with the paper's recipe.
         seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
     """
     _print_tests("Table 4", "dense19", TABLE4, labelers, num_frames, captures, seed)
@@ -134,8 +135,8 @@ def table6(
 
     Args:
         labelers: Shipped names, folders of trained labelers, or exported .onnx files.
-        num_frames: Test frames of people and poses that no training set holds, with the paper's recipe.
-        captures: Labeled captures or folders of them; a column is theirs, with the paper's recipe.
+        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
+        captures: Labeled captures or folders of them, for another column with the paper's recipe.
         seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
     """
     _print_tests("Table 6", "sparse13", TABLE6, labelers, num_frames, captures, seed)
@@ -159,7 +160,7 @@ def _print_tests(
         name: labeler_for_glove(glove, name if name in shipped_labelers() else Path(name))
         for name in labelers
     }
-    stills = {"synthetic": unseen_markers(glove, num_frames, seed=seed)}
+    stills = {"synthetic": held_out_markers(glove, num_frames, seed=seed)}
     takes = _simulate(glove, seed)
     if captures:
         names = next(iter(found.values())).marker_names
@@ -197,7 +198,7 @@ def _table3(takes: dict[str, Take]) -> Table:
 
 
 def _by_marker(takes: dict[str, Take]) -> Table:
-    table = Table(title="Missing share and gap lengths, a marker at a time")
+    table = Table(title="Missing share and gap lengths per marker")
     for column in ("Test set", "mean", "least", "most", "median gap", "p90", "p99 [frames]"):
         table.add_column(
             column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"

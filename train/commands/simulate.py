@@ -13,12 +13,12 @@ from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX, save_take
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 PUBLISHED_GAPS = "3-4", "24-43"  # median and p90 of real finger markers' gaps [frames]; docs/room.md
 
 
-def simulate(out: Path, config: Annotated[TwinConfig, tyro.conf.arg(name="")]) -> None:
+def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -> None:
     """Simulate a capture of two hands; the truth goes beside it.
 
     Args:
@@ -26,7 +26,7 @@ def simulate(out: Path, config: Annotated[TwinConfig, tyro.conf.arg(name="")]) -
         config: What to simulate.
     """
     check_suffix(out, WRITABLE)
-    take = simulate_twin(config)
+    take = simulate_take(config)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     write_capture(out, Capture(names, take.points, take.rate))
     truth = out.with_suffix(SUFFIX)

@@ -2,38 +2,42 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import tyro
 from rich.console import Console
 
+from handsim.app.presets import PresetCommand, given_option
 from handsim.app.progress import progress_bar
-from train.config import Preset, TrainConfig, with_preset
-from train.data.shards import Dataset
+from train.config import PRESETS, Preset, TrainConfig, preset_config
+from train.data.shards import Dataset, load_manifest
 from train.reports.figures_table import print_figures
 from train.reports.run_page import PAGE
 
+_PAPER_FRAMES: Final = 170_330  # for the help, which knows no training set
 
-def train(
+
+def _train(
     dataset: Annotated[Path, tyro.conf.Positional],
     out: Path,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")],
     preset: Preset | None = None,
 ) -> None:
-    """Train a labeler on a training set and draw a page about it; run it again to go on where it was stopped.
+    """Train a labeler on a training set and write a page about it; run it again to continue a stopped run.
 
     Args:
         dataset: Folder that `handsim generate` wrote.
         out: Folder for the weights, the model card, the checkpoint and report.html.
         config: How to train.
-        preset: A published recipe; options given beside it hold all the same.
+        preset: A published recipe, which replaces the defaults; options given beside it hold.
     """
+    del preset  # it is in `config` already
     from train.loop import train_labeler
 
     rows = Dataset(dataset)
-    if preset is not None:
-        config = with_preset(preset, config, rows.manifest.num_frames)
     with progress_bar("samples") as (bar, task):
 
         def report(done: int, total: int, loss: float) -> None:
@@ -43,3 +47,31 @@ def train(
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
     Console().print(f"weights and model card in {out}")
     Console().print(f"report in {out / PAGE}", soft_wrap=True, markup=False)
+
+
+def _with_preset_as_default(args: Sequence[str], prog: str) -> Callable[..., None]:
+    """`handsim train` with the settings of the preset among its arguments as the default of `config`."""
+    name = given_option(args, "--preset")
+    preset = next((preset for preset in PRESETS if preset == name), None)
+    if preset is None:
+        return _train
+    # The recipe counts epochs, so the training set must be known before its defaults are.
+    folder = tyro.cli(
+        functools.partial(_dataset_of, config=preset_config(preset, _PAPER_FRAMES)), prog=prog, args=args
+    )
+    config = preset_config(preset, load_manifest(folder).num_frames)
+    return functools.partial(_train, config=config)
+
+
+@functools.wraps(_train)
+def _dataset_of(
+    dataset: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    config: Annotated[TrainConfig, tyro.conf.arg(name="")],
+    preset: Preset | None = None,
+) -> Path:
+    del out, config, preset
+    return dataset
+
+
+train: Final = PresetCommand(_with_preset_as_default)

@@ -1,1 +1,6 @@
-"""TODO map."""
+"""Training data: files, batches and their augmentation.
+
+- shards: a training set on disk: `.npy` shards and a manifest; `Dataset` reads it.
+- batches: random rows, stretched, mirrored and centered, as batches.
+- augmentation: jitter, occlusion, ghosts and random order (`Corruption`, `corrupt`).
+"""

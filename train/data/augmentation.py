@@ -1,6 +1,6 @@
-"""What training does to a clean row before the labeler sees it: jitter, occlusion, ghosts, a shuffled order.
+"""Augmentation of clean rows for training: jitter, occlusion, ghosts and a shuffled order.
 
-Some batches keep what the simulated rig saw of them, the others go through the paper's recipe (Han et al.
+Some batches keep what the simulated rig sees of them; the others get the corruption of the paper (Han et al.
 2018, section 3.3): zero to five draws of markers to drop, zero to two ghosts anywhere in the sample's box.
 """
 
@@ -21,7 +21,7 @@ class Corruption:
     """The paper's corruption, as it is drawn for training and for tests."""
 
     occlude: int = 5
-    """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio tells."""
+    """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
     ghosts: int = 2
     """Most ghosts added, uniform in the sample's box grown by `margin`."""
     jitter: float = 0.0
@@ -34,7 +34,9 @@ class Cloud(NamedTuple):
     """Clouds of points, padded to one length, in random order."""
 
     points: Float[np.ndarray, "B N 3"]
+    """[m]; 0 in padding."""
     present: Bool[np.ndarray, "B N"]
+    """False in padding."""
     truth: Int[np.ndarray, "B N"]
     """Marker of each point, -1 for a ghost."""
 
@@ -46,12 +48,12 @@ def corrupt(
     ghosts: Float[np.ndarray, "B G 3"] | None = None,
     rng: np.random.Generator,
 ) -> Cloud:
-    """Corrupted, shuffled clouds of clean markers [m].
+    """Corrupted, shuffled clouds (B, N) of clean markers (B, M).
 
     Args:
-        markers: Marker positions; NaN rows are missing already.
+        markers: Marker positions (B, M, 3) [m]; NaN where a marker is missing already.
         corruption: How much is drawn at random on top.
-        ghosts: Ghosts that the rig saw, NaN where none.
+        ghosts: Ghosts that the rig sees (B, G, 3) [m], NaN where there is none.
         rng: Source of all randomness.
     """
     batch, count = markers.shape[:2]
@@ -76,12 +78,12 @@ def corrupt(
 
 
 def _draw_drops(batch: int, count: int, most: int, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Zero to `most` draws with replacement, a row each."""
+    """Markers to drop (B, M): zero to `most` draws with replacement per row."""
     dropped = np.zeros((batch, count), dtype=bool)
     if most:
-        wanted = rng.integers(0, most + 1, size=batch)
+        num_draws = rng.integers(0, most + 1, size=batch)
         draws = rng.integers(0, count, size=(batch, most))
-        taken = np.arange(most) < wanted[:, None]
+        taken = np.arange(most) < num_draws[:, None]
         rows = np.broadcast_to(np.arange(batch)[:, None], draws.shape)
         dropped[rows[taken], draws[taken]] = True
     return dropped
@@ -97,6 +99,6 @@ def _draw_ghosts(
     side = np.where(np.isfinite(high - low), high - low, np.nan)
     uniform = rng.uniform(-corruption.margin / 2, 1 + corruption.margin / 2, size=(batch, most, 3))
     ghosts: NDArray[np.float64] = low[:, None] + uniform * side[:, None]
-    wanted = rng.integers(0, most + 1, size=batch)
-    ghosts[np.arange(most) >= wanted[:, None]] = np.nan
+    num_ghosts = rng.integers(0, most + 1, size=batch)
+    ghosts[np.arange(most) >= num_ghosts[:, None]] = np.nan
     return ghosts

@@ -20,7 +20,7 @@ class Batch(NamedTuple):
 
     cloud: Cloud
     markers: Float[np.ndarray, "B M 3"]
-    """Where all markers are [m], the lost ones too, in the clouds' frame: centered and not turned."""
+    """True positions [m] of all markers, the lost ones too, in the clouds' frame: centered, not rotated."""
 
 
 def paper_corruption(num_markers: int) -> Corruption:
@@ -29,11 +29,11 @@ def paper_corruption(num_markers: int) -> Corruption:
 
 
 def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Generator) -> Batch:
-    """Random rows as corrupted clouds, centered; left hands are mirrored to right ones.
+    """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones.
 
     Args:
         rows: Rows of a training set, see `train.data.shards.row_dtype`.
-        config: How many, and how to corrupt them.
+        config: Size of the batch, and how to corrupt it.
         rng: Source of all randomness.
     """
     chosen = rows[rng.integers(len(rows), size=config.batch)]
@@ -62,7 +62,7 @@ def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArr
 
 
 def _mirrors(hand: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Matrices (B, 3, 3) that mirror left hands; a person's two follow each other in the order of `SIDES`."""
+    """Matrices (B, 3, 3) that mirror left hands; the two hands of a person are in the order of `SIDES`."""
     mirrors = np.tile(np.eye(3), (len(hand), 1, 1))
     mirrors[hand % len(SIDES) == SIDES.index("left"), 0, 0] = -1.0
     return mirrors

@@ -1,6 +1,6 @@
 """Training sets on disk: `.npy` shards of rows and hands, and a manifest that names and checks them.
 
-A row is clean: what the hand did and what the rig saw of it. Jitter, drops and a shuffled order are drawn
+A row is clean: the pose of the hand and what the rig sees of it. Jitter, drops and a shuffled order are drawn
 when training (`train.data.augmentation`).
 """
 
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -34,8 +35,9 @@ CONFIG: Final = "config.json"
 def row_dtype(num_markers: int) -> np.dtype[np.void]:
     """One frame of one hand.
 
-    qpos, hand (its place in the shard), true markers [m], cameras with a free view of each (bits), where the
-    optical system puts them [m] (NaN where it loses them), ghosts [m].
+    `qpos` (position [m], quaternion wxyz, 20 joint angles [rad]), `hand` (its index in the shard's hands),
+    true `markers` (M, 3) [m], `cameras` with a free view of each marker (bits), positions `observed` by the
+    optical system (M, 3) [m] (NaN where it loses the marker), `ghosts` (4, 3) [m] (NaN where there is none).
     """
     return np.dtype(
         [
@@ -61,6 +63,8 @@ class Manifest:
     """Cameras that must see a marker before it exists."""
     files: dict[str, str]
     """SHA-256 of every file, by name."""
+    redrawn: dict[str, int] | None = None
+    """How often people or scenes had to be drawn again, by reason; None in a set that did not count them."""
     units: str = "metres, radians, world frame"
     schema: int = SCHEMA
 
@@ -75,9 +79,28 @@ def hands_name(shard: int) -> str:
     return f"hands-{shard:05d}.npy"
 
 
+def redrawn_name(shard: int) -> str:
+    """File of a shard's counts of what was drawn again."""
+    return f"redrawn-{shard:05d}.json"
+
+
+def load_redrawn(path: Path, num_shards: int) -> dict[str, int] | None:
+    """How often people or scenes were drawn again in all shards, by reason.
+
+    None where a shard has no counts, as those of earlier versions.
+    """
+    files = [path / redrawn_name(shard) for shard in range(num_shards)]
+    if not all(file.is_file() for file in files):
+        return None
+    total: Counter[str] = Counter()
+    for file in files:
+        total.update(load_json(file))
+    return dict(sorted(total.items()))
+
+
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an `.npy` file, whole or not at all."""
-    # By hand, because numpy.save tells a full disk as "8192 requested and 6690 written", without its errno.
+    # Not numpy.save: it reports a full disk as "8192 requested and 6690 written", without its errno.
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
         file.write(np.ascontiguousarray(array).tobytes())
@@ -94,6 +117,27 @@ def save_manifest(out: Path, manifest: Manifest) -> None:
     save_json(out / MANIFEST, dataclasses.asdict(manifest))
 
 
+def load_manifest(path: Path) -> Manifest:
+    """The manifest of a finished training set; its files are not checked.
+
+    Args:
+        path: The folder that `handsim generate` wrote.
+
+    Raises:
+        DatasetError: Not a training set, unfinished, of another schema, or the manifest is damaged.
+    """
+    if not (path / MANIFEST).is_file():
+        hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
+        raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
+    content = load_json(path / MANIFEST)
+    if content.get("schema") != SCHEMA:
+        raise DatasetError(f"{path} has schema {content.get('schema')}, expected {SCHEMA}")
+    try:
+        return Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
+    except (TypeError, KeyError) as error:
+        raise DatasetError(f"{path / MANIFEST} is damaged: a field is missing or unknown") from error
+
+
 class Dataset:
     """A finished training set, its rows memory-mapped.
 
@@ -105,23 +149,14 @@ class Dataset:
     """
 
     def __init__(self, path: Path) -> None:
-        if not (path / MANIFEST).is_file():
-            hint = "is unfinished; run handsim generate again" if (path / CONFIG).is_file() else "holds none"
-            raise DatasetError(f"expected a training set with a {MANIFEST}, but {path} {hint}")
-        content = load_json(path / MANIFEST)
-        if content.get("schema") != SCHEMA:
-            raise DatasetError(f"{path} has schema {content.get('schema')}, expected {SCHEMA}")
-        try:
-            self.manifest = Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
-        except (TypeError, KeyError) as error:
-            raise DatasetError(f"{path / MANIFEST} is damaged: a field is missing or unknown") from error
-        for name, wanted in self.manifest.files.items():
+        self.manifest = load_manifest(path)
+        for name, expected in self.manifest.files.items():
             file = path / name
             if not file.is_file():
                 raise DatasetError(
                     f"{file} is missing; delete {path / MANIFEST} and run handsim generate again"
                 )
-            if checksum(file) != wanted:
+            if checksum(file) != expected:
                 raise DatasetError(
                     f"{file} is damaged (its checksum is not the manifest's); delete it together with "
                     f"{MANIFEST} and run handsim generate again"
@@ -136,9 +171,9 @@ class Dataset:
         return self.manifest.marker_names
 
     def rows(self) -> Shaped[np.ndarray, "T"]:
-        """All rows in order, read into memory."""
+        """All T rows in order, read into memory; see `row_dtype` for their fields."""
         return np.concatenate(self.shards)
 
     def hands(self, shard: int) -> list[HandShape]:
-        """The hands of a shard, which its rows count from 0."""
+        """The hands of a shard; the `hand` of its rows is an index into them."""
         return [unpack_hand(record) for record in np.load(self.path / hands_name(shard), allow_pickle=False)]

@@ -1,4 +1,4 @@
-"""Measure a labeler: known markers, corrupted as in the paper, labeled, and counted."""
+"""Evaluation of labelers: known markers are corrupted as in the paper, labeled, and counted."""
 
 from __future__ import annotations
 
@@ -26,20 +26,19 @@ _CHUNK: Final = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """What an evaluation found."""
+    """The result of an evaluation."""
 
     figures: dict[str, float]
     """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.reliability` the expected
-    calibration error and
-    the share of points labeled wrongly without the 2 % least sure (with them, it is 1 - point accuracy)."""
+    calibration error and the share of points labeled wrongly without the 2 % of least confidence."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int
     confusion: Int[np.ndarray, "M+1 M+1"]
-    """Points by what they are (rows) and were called (columns): markers in label order, then ghost."""
+    """Points by true label (rows) and given label (columns): markers in label order, then ghost."""
     confidences: Float[np.ndarray, "N"]
-    """How sure the label of each point was: all frames' points, in order."""
+    """Confidence of each point's label, the points of all frames in order."""
     right: Bool[np.ndarray, "N"]
-    """Whether it was the right one."""
+    """Whether that label is right."""
 
 
 def evaluate_labeler(
@@ -49,12 +48,12 @@ def evaluate_labeler(
     *,
     rng: np.random.Generator,
 ) -> Report:
-    """Corrupt, label, count.
+    """Corrupt known markers, label them and count errors.
 
     Args:
-        labeler: What to measure.
-        markers: True markers [m] in the labeler's order, NaN where missing.
-        corruption: What is drawn on top.
+        labeler: The labeler to evaluate.
+        markers: True markers (T, M, 3) [m] in the labeler's order, NaN where missing.
+        corruption: Occlusion, ghosts and jitter to draw.
         rng: Source of all randomness.
     """
     count = _Count(labeler)
@@ -68,7 +67,11 @@ def evaluate_labeler(
 
 
 def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
-    """Label every hand of every frame of simulated takes, told apart by the truth, and count.
+    """Label every hand of every frame of simulated takes, separated by the truth, and count errors.
+
+    Args:
+        labeler: The labeler to evaluate.
+        takes: Takes with truth.
 
     Raises:
         CaptureError: A take's glove has other markers than the labeler knows.
@@ -91,8 +94,8 @@ def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
 def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:
     """One hand's points of every frame [m], with the marker of each; -1 for a ghost.
 
-    A ghost belongs to the hand with the nearest marker, if that is no further than `GHOST_REACH`. Markers of
-    a body with three or more are the system's own business and left out, as are those of the other hand.
+    A ghost belongs to the hand with the nearest marker, if that is within `GHOST_REACH`. Markers of a body
+    with three or more are left out, since the system tracks it, as are those of the other hand.
     """
     nearest = np.stack([_nearest_marker(take, label) for label in take.hand_labels])
     mine = take.hand_labels[hand]
@@ -105,7 +108,7 @@ def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], 
 
 
 def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "T N"]:
-    """Distance of every point from the nearest marker seen of one hand [m]; inf without any."""
+    """Distance of every point from the nearest marker seen of one hand [m]; inf where none is seen."""
     markers = take.observed(label)
     distance = np.full(take.labels.shape, np.inf)
     for frame, points in enumerate(take.points):
@@ -117,7 +120,7 @@ def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "T N"]:
 
 
 class _Count:
-    """Labels clouds and keeps the score."""
+    """Labels clouds and counts errors."""
 
     def __init__(self, labeler: Labeler) -> None:
         self.labeler = labeler

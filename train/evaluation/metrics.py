@@ -1,8 +1,8 @@
-"""How good a labeling is, counted as Han et al. 2018 count it, with what the paper leaves implicit said.
+"""Accuracy, precision and recall of labelings, as Han et al. 2018 define them.
 
 Slot accuracy: over frames and label slots, a slot is right when it holds the right point, or rightly none
-(Tables 2, 4 and 6 on synthetic data). Point accuracy: over the points that came in, ghosts among them.
-Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as what is to be found. Macro F1 is
+(Tables 2, 4 and 6 on synthetic data). Point accuracy: over the points of the input, ghosts among them.
+Occlusion (O) and ghost (G) figures take "occluded slot" and "ghost point" as the positive class. Macro F1 is
 over points too: the mean F1 of the markers and of "ghost", the null class, as SOMA (Ghorbani and Black 2021)
 counts it.
 """
@@ -29,27 +29,32 @@ class LabelCounts:
     points: int = 0
     points_right: int = 0
     occluded: int = 0
-    occluded_said: int = 0
+    occluded_given: int = 0
     occluded_right: int = 0
     ghosts: int = 0
-    ghosts_said: int = 0
+    ghosts_given: int = 0
     ghosts_right: int = 0
     confusion: Int[np.ndarray, "M+1 M+1"] = field(
         default_factory=lambda: np.zeros((0, 0), dtype=np.int64), compare=False
     )
-    """Points by what they are (rows) and were called (columns): markers in label order, then ghost.
-    Without rows until there was a frame."""
+    """Points by true label (rows) and given label (columns): markers in label order, then ghost.
+    Empty before the first frame."""
 
     def add(
         self, labels: Int[np.ndarray, "N"], truth: Int[np.ndarray, "N"], num_labels: int
     ) -> Bool[np.ndarray, "M"]:
-        """Count one frame: labels given to its points, and the true ones; -1 is a ghost.
+        """Count one frame.
+
+        Args:
+            labels: Given label of each point, -1 for a ghost.
+            truth: True label of each point, -1 for a ghost.
+            num_labels: Number of markers M.
 
         Returns:
             Which label slots are right.
         """
-        said, held = _slots(labels, num_labels), _slots(truth, num_labels)
-        right: np.ndarray = said == held
+        given, true = _slots(labels, num_labels), _slots(truth, num_labels)
+        right: np.ndarray = given == true
         slots_right, points_right = int(right.sum()), int((labels == truth).sum())
         self.frames += 1
         self.frames_right += slots_right == num_labels and points_right == len(truth)
@@ -57,15 +62,15 @@ class LabelCounts:
         self.slots_right += slots_right
         self.points += len(truth)
         self.points_right += points_right
-        self.occluded += int((held < 0).sum())
-        self.occluded_said += int((said < 0).sum())
-        self.occluded_right += int(((said < 0) & (held < 0)).sum())
+        self.occluded += int((true < 0).sum())
+        self.occluded_given += int((given < 0).sum())
+        self.occluded_right += int(((given < 0) & (true < 0)).sum())
         self.ghosts += int((truth < 0).sum())
-        self.ghosts_said += int((labels < 0).sum())
+        self.ghosts_given += int((labels < 0).sum())
         self.ghosts_right += int(((labels < 0) & (truth < 0)).sum())
         if not self.confusion.size:
             self.confusion = np.zeros((num_labels + 1, num_labels + 1), dtype=np.int64)
-        np.add.at(self.confusion, (truth, labels), 1)  # -1, a ghost, is the last place of either
+        np.add.at(self.confusion, (truth, labels), 1)  # -1, a ghost, is the last row and column
         return right
 
     def figures(self) -> dict[str, float]:
@@ -75,17 +80,17 @@ class LabelCounts:
             "point_accuracy": _share(self.points_right, self.points),
             "frame_accuracy": _share(self.frames_right, self.frames),
             "occlusion_ratio": _share(self.occluded, self.slots),
-            "occlusion_precision": _share(self.occluded_right, self.occluded_said),
+            "occlusion_precision": _share(self.occluded_right, self.occluded_given),
             "occlusion_recall": _share(self.occluded_right, self.occluded),
             "ghost_ratio": _share(self.ghosts, self.slots),
-            "ghost_precision": _share(self.ghosts_right, self.ghosts_said),
+            "ghost_precision": _share(self.ghosts_right, self.ghosts_given),
             "ghost_recall": _share(self.ghosts_right, self.ghosts),
             "macro_f1": macro_f1(self.confusion),
         }
 
 
 def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
-    """Mean F1 of the classes that occur, in truth or in what was said; NaN where none does.
+    """Mean F1 of the classes that occur, as true or given labels; NaN where none does.
 
     Args:
         confusion: Counts, rows the truth.
@@ -105,8 +110,8 @@ def percent(share: float) -> str:
 def _slots(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"]:
     """Which point each label slot holds, -1 for none."""
     slots = np.full(num_labels, -1)
-    named = np.flatnonzero(labels >= 0)
-    slots[labels[named]] = named
+    labeled = np.flatnonzero(labels >= 0)
+    slots[labels[labeled]] = labeled
     return slots
 
 

@@ -1,4 +1,4 @@
-"""What Han et al. 2018 print in their tables of labeling, as shares, rows and columns as they must be read.
+"""The labeling tables of Han et al. 2018 as shares, with the header of Table 2 corrected.
 
 The header of Table 2 is transposed in print: its rows are test sets and its columns networks, which its text
 and Table 4 (whose synthetic accuracy is the last cell) agree on.

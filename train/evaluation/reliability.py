@@ -1,4 +1,4 @@
-"""Whether a labeler's confidence says how often it is right, and what it buys to leave the least sure out."""
+"""Calibration of a labeler's confidence, and the error without the points of least confidence."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 BINS: Final = 15
 """Equally wide bins of confidence."""
 LEAST_SURE: Final = 0.02
-"""Share of the points that a reader might look through by hand."""
+"""Share of the points that a person might check by hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,24 +28,24 @@ class Reliability:
 
 
 def reliability(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> Reliability:
-    """How often points of each confidence are right.
+    """Share of right labels by confidence.
 
     Args:
-        confidence: How sure each label is, 0 to 1; a bin holds its lower edge, the last one 1 too.
+        confidence: Confidence of each label, 0 to 1; a bin includes its lower edge, the last one also 1.
         right: Which labels are right.
     """
-    place = np.floor(confidence * BINS).astype(np.int64).clip(0, BINS - 1)
-    count = np.bincount(place, minlength=BINS)
-    sums = [np.bincount(place, weights, minlength=BINS) for weights in (confidence, right)]
+    index = np.floor(confidence * BINS).astype(np.int64).clip(0, BINS - 1)
+    count = np.bincount(index, minlength=BINS)
+    sums = [np.bincount(index, weights, minlength=BINS) for weights in (confidence, right)]
     with np.errstate(invalid="ignore"):
         return Reliability(sums[0] / count, sums[1] / count, count)
 
 
 def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"]) -> float:
-    """Mean distance of a bin's confidence from its share right, weighted by its points; NaN without any.
+    """Mean difference of a bin's confidence and its share of right labels, weighted by points; NaN if empty.
 
     Args:
-        confidence: How sure each label is, 0 to 1.
+        confidence: Confidence of each label, 0 to 1.
         right: Which labels are right.
     """
     if not len(confidence):
@@ -57,20 +57,20 @@ def expected_calibration_error(confidence: Float[np.ndarray, "N"], right: Bool[n
 def error_without(
     confidence: Float[np.ndarray, "N"], right: Bool[np.ndarray, "N"], share: float = LEAST_SURE
 ) -> float:
-    """Share of points labeled wrongly after the least sure are left out; NaN when none is kept.
+    """Share of points labeled wrongly after those of least confidence are left out; NaN when none is kept.
 
-    Of points of one confidence, only some of which go, it goes the mean over all ways to choose them: the
-    order in which points came has no say.
+    Where only some points of one confidence are left out, the result is the mean over all choices, so that
+    the order of the points does not matter.
 
     Args:
-        confidence: How sure each label is, 0 to 1.
+        confidence: Confidence of each label, 0 to 1.
         right: Which labels are right.
-        share: How many to leave out, rounded to whole points.
+        share: Share of the points to leave out, rounded to whole points.
     """
     kept = len(confidence) - round(share * len(confidence))
     if not kept:
         return float("nan")
-    least = np.partition(confidence, -kept)[-kept]  # the least sure that is kept
+    least = np.partition(confidence, -kept)[-kept]  # the least confidence that is kept
     above, tied = confidence > least, confidence == least
     from_tied = (kept - above.sum()) * (~right[tied]).mean()
     return float(((~right[above]).sum() + from_tied) / kept)

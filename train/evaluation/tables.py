@@ -1,4 +1,4 @@
-"""The paper's tables of labeling: the same tests for our labelers, its figures beside ours."""
+"""Tables of labeling: the paper's tests for our labelers, with its figures beside ours."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from train.data.batches import paper_corruption
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler, evaluate_takes
 from train.evaluation.paper import AUGMENTATIONS, TABLE2, TEST_SETS
 from train.labelers.protocol import Labeler
-from train.simulation.twins import KINDS, TwinConfig, simulate_twin
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import TakeConfig, simulate_take
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -56,7 +57,7 @@ def simulate_takes(glove: str, seed: int, done: Callable[[], None]) -> dict[str,
     """The twins of the paper's four captures."""
     takes: dict[str, Take] = {}
     for kind in KINDS:
-        takes[kind] = simulate_twin(TwinConfig(kind=kind, glove=glove, seed=seed))
+        takes[kind] = simulate_take(TakeConfig(kind=kind, glove=glove, seed=seed))
         done()
     return takes
 
@@ -71,10 +72,10 @@ def measure_tests(
     """Tables 4 and 6 for one labeler.
 
     Args:
-        labeler: What to measure.
-        stills: Sets of true markers [m] that the paper's recipe is drawn on, by name.
+        labeler: The labeler to evaluate.
+        stills: Sets of true markers [m] that get the paper's corruption, by name.
         takes: Simulated captures, by name.
-        seed: Seed of the recipe.
+        seed: Seed of the corruption.
     """
     recipe = paper_corruption(len(labeler.marker_names))
     reports = {

@@ -1,4 +1,4 @@
-"""The paper's network as a labeler, and what it learns from."""
+"""The paper's network as a labeler, and its loss."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _SPREAD: Final = 0.002
-"""How fast confidence falls with distance: by e in this much [m]; chosen, not calibrated."""
+"""Distance over which the confidence falls by a factor of e [m]; chosen, not calibrated."""
 
 
 class TrainedCNNLabeler:
     """The paper's network with weights: the view of ten on which the cloud spreads best, then equation 1.
 
-    The network knows right hands; each cloud is shown to it as it is and mirrored, and the labels that fit
-    better are taken.
+    The network is trained on right hands. Each cloud is labeled as it is and mirrored; the labels with the
+    smaller total distance are kept.
 
     Args:
         network: Trained network.
@@ -62,7 +62,7 @@ class TrainedCNNLabeler:
 
     @torch.inference_mode()
     def predict(self, points: Float[np.ndarray, "B N 3"], present: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Where the network sees each marker (B, M, 3) of right hands, in the frame of the points [m]."""
+        """Predicted marker positions (B, M, 3) [m] of right hands, in the frame of the points (B, N, 3)."""
         rng = np.random.default_rng(0)  # the same clouds get the same labels every time
         rotations = view_rotations(points, present, policy="random10", rng=rng)
         images, frames = depth_images(points, present, rotations)
@@ -71,13 +71,13 @@ class TrainedCNNLabeler:
 
 
 def _costs(points: NDArray[np.float64], markers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (N, M + 1) of points from predicted markers [m], and last the cost of none."""
+    """Distances (N, M + 1) of points from predicted markers [m], and last the cost of no label."""
     distances = np.linalg.norm(points[:, None] - markers[None], axis=-1)
     return np.concatenate([distances, np.full((len(points), 1), REJECT)], axis=1)
 
 
 def _confidence(costs: NDArray[np.float64], taken: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of the label taken among all that a point might have had."""
+    """Weight of the label taken as a share of the weights of all labels of a point."""
     weights = np.exp(-costs / _SPREAD)
     shares: NDArray[np.float64] = np.exp(-taken / _SPREAD) / weights.sum(axis=1)
     return shares
@@ -86,7 +86,7 @@ def _confidence(costs: NDArray[np.float64], taken: NDArray[np.float64]) -> NDArr
 def cnn_loss(
     network: torch.nn.Module, batch: Batch, device: torch.device, *, rng: np.random.Generator
 ) -> torch.Tensor:
-    """Loss of one batch, each cloud seen from a random side (section 3.1)."""
+    """Loss of one batch, each cloud seen from a random view (section 3.1 of the paper)."""
     points, present = batch.cloud.points, batch.cloud.present
     images, frames = depth_images(points, present, view_rotations(points, present, policy="random", rng=rng))
     targets = torch.from_numpy(frames.normalize(batch.markers).astype(np.float32)).to(device)

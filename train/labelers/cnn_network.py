@@ -1,9 +1,8 @@
-"""The paper's labeler: a VGG-style network that sees a depth image and says where each marker is.
+"""The paper's network: VGG-style, from a depth image to the position of each marker.
 
 Han et al. 2018, Table 1. Its filters are valid (no padding): 52 → 50 → 48, pool 24 → 22 → 20 → 18, pool 9.
 The outputs are positions in the image's view frame (`train.labelers.depth_image.ViewFrames`), in the
-layout's marker
-order; labels come from matching them with the points (equation 1).
+layout's marker order; labels come from matching them with the points (equation 1).
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class DeepLabelCNN(nn.Module):
         )
 
     def forward(self, images: Float[Tensor, "B 1 52 52"]) -> Float[Tensor, "B M 3"]:
-        """Marker positions in view units, occluded markers too."""
+        """Marker positions in view units, those of occluded markers too."""
         positions: Tensor = self.positions(self.features(images))
         return positions.view(-1, self.num_labels, 3)
 
@@ -69,7 +68,7 @@ def position_loss(
 
     Args:
         predicted: From `DeepLabelCNN`.
-        targets: True positions in view units; what absent markers hold, NaN too, does not matter.
+        targets: True positions in view units; absent markers are ignored and may be NaN.
         present: Which markers count.
     """
     total = functional.smooth_l1_loss(predicted[present], targets[present], reduction="sum")
@@ -79,13 +78,13 @@ def position_loss(
 def match_positions(
     predicted: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "N 3"], reject: float = REJECT
 ) -> Int[np.ndarray, "N"]:
-    """One-to-one labeling of a cloud that takes the least distance in all.
+    """One-to-one labeling of a cloud with the least total distance.
 
-    The paper's equation 1, with the way out that its results imply: a point may stay without a label at the
-    cost of `reject`, so none goes farther than that.
+    The paper's equation 1, with the reject option that its results imply: a point may stay without a label at
+    the cost of `reject`, so no point is matched over a larger distance.
 
     Args:
-        predicted: Where each marker is thought to be [m].
+        predicted: Predicted position of each marker [m].
         points: The cloud in the same frame [m]; NaN rows are missing.
         reject: Cost of a point without a label [m].
 

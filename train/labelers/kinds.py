@@ -1,4 +1,4 @@
-"""The kinds of network there are: how each is built, taught, and made a labeler."""
+"""The kinds of network: how each is built, its loss, and how it becomes a labeler."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def new_network(kind: Kind, config: SetLabelerConfig) -> nn.Module:
-    """An untrained network; of the config the paper's needs only the number of labels."""
+    """An untrained network; the paper's uses only the number of labels of the config."""
     if kind == "cnn":
         network = DeepLabelCNN(config.num_labels)
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
@@ -30,7 +30,7 @@ def new_network(kind: Kind, config: SetLabelerConfig) -> nn.Module:
 def batch_loss(
     kind: Kind, network: nn.Module, batch: Batch, device: torch.device, *, rng: np.random.Generator
 ) -> torch.Tensor:
-    """Loss of one batch."""
+    """Loss of one batch, a scalar."""
     if kind == "cnn":
         return cnn_loss(network, batch, device, rng=rng)
     return set_loss(network, batch, device)

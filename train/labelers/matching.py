@@ -1,8 +1,8 @@
-"""From scores to labels: one point a label, one label a point, with a way out for ghosts and occlusions."""
+"""From scores to labels: one point per label, one label per point, with a reject option for both."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numba
 import numpy as np
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 GHOST = -1
-"""Label of a point that is no marker."""
+"""Label of a point that is not a marker."""
 _WEIGHT: Final = 0.65
-"""What each reading counts: 0.5 if both said the same thing twice, 1 if they knew of different things."""
+"""Weight of each of the two scores: 0.5 if they held the same information, 1 if they were independent."""
 _ROUNDS: Final = 20
 _NEVER: Final = 1e-30  # a probability whose logarithm is still a number
 _IMPOSSIBLE: Final = 1e6
@@ -44,10 +44,10 @@ def match_scores(
 def pair_probabilities(
     point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
 ) -> Float[np.ndarray, "N+1 M+1"]:
-    """How likely each point has each label when no two may share one.
+    """Probability of each label for each point when no two points may share one.
 
-    Both readings, each weighted, are brought together and balanced in turn until every point and every
-    label is spent once (Sinkhorn's iteration; ghosts and occluded labels are outside of it).
+    Both scores are weighted, added and normalized over rows and columns in turn, so that every point and
+    every label is used once (Sinkhorn's iteration; ghosts and occluded labels are outside of it).
 
     Args:
         point_scores: Log-probability of each label, and last of ghost, for each point.
@@ -66,7 +66,7 @@ def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.n
     """The one-to-one labeling with the greatest product of probabilities; `GHOST` where a point has none."""
     count, num_labels = len(probabilities) - 1, probabilities.shape[1] - 1
     costs = -np.log(np.maximum(probabilities, _NEVER))
-    # A pair settles a point and a label, which then is not occluded; each point has a way out of its own.
+    # A pair assigns a point and a label, which then is not occluded; each point has its own reject option.
     table = np.full((count, num_labels + count), _IMPOSSIBLE)
     table[:, :num_labels] = 2.0 * costs[:count, :num_labels] - costs[count, :num_labels]
     table.ravel()[num_labels :: num_labels + count + 1] = costs[:count, num_labels]
@@ -76,7 +76,20 @@ def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.n
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _balance(point_scores: Any, label_scores: Any, weight: float, rounds: int) -> Any:
+def _balance(
+    point_scores: NDArray[np.float64], label_scores: NDArray[np.float64], weight: float, rounds: int
+) -> NDArray[np.float64]:
+    """Sinkhorn's iteration on the weighted sum of two log-probabilities.
+
+    Args:
+        point_scores: Log-probabilities (N, M + 1) by point, the last column "a ghost".
+        label_scores: Log-probabilities (M, N + 1) by label, the last column "occluded".
+        weight: Weight of each.
+        rounds: Number of iterations.
+
+    Returns:
+        Probabilities (N + 1, M + 1), the last column "a ghost", the last row "occluded".
+    """
     count, num_labels = len(point_scores), len(label_scores)
     plan = np.zeros((count + 1, num_labels + 1))
     for i in range(count):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import nn
 
-_NAMES: Final = "handsim.marker_names"  # key of the file's own words
+_NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
 _OPSET: Final = 17
@@ -35,7 +35,7 @@ class OnnxLabeler:
 
     Raises:
         HandSimError: onnxruntime is not installed.
-        WeightsError: The file is missing, damaged, or no labeler's.
+        WeightsError: The file is missing, damaged, or not a labeler.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,7 +56,7 @@ class OnnxLabeler:
             names = json.loads(self._session.get_modelmeta().custom_metadata_map[_NAMES])
         except Exception as error:  # onnxruntime's errors have no common class of their own
             raise WeightsError(
-                f"{path} is damaged or no labeler's: expected what handsim export wrote"
+                f"{path} is damaged or not a labeler's: expected what handsim export wrote"
             ) from error
         self.marker_names: tuple[str, ...] = tuple(names)
 
@@ -90,7 +90,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
     axes = {name: {0: "frames", 1: "points"} for name in _INPUTS}
     axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
     with atomic_write(path) as temporary, warnings.catch_warnings():
-        # The newer exporter brings a package more and fixes the sizes of what is expanded.
+        # The newer exporter needs another package and fixes the sizes of expanded arrays.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             network.eval(),

@@ -1,4 +1,4 @@
-"""What every labeler promises: points of a frame in, a label and a confidence a point out. Free of torch."""
+"""The interface of every labeler: points of a frame in, a label and a confidence per point out; no torch."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Int
     from numpy.typing import NDArray
 
-MOST_POINTS: Final = 512
-FARTHEST: Final = 30.0
-"""Median span of clouds that are in meters, at most [m]; a hand in millimeters would span more."""
-_ENOUGH: Final = 5  # points that tell the unit; fewer may all be strays
+MAX_POINTS: Final = 512
+MAX_SPAN: Final = 30.0
+"""Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
+_MIN_POINTS: Final = 5  # from which a cloud shows its unit; fewer points may all be strays
 _BATCH: Final = 256
 
 
@@ -27,21 +27,21 @@ class Labeling:
     """Labels of one frame's points."""
 
     labels: Int[np.ndarray, "N"]
-    """Place of each point's marker in the layout, -1 for a ghost; no marker twice."""
+    """Index of each point's marker in the layout, -1 for a ghost; no marker twice."""
     confidence: Float[np.ndarray, "N"]
-    """How sure each label is, 0 to 1."""
+    """Confidence of each label, 0 to 1."""
 
 
 class Labeler(Protocol):
-    """Names the points of a frame, each frame on its own."""
+    """Labels the points of a frame, each frame on its own."""
 
     @property
     def marker_names(self) -> tuple[str, ...]:
-        """Markers that it knows, in label order."""
+        """The markers that it knows, in label order."""
         ...
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
-        """Label the points [m] of every frame; a frame may be empty.
+        """Label the points (N, 3) [m] of every frame; a frame may be empty.
 
         Raises:
             ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
@@ -53,11 +53,11 @@ def label_in_batches(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     label: Callable[[list[NDArray[np.float64]]], list[Labeling]],
 ) -> list[Labeling]:
-    """Check frames and have them labeled, those of like size together, so that padding stays small.
+    """Check frames and label them in batches of similar size, so that padding stays small.
 
     Args:
         frames: Points of each frame [m].
-        label: Labels a batch of frames of which the last holds the most points, and at least one.
+        label: Labels a batch of frames; the last one holds the most points, and at least one.
 
     Returns:
         Labelings in the order of the frames.
@@ -81,13 +81,13 @@ def label_in_batches(
 def pad_clouds(
     clouds: Sequence[NDArray[np.float64]],
 ) -> tuple[Float32[np.ndarray, "B N 3"], Bool[np.ndarray, "B N"]]:
-    """Clouds moved to their centers and padded to one length, and which points are there."""
+    """Clouds [m] moved to their centers and padded to one length, and which points are there."""
     longest = max(len(cloud) for cloud in clouds)
     points = np.zeros((len(clouds), longest, 3), dtype=np.float32)
     present = np.zeros((len(clouds), longest), dtype=bool)
     for row, cloud in enumerate(clouds):
         if len(cloud):
-            points[row, : len(cloud)] = cloud - cloud.mean(axis=0)  # before float32 cuts far-off places
+            points[row, : len(cloud)] = cloud - cloud.mean(axis=0)  # before float32 rounds off far positions
         present[row, : len(cloud)] = True
     return points, present
 
@@ -97,7 +97,7 @@ def label_by_scores(
     point_scores: Float[np.ndarray, "B N M+1"],
     label_scores: Float[np.ndarray, "B M N+1"],
 ) -> list[Labeling]:
-    """Match the scores of padded clouds, see `train.labelers.matching.match_scores`."""
+    """Labelings from the log-probabilities of padded clouds, see `train.labelers.matching.match_scores`."""
     longest = point_scores.shape[1]
     labelings = []
     for cloud, by_point, by_label in zip(clouds, point_scores, label_scores, strict=True):
@@ -112,21 +112,24 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
         raise ArgumentError(f"frame {frame} has shape {cloud.shape}, expected (N, 3)")
     if not np.isfinite(cloud).all():
         raise ArgumentError(f"frame {frame} holds NaN or infinite points; leave missing points out")
-    if len(cloud) > MOST_POINTS:
-        raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MOST_POINTS}")
+    if len(cloud) > MAX_POINTS:
+        raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MAX_POINTS}")
     return cloud
 
 
 def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> None:
-    """Millimeters are told, not guessed at; the median, because strays of a real system lie anywhere.
+    """Refuse clouds in millimeters, by their median span, since strays of a real system lie anywhere.
+
+    Args:
+        clouds: Points of each frame [m].
 
     Raises:
-        ArgumentError: Most frames span more than a room does.
+        ArgumentError: Most frames span more than a room.
     """
     spans = [
-        float((cloud.max(axis=0) - cloud.min(axis=0)).max()) for cloud in clouds if len(cloud) >= _ENOUGH
+        float((cloud.max(axis=0) - cloud.min(axis=0)).max()) for cloud in clouds if len(cloud) >= _MIN_POINTS
     ]
-    if max(spans, default=0.0) > FARTHEST and (span := float(np.median(spans))) > FARTHEST:
+    if max(spans, default=0.0) > MAX_SPAN and (span := float(np.median(spans))) > MAX_SPAN:
         raise ArgumentError(
             f"the points of a frame span {span:.0f} m, expected a hand in meters; millimeters?"
         )

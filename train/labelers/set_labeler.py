@@ -1,4 +1,4 @@
-"""The set labeler with weights, and what it learns from."""
+"""The set labeler with weights, and its loss."""
 
 from __future__ import annotations
 

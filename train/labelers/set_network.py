@@ -1,9 +1,9 @@
-"""The default labeler: gated messages between points, from nothing but the distances between them.
+"""The default network: gated messages between points, from the distances between them alone.
 
-The cloud enters as pairwise distances, so turning, moving or mirroring it changes nothing: one network labels
-left and right hands. Messages are weighted by sigmoid gates of distance and of both ends (no softmax over
-points, unlike self-attention), so they add up evidence and can count neighbors. Two readings are trained
-together: which label, or ghost, a point is; and which point, or none, a label has.
+Its input is the pairwise distances, so rotating, moving or mirroring the cloud changes nothing: one network
+labels left and right hands. Messages are weighted by sigmoid gates of distance and of both ends (no softmax
+over points, unlike self-attention), so they add up evidence and can count neighbors. Two outputs are trained
+together: the label, or ghost, of each point; and the point, or none, of each label.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class LabelScores(NamedTuple):
-    """Log-probabilities of both readings."""
+    """Log-probabilities of both outputs."""
 
     points: Float[Tensor, "B N M+1"]
     """Each point: its label, or ghost (last)."""
@@ -72,7 +72,7 @@ class SetLabeler(nn.Module):
 
 
 class MessageRound(nn.Module):
-    """One round: gather gated messages from all points, then think about them."""
+    """One round: sum gated messages from all points, then transform the sums."""
 
     def __init__(self, width: int, gates: int, bumps: int) -> None:
         super().__init__()
@@ -82,6 +82,7 @@ class MessageRound(nn.Module):
         self.ends = nn.Linear(width, 2 * gates)
         self.distance_gate = nn.Linear(bumps, gates)
         self.mix = nn.Linear(width, width)
+        # The weights on disk name these modules.
         self.think = nn.Sequential(
             nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), nn.Linear(2 * width, width)
         )
@@ -92,27 +93,27 @@ class MessageRound(nn.Module):
         bumps: Float[Tensor, "B K N*N"],
         there: Float[Tensor, "B N 1"],
     ) -> Float[Tensor, "B N W"]:
-        """Features after one exchange; `there` is 0 for padding, which sends nothing."""
+        """Features after one exchange; `there` is 0 for padding, which sends no message."""
         batch, count, width = features.shape
         normed = self.norm(features)
         receiver, sender = self.ends(normed).transpose(1, 2).chunk(2, dim=1)  # (B, G, N) each
-        # Gates before points: all that is as large as the pairs then lies in memory as bmm wants it.
+        # Gates before points: the large arrays of pairs are then laid out as bmm expects them.
         near = torch.bmm(self.distance_gate.weight.expand(batch, -1, -1), bumps).view(batch, -1, count, count)
         biased = receiver + self.distance_gate.bias[:, None]
         gate = torch.sigmoid(near + biased[..., None] + sender[:, :, None])  # (B, G, N, N)
         values = (self.values(normed) * there).view(batch, count, self.gates, -1).transpose(1, 2)
-        gathered = (gate @ values).transpose(1, 2).reshape(batch, count, width) / 5.0
-        features = features + self.mix(gathered)
-        thought: Tensor = self.think(features)
-        return features + thought
+        received = (gate @ values).transpose(1, 2).reshape(batch, count, width) / 5.0
+        features = features + self.mix(received)
+        update: Tensor = self.think(features)
+        return features + update
 
 
 def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor) -> Tensor:
-    """Cross-entropy of both readings.
+    """Cross-entropy of both outputs.
 
     Args:
         scores: From `SetLabeler`.
-        truth: Label of each point (B, N), -1 for a ghost; what padding holds does not matter.
+        truth: Label of each point (B, N), -1 for a ghost; padding is ignored.
         present: Which points are there (B, N).
     """
     num_labels = scores.points.shape[-1] - 1
@@ -120,8 +121,8 @@ def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor) -> Tensor
     point_loss = -scores.points.gather(-1, of_point[..., None])[..., 0][present].mean()
     batch, count = truth.shape
     of_label = truth.new_full((batch, num_labels + 1), count)
-    places = torch.arange(count).expand(batch, -1).to(truth.device)
+    indices = torch.arange(count).expand(batch, -1).to(truth.device)
     known = torch.where(present, of_point, num_labels)
-    of_label = of_label.scatter(1, known, places)[:, :num_labels]
+    of_label = of_label.scatter(1, known, indices)[:, :num_labels]
     label_loss = -scores.labels.gather(-1, of_label[..., None]).mean()
     return point_loss + label_loss

@@ -1,8 +1,8 @@
-"""Left or right, from labeled points: the labeler is blind to mirrors, the points it names are not.
+"""Left or right hand, from labeled points; the labelers themselves do not tell a hand from its mirror image.
 
-Four named points span a tetrahedron whose orientation a mirror turns round. Some four are turned the same
-way in almost every pose (thumb, knuckles and wrist), others either way; poses of simulated right hands say
-which, and each four votes with as much as it tells.
+Four labeled points span a tetrahedron, and a mirror inverts its orientation. Some groups of four have
+the same orientation in almost every pose (thumb, knuckles and wrist), others do not. Poses of simulated right
+hands measure this; each group votes with the log-odds of its orientation.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
-_MOST_FOURS: Final = 3000
+_MAX_FOURS: Final = 3000
 _POSES: Final = 100  # of each size
 _SIZES: Final = ("XS", "S", "M", "L", "XL")
 
 
-class SideTeller:
-    """Tells a layout's left hands from its right ones, one frame at a time.
+class SideClassifier:
+    """Classifies the hands of a layout as left or right, one frame at a time.
 
     Args:
         layout: The glove, the same on both hands.
-        rng: Source of the poses that it learns from, and of the fours where a layout has more than 3,000.
+        rng: Source of the poses that it learns from, and of the groups of four where there are over 3,000.
     """
 
     def __init__(self, layout: MarkerLayout, *, rng: np.random.Generator) -> None:
         fours = np.array(list(combinations(range(layout.num_markers), 4)))
-        if len(fours) > _MOST_FOURS:
-            fours = fours[rng.choice(len(fours), size=_MOST_FOURS, replace=False)]
+        if len(fours) > _MAX_FOURS:
+            fours = fours[rng.choice(len(fours), size=_MAX_FOURS, replace=False)]
         markers = np.concatenate([_right_hands(layout, size, rng) for size in _SIZES])
         mean = np.sign(_volumes(markers[:, fours])).mean(axis=0)
         self._fours: NDArray[np.int64] = fours
         self._votes: NDArray[np.float64] = np.arctanh(mean.clip(-0.999, 0.999))
         self._num_markers = layout.num_markers
 
-    def tell(self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"]) -> tuple[Side, float]:
-        """The side of one hand, and how clear the vote was [0, 1].
+    def classify(self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"]) -> tuple[Side, float]:
+        """The side of one hand, and the clearness of the vote [0, 1].
 
         Args:
-            points: A frame's points.
+            points: A frame's points [m].
             labels: Marker of each point, -1 for a ghost.
 
         Returns:
-            With fewer than four named points nothing votes, and the answer is "right" with 0.
+            "right" with a clearness of 0 where fewer than four points are labeled.
         """
         markers = np.full((self._num_markers, 3), np.nan)
         markers[labels[labels >= 0]] = points[labels >= 0]

@@ -1,4 +1,4 @@
-"""Trained labelers as they are kept: safetensors for numbers, JSON for words, or one ONNX file."""
+"""Trained labelers on disk: safetensors for weights and JSON for the model card, or one ONNX file."""
 
 from __future__ import annotations
 
@@ -28,9 +28,12 @@ def shipped_labelers() -> tuple[str, ...]:
 
 
 def load_labeler(name_or_path: str | Path) -> Labeler:
-    """The shipped labeler of a glove, one that `handsim train` left in a folder, or an exported .onnx file.
+    """The shipped labeler of a glove, one that `handsim train` wrote to a folder, or an exported .onnx file.
 
     Only the first two need torch.
+
+    Args:
+        name_or_path: A glove with a shipped labeler, a folder, or an .onnx file.
 
     Raises:
         WeightsError: Unknown, damaged, or not a labeler's weights.
@@ -69,7 +72,9 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         network = new_network(content.get("labeler", "set"), SetLabelerConfig(**content["network"]))
         network.load_state_dict(load_file(weights))
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise WeightsError(f"{weights} is damaged or no labeler's: {str(error).splitlines()[0]}") from error
+        raise WeightsError(
+            f"{weights} is damaged or not a labeler's: {str(error).splitlines()[0]}"
+        ) from error
     if len(names) != content["network"]["num_labels"]:
         raise WeightsError(f"{card} names {len(names)} markers for {content['network']['num_labels']} labels")
     return network, content
@@ -88,7 +93,11 @@ def save_network(
 
 
 def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
-    """The labeler asked for, or the glove's shipped one; checked against the glove's markers.
+    """The given labeler, or the glove's shipped one; checked against the glove's markers.
+
+    Args:
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        labeler: Anything that `load_labeler` reads; the shipped one of the glove when None.
 
     Raises:
         LayoutError: The glove is unknown.

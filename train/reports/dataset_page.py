@@ -1,4 +1,4 @@
-"""The page of plots that `handsim generate` leaves beside a training set: what is in it, at a glance."""
+"""The page of plots that `handsim generate` writes beside a training set."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from handsim.hand.topology import JOINTS, SIDES
 from handsim.space.cameras import load_rig
 from train.data.shards import Dataset, hands_name
 from train.reports import dataset_plots as _plots
+from train.reports.plot_style import picture
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int, Shaped
@@ -24,7 +25,7 @@ REPORT: Final = "report.html"
 MOST_ROWS: Final = 50_000
 """Rows read for the plots; larger sets are sampled evenly."""
 ANGLE_BINS: Final = 40
-_AT_ONCE: Final = 1024  # rows whose marker pairs are held in memory at one time
+_CHUNK: Final = 1024  # rows whose marker pairs are held in memory at one time
 _LOW: Final = np.array([joint.low for joint in JOINTS])
 _HIGH: Final = np.array([joint.high for joint in JOINTS])
 
@@ -33,20 +34,20 @@ def write_report(
     dataset: Dataset, path: Path | None = None, *, present: Bool[np.ndarray, "T M"] | None = None,
     rate: float = 120.0,
 ) -> Path:  # fmt: skip
-    """Draw the report of a training set: one HTML file with its pictures inside, whole or not at all.
+    """Write the report of a training set: one HTML file with its pictures inside, complete or not at all.
 
     Args:
         dataset: A finished training set.
         path: The page; `report.html` in the set's folder when not given. An older one is replaced.
         present: Which markers a continuous take of this glove and rig holds, for the lengths of gaps; a
             training set's frames are independent and have none.
-        rate: Frames a second of that take [Hz].
+        rate: Frames per second of that take [Hz].
 
     Returns:
         The page's path.
 
     Raises:
-        DatasetError: `present` is no table of frames and markers, or the rate is not positive.
+        DatasetError: `present` is not a table of frames and markers, or the rate is not positive.
     """
     path = dataset.path / REPORT if path is None else path
     rows, manifest = sample_rows(dataset), dataset.manifest
@@ -70,14 +71,14 @@ def write_report(
 
 
 def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
-    """How long markers stay away in a continuous take, beside published figures of real finger markers.
+    """Lengths of the gaps in a continuous take, beside published figures of real finger markers.
 
     Args:
         present: Which markers are there in each frame.
-        rate: Frames a second [Hz].
+        rate: Frames per second [Hz].
 
     Raises:
-        DatasetError: `present` is no table of frames and markers, or the rate is not positive.
+        DatasetError: `present` is not a table of frames and markers, or the rate is not positive.
     """
     if present.ndim != 2 or not present.size or present.dtype != np.bool_:
         raise DatasetError(
@@ -94,7 +95,7 @@ def gap_section(present: Bool[np.ndarray, "T M"], rate: float) -> Section:
     )
     if not len(lengths):
         return Section("Gaps", text)
-    drawn = _plots.picture((9.0, 4.2), partial(_plots.draw_gaps, lengths=lengths, rate=rate))
+    drawn = picture((9.0, 4.2), partial(_plots.draw_gaps, lengths=lengths, rate=rate))
     caption = (
         "Share of gaps by length. Orange: median and 90th percentile of the gap lists of real finger markers "
         "that were published with LocalMoCap (SIGGRAPH 2023)."
@@ -115,10 +116,10 @@ def sample_rows(dataset: Dataset, most: int = MOST_ROWS) -> Shaped[np.ndarray, "
 
 
 def angle_shares(rows: Shaped[np.ndarray, "T"], bins: int = ANGLE_BINS) -> Float[np.ndarray, "20 N"]:
-    """Share of frames in each of equally wide bins over each hinge's range."""
+    """Share of frames in each of equally wide bins over the range of each joint angle."""
     angles = np.rad2deg(rows["qpos"][:, 7:].astype(np.float64))
-    place = np.floor((angles - _LOW) / (_HIGH - _LOW) * bins).astype(np.int64).clip(0, bins - 1)
-    counts = np.stack([np.bincount(place[:, joint], minlength=bins) for joint in range(len(JOINTS))])
+    index = np.floor((angles - _LOW) / (_HIGH - _LOW) * bins).astype(np.int64).clip(0, bins - 1)
+    counts = np.stack([np.bincount(index[:, joint], minlength=bins) for joint in range(len(JOINTS))])
     shares: NDArray[np.float64] = counts / len(rows)
     return shares
 
@@ -141,8 +142,8 @@ def ghost_counts(rows: Shaped[np.ndarray, "T"]) -> Int[np.ndarray, "G+1"]:
 
 def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:
     """From every ghost to the nearest marker of its frame, seen or not [m]."""
-    frame, place = np.nonzero(np.isfinite(rows["ghosts"][..., 0]))
-    away = rows["markers"][frame].astype(np.float64) - rows["ghosts"][frame, place][:, None]
+    frame, ghost = np.nonzero(np.isfinite(rows["ghosts"][..., 0]))
+    away = rows["markers"][frame].astype(np.float64) - rows["ghosts"][frame, ghost][:, None]
     distances: NDArray[np.float64] = np.linalg.norm(away, axis=-1).min(axis=1)
     return distances
 
@@ -150,8 +151,8 @@ def ghost_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "N"]:
 def neighbor_distances(rows: Shaped[np.ndarray, "T"]) -> Float[np.ndarray, "T M"]:
     """From every marker to the nearest other one, seen or not, center to center [m]."""
     parts = []
-    for first in range(0, len(rows), _AT_ONCE):
-        markers = rows["markers"][first : first + _AT_ONCE]
+    for first in range(0, len(rows), _CHUNK):
+        markers = rows["markers"][first : first + _CHUNK]
         apart = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
         apart[:, range(markers.shape[1]), range(markers.shape[1])] = np.inf
         parts.append(apart.min(axis=-1))
@@ -172,8 +173,8 @@ def _figures_section(dataset: Dataset, rows: Shaped[np.ndarray, "T"]) -> Section
         ["people", f"{len(hands) // len(SIDES):,}"],
         ["left hands", f"{100 * (rows['hand'] % len(SIDES) == SIDES.index('left')).mean():.1f} %"],
         ["hand length, shortest, median, longest", " / ".join(f"{value:.0f}" for value in length) + " mm"],
-        ["markers found a frame", f"{found:.2f} of {len(manifest.marker_names)}"],
-        ["ghosts a frame", f"{(counts * np.arange(len(counts))).sum() / len(rows):.2f}"],
+        ["markers found per frame", f"{found:.2f} of {len(manifest.marker_names)}"],
+        ["ghosts per frame", f"{(counts * np.arange(len(counts))).sum() / len(rows):.2f}"],
         ["bytes", f"{size:,}"],
     ]
     text = (
@@ -187,14 +188,14 @@ def _angles_section(rows: Shaped[np.ndarray, "T"]) -> Section:
     middle = np.rad2deg(np.percentile(rows["qpos"][:, 7:], [1.0, 99.0], axis=0)).T
     draw = partial(_plots.draw_angles, shares=angle_shares(rows), edges=edges, middle=middle)
     text = (
-        "How often each of the twenty hinges takes which angle. Zero is the flat hand; flexion counts "
+        "Share of frames by angle, for each of the twenty joints. Zero is the flat hand; flexion counts "
         "towards the palm, abduction towards the thumb (the thumb's: away from the palm)."
     )
     caption = (
         "Gray: the joint's range. Orange: between these angles lie 98 % of the frames. The four fingers of a "
         "row share their axes."
     )
-    return Section("Joint angles", text, pictures=[(_plots.picture((10.8, 7.0), draw), caption)])
+    return Section("Joint angles", text, pictures=[(picture((10.8, 7.0), draw), caption)])
 
 
 def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
@@ -202,7 +203,7 @@ def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
     lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
     shares = camera_shares(rows, len(load_rig(manifest.config["rig"]).positions))
     draw = partial(
-        _plots.draw_sight,
+        _plots.draw_visibility,
         names=manifest.marker_names,
         lost=lost,
         seen_by=shares,
@@ -210,19 +211,19 @@ def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
     )
     text = (
         f"A marker has a point when the rays of at least {manifest.min_cameras} cameras meet; other hands, "
-        "held things, merged blobs and lost pictures are in it."
+        "held objects, merged blobs and lost pictures are included."
     )
     caption = f"Left: how often each marker is lost. Right: how many of {shares.shape[1] - 1} cameras see it."
     size = (10.8, 1.6 + 0.21 * len(lost))
-    return Section("Occlusion", text, pictures=[(_plots.picture(size, draw), caption)])
+    return Section("Occlusion", text, pictures=[(picture(size, draw), caption)])
 
 
 def _ghosts_section(rows: Shaped[np.ndarray, "T"]) -> Section:
     counts = ghost_counts(rows)
     draw = partial(_plots.draw_ghosts, counts=counts, distances=ghost_distances(rows))
-    caption = f"Left: ghosts a frame, of which {len(counts) - 1} at most are kept. Right: where they lie."
-    text = "Points that no marker made: mirror images in shiny surfaces near the hand, and stray reflections."
-    return Section("Ghosts", text, pictures=[(_plots.picture((10.8, 3.4), draw), caption)])
+    caption = f"Left: ghosts per frame, of which {len(counts) - 1} at most are kept. Right: their distances."
+    text = "Points of no marker: mirror images in shiny surfaces near the hand, and stray reflections."
+    return Section("Ghosts", text, pictures=[(picture((10.8, 3.4), draw), caption)])
 
 
 def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Section:
@@ -234,4 +235,4 @@ def _neighbors_section(rows: Shaped[np.ndarray, "T"], diameter: float) -> Sectio
         "a marker is wide."
     )
     text = "The nearer markers are to each other, the easier they are confused."
-    return Section("Nearest markers", text, pictures=[(_plots.picture((9.0, 3.6), draw), caption)])
+    return Section("Nearest markers", text, pictures=[(picture((9.0, 3.6), draw), caption)])

@@ -1,62 +1,24 @@
-"""The pictures of a training set's report, and the manner of all reports' pictures.
-
-matplotlib is imported when a picture is drawn, and pyplot never.
-"""
+"""The pictures of a training set's page: joint angles, occlusion, ghosts, neighbors and gaps."""
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from handsim.hand.topology import DIGITS, JOINTS
+from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
-BLUE, PALE, WARM = "#3f7396", "#a9c3d4", "#b8572b"
-_STYLE: Final[dict[str, Any]] = {
-    "font.size": 9.0,
-    "text.color": INK,
-    "axes.labelcolor": SOFT,
-    "axes.labelsize": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.edgecolor": LINE,
-    "axes.facecolor": "none",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "xtick.color": LINE,
-    "ytick.color": LINE,
-    "xtick.labelcolor": SOFT,
-    "ytick.labelcolor": SOFT,
-    "figure.facecolor": CARD,  # the page's card, light on dark pages too, so that no frame shows
-    "savefig.facecolor": CARD,
-    "svg.hashsalt": "handsim",  # ids that do not change from one run to the next
-}
 PUBLISHED_MEDIAN: Final = (3, 4)
 """Median gap of real finger markers [frames], lowest and highest of the published takes."""
 PUBLISHED_P90: Final = (24, 43)
 """The same, 90th percentile."""
-
-
-def picture(size: tuple[float, float], draw: Callable[[Figure], None]) -> str:
-    """A figure of this size [inch] as SVG in a `data:` URI, the same bytes for the same numbers."""
-    from matplotlib import style
-    from matplotlib.figure import Figure
-
-    drawn = io.BytesIO()
-    with style.context(["default", _STYLE]):  # whatever the user's own settings are
-        figure = Figure(figsize=size, layout="constrained")
-        draw(figure)
-        figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(drawn.getvalue()).decode()
 
 
 def draw_angles(
@@ -65,21 +27,21 @@ def draw_angles(
     edges: Float[np.ndarray, "20 N+1"],
     middle: Float[np.ndarray, "20 2"],
 ) -> None:
-    """Small multiples: a column each digit, a row each hinge from the knuckle outwards.
+    """Small multiples: one column per digit, one row per joint angle from the knuckle outwards.
 
     Args:
         figure: Where to draw.
-        shares: Share of frames in each bin of a hinge's range.
+        shares: Share of frames in each bin of a joint angle's range.
         edges: The bins' edges [deg].
         middle: Angles between which 98 % of the frames lie [deg].
     """
     panels = figure.subplots(4, 5)
     for number, joint in enumerate(JOINTS):
-        digit, place = divmod(number, 4)
-        panel: Axes = panels[place, digit]
+        digit, row = divmod(number, 4)
+        panel: Axes = panels[row, digit]
         if digit > 1:  # the thumb has axes of its own; linked before anything is drawn, so that all fits
-            panel.sharex(panels[place, 1])
-            panel.sharey(panels[place, 1])
+            panel.sharex(panels[row, 1])
+            panel.sharey(panels[row, 1])
         density = 100.0 * shares[number] / np.diff(edges[number])
         panel.axvspan(joint.low, joint.high, color=BAND, linewidth=0)
         panel.stairs(density, edges[number], fill=True, color=BLUE)
@@ -101,18 +63,18 @@ def draw_angles(
     figure.supylabel("share of frames [% per degree]", fontsize=9.0, color=SOFT)
 
 
-def draw_sight(
+def draw_visibility(
     figure: Figure, names: tuple[str, ...], lost: Float[np.ndarray, "M"], seen_by: Float[np.ndarray, "M C+1"],
     min_cameras: int,
 ) -> None:  # fmt: skip
     """Bars of the share of frames without each marker; beside them how many cameras see it."""
-    places = np.arange(len(names))
+    rows = np.arange(len(names))
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.5))
-    left.barh(places, 100.0 * lost, color=BLUE, height=0.62)
-    for place, share in enumerate(lost):
-        left.annotate(f"{100 * share:.1f}", (100 * share, place), (4, 0), textcoords="offset points",
+    left.barh(rows, 100.0 * lost, color=BLUE, height=0.62)
+    for row, share in enumerate(lost):
+        left.annotate(f"{100 * share:.1f}", (100 * share, row), (4, 0), textcoords="offset points",
                       va="center", color=SOFT, fontsize=8.0)  # fmt: skip
-    left.set_yticks(places, names, color=INK, parse_math=False)
+    left.set_yticks(rows, names, color=INK, parse_math=False)
     left.set_ylim(len(names) - 0.4, -0.6)
     left.set_xlim(0.0, max(0.1, 115.0 * float(lost.max(initial=0.0))))
     left.set_xlabel(f"frames in which fewer than {min_cameras} cameras see it [%]")
@@ -123,7 +85,7 @@ def draw_sight(
         cmap="Blues", vmin=0.0, edgecolors=CARD, linewidth=1.2,
     )  # fmt: skip
     means = seen_by @ np.arange(seen_by.shape[1])
-    right.plot(means, places, "o", color=CARD, markeredgecolor=INK, markersize=4.5, markeredgewidth=0.9)
+    right.plot(means, rows, "o", color=CARD, markeredgecolor=INK, markersize=4.5, markeredgewidth=0.9)
     right.annotate("mean", (means[0], 0.0), (0, 13), textcoords="offset points", ha="center", fontsize=8.0)
     right.axvline(min_cameras - 0.5, color=WARM, linewidth=1.4)
     right.annotate(f"at least {min_cameras}", (min_cameras - 0.5, -0.5), (3, 3), textcoords="offset points",
@@ -138,7 +100,7 @@ def draw_sight(
 
 
 def draw_ghosts(figure: Figure, counts: Int[np.ndarray, "G+1"], distances: Float[np.ndarray, "N"]) -> None:
-    """Ghosts a frame, and how far [m] each lies from the nearest marker."""
+    """Ghosts per frame, and how far [m] each lies from the nearest marker."""
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
     shares = 100.0 * counts / max(1, counts.sum())
     left.bar(np.arange(len(counts)), shares, color=BLUE, width=0.62)
@@ -222,18 +184,18 @@ def _shares(
     return 100.0 * counts / (max(1, len(distances)) * np.diff(bins)), bins
 
 
-def _millimeters(panel: Axes, distances: Float[np.ndarray, "N"], color: str, things: str) -> None:
+def _millimeters(panel: Axes, distances: Float[np.ndarray, "N"], color: str, noun: str) -> None:
     """A filled histogram of distances [m]."""
     panel.stairs(*_shares(distances, _millimeter_bins(distances)), fill=True, color=color)
-    panel.set_ylabel(f"share of {things} [% per mm]")
+    panel.set_ylabel(f"share of {noun} [% per mm]")
     panel.set_xlim(left=0.0)
     panel.margins(y=0.12)
     if not distances.size:
         panel.set_ylim(0.0, 1.0)
 
 
-def _mark(panel: Axes, place: float, text: str, color: str) -> None:
+def _mark(panel: Axes, value: float, text: str, color: str) -> None:
     """An upright line with its meaning beside its top."""
-    panel.axvline(place, color=color, linewidth=1.4)
-    panel.annotate(text.format(place), (place, 1.0), (5, -2), ("data", "axes fraction"), "offset points",
+    panel.axvline(value, color=color, linewidth=1.4)
+    panel.annotate(text.format(value), (value, 1.0), (5, -2), ("data", "axes fraction"), "offset points",
                    va="top", color=color)  # fmt: skip

@@ -21,7 +21,8 @@ from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import evaluate_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
-from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
 
 _DROPS, _GHOSTS = 5, 2  # the paper's corruption (Han et al. 2018, section 5)
 _TIMED: Final = 1024  # frames that are labeled at once to time the labeler

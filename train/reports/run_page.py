@@ -1,4 +1,4 @@
-"""The page that a training run ends with: how it went, what is confused with what, how sure to believe it."""
+"""The page of a training run: figures, curves, confusions and reliability."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from train.evaluation.reliability import LEAST_SURE, reliability
 from train.history import History
 from train.reports import hand_plot as _hand_plot
 from train.reports import run_plots as _run_plots
-from train.reports.dataset_plots import picture
+from train.reports.flat_hand import flat_hand
+from train.reports.plot_style import picture
 
 PAGE: Final = "report.html"
 _KINDS: Final = {"set": "Set labeler", "cnn": "The paper's network"}
 
 
 def write_run_page(out: Path, card: dict[str, Any], history: History, report: Report) -> Path:
-    """Draw the page of a run: one HTML file with its pictures inside, whole or not at all.
+    """Write the page of a run: one HTML file with its pictures inside, complete or not at all.
 
     Args:
         out: The run's folder; an older page there is replaced.
         card: The run's model card, see `train.loop.train_labeler`.
-        history: How it went.
-        report: What the labeler does on held-out frames with the paper's corruption.
+        history: Loss and accuracy over the run.
+        report: Evaluation on held-out frames with the paper's corruption.
 
     Returns:
         The page's path.
@@ -113,7 +114,7 @@ def _confusion_section(layout: MarkerLayout, report: Report) -> Section:
 def _hand_section(layout: MarkerLayout, report: Report) -> Section:
     arrows = _hand_plot.mistakes(report.confusion)
     draw = partial(
-        _hand_plot.draw_hand, hand=_hand_plot.flat_hand(layout), names=layout.names,
+        _hand_plot.draw_hand, hand=flat_hand(layout), names=layout.names,
         accuracy=report.slot_accuracy_by_marker, arrows=arrows,
     )  # fmt: skip
     drawn = picture(_hand_plot.HAND_SIZE, draw)

@@ -9,7 +9,7 @@ import numpy as np
 
 from train.evaluation.reliability import BINS, Reliability
 from train.history import History
-from train.reports.dataset_plots import BAND, BLUE, INK, LINE, PALE, SOFT, WARM
+from train.reports.plot_style import BAND, BLUE, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:
     from jaxtyping import Int

@@ -1,8 +1,7 @@
-"""The capture that a user makes to be calibrated, simulated with its truth: free motion, then touches."""
+"""The capture that a user makes for calibration, simulated with its truth: touches, then free motion."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -22,14 +21,16 @@ from poses.motion.wrist_paths import WristConfig, wrist_path
 from poses.shapes.library import gesture
 from poses.shapes.touch import FINGERS, touching_angles
 from poses.shapes.validity import make_valid
-from train.simulation.room import Room, RoomConfig
+from train.simulation.motion import SceneMotion
+from train.simulation.room import record_take
+from train.simulation.room_settings import RoomConfig
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_PLACES: Final = (0.22, -0.22)  # where each hand is [m], so that hands do not meet
-_VOLUME: Final = 0.1
-_MOST_DRAWS: Final = 20
+_OFFSETS: Final = (0.22, -0.22)  # of the hands from the room's middle [m], so that they do not meet
+_VOLUME: Final = 0.1  # half side of the cube that a wrist stays in [m]
+_MAX_DRAWS: Final = 20
 _STARTS: Final = ("pinch_pad", "pinch_tip")
 _JITTER: Final = np.deg2rad(8.0)
 _TOUCHING: Final = MotionConfig(durations=(0.4, 0.8), hold=0.8)
@@ -38,7 +39,7 @@ _FREE: Final = MotionConfig(durations=(0.3, 0.9), hold=0.2)
 
 @dataclass(frozen=True, slots=True)
 class CalibrationTakeConfig:
-    """What the user does and who looks on."""
+    """What the user does, and the cameras that see it."""
 
     free: float = 40.0
     """Free motion [s]."""
@@ -47,7 +48,7 @@ class CalibrationTakeConfig:
     rig: str = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     turning: float = 0.7
-    """Standard deviation of the wrist's turns about each axis [rad]."""
+    """Standard deviation of the wrist's rotation about each axis [rad]."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.free < np.inf:
@@ -71,33 +72,38 @@ def simulate_calibration(
 
     Raises:
         ArgumentError: There are no hands or more than two.
-        PoseError: A hand cannot move or touch.
+        PoseError: A hand finds no way from its touches to free motion.
     """
     config = config or CalibrationTakeConfig()
-    if not 1 <= len(hands) <= len(_PLACES):
+    if not 1 <= len(hands) <= len(_OFFSETS):
         raise ArgumentError(f"{len(hands)} hands, expected one or two")
     angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
     frames = min(len(part) for part in angles)
     moving = []
-    for fit, part, aside in zip(hands, angles, _PLACES, strict=False):
-        where = WristConfig(center=(aside, 0.0, 1.1), volume=_VOLUME, turning=config.turning)
-        position, quaternion = wrist_path(frames, _FREE.rate, where, rng=rng)
+    for fit, part, offset in zip(hands, angles, _OFFSETS, strict=False):
+        wrist = WristConfig(center=(offset, 0.0, 1.1), volume=_VOLUME, turning=config.turning)
+        position, quaternion = wrist_path(frames, _FREE.rate, wrist, rng=rng)
         qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
         moving.append(GlovedHand(fit, qpos))
     settings = {"kind": "calibration", **dataclasses.asdict(config)}
-    room = Room(tuple(moving), None, load_rig(config.rig), RoomConfig(), rate=_FREE.rate)
-    return room.take(settings, rng=rng)
+    scene = SceneMotion(tuple(moving), rate=_FREE.rate)
+    return record_take(scene, load_rig(config.rig), RoomConfig(), settings, rng=rng)
 
 
 def calibration_angles(
     model: HandModel, config: CalibrationTakeConfig, *, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Hinge angles (T, 20) [rad]: rounds of touches, as far as the thumb reaches, then free motion.
+    """Joint angles (T, 20) [rad]: rounds of touches by the thumb, then free motion.
+
+    Args:
+        model: The hand.
+        config: How many rounds, and how long the free motion is.
+        rng: Source of all randomness.
 
     Raises:
-        PoseError: This hand cannot move.
+        PoseError: This hand finds no way from its touches to free motion.
     """
-    touches = [pose for _ in range(config.rounds) for pose in _round(model, rng)]
+    touches = [pose for _ in range(config.rounds) for pose in _touch_fingers(model, rng)]
     free = _free_motion(model, config.free, rng)
     if not touches:
         return free
@@ -107,21 +113,23 @@ def calibration_angles(
 
 def _free_motion(model: HandModel, seconds: float, rng: np.random.Generator) -> NDArray[np.float64]:
     """Free motion from a pose that can be reached from everywhere."""
-    for _ in range(_MOST_DRAWS):
+    for _ in range(_MAX_DRAWS):
         free = sample_motion(model, seconds, _FREE, rng=rng).qpos[: count_frames(seconds, _FREE), 7:]
         if can_be_left(model, free[:1]).all():
             return free
-    raise PoseError("this hand finds no way from its touches to a free motion")
+    raise PoseError(f"this hand finds no way from its touches to a free motion in {_MAX_DRAWS} tries")
 
 
-def _round(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """The thumb at each fingertip that it reaches, from a start that differs every time."""
+def _touch_fingers(model: HandModel, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+    """Poses (20,) [rad] of the thumb at each fingertip that it reaches, each from a start of its own."""
     poses = []
     for finger in FINGERS:
         pinch = gesture(f"{_STARTS[rng.integers(len(_STARTS))]}_{finger}")
         start = make_valid(model, (pinch + rng.normal(scale=_JITTER, size=NUM_JOINTS))[None])
-        with contextlib.suppress(PoseError):  # another finger, or the next round
+        try:
             touch = touching_angles(model, finger, start)
-            if can_be_left(model, touch[None]).all():
-                poses.append(touch)
+        except PoseError:
+            continue  # another finger, or the next round, will do
+        if can_be_left(model, touch[None]).all():
+            poses.append(touch)
     return poses

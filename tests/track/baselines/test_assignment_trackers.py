@@ -14,14 +14,14 @@ from track.baselines.assignment_trackers import GATE, NEAR, HungarianTracker, Ne
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
 from track.evaluation.trials import cut_take, hide_points, without_body
 from track.tracked_frame import Status
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker])
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return without_body(simulate_twin(TwinConfig(kind="single-hand", num_frames=300)))
+    return without_body(simulate_take(TakeConfig(kind="single-hand", num_frames=300)))
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from track.evaluation.trials import cut_take, hide_points, without_body
 from track.tracked_frame import Status, TrackedFrame
 from train.labelers.protocol import Labeling
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 class Asked:
@@ -39,7 +39,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return without_body(simulate_twin(TwinConfig(kind="hand-controller", num_frames=240)))
+    return without_body(simulate_take(TakeConfig(kind="hand-controller", num_frames=240)))
 
 
 @pytest.fixture(scope="module")

@@ -19,12 +19,12 @@ from track.evaluation.trials import (
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
-from train.simulation.twins import TwinConfig, simulate_twin
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_twin(TwinConfig(kind="hand-controller", num_frames=FEWEST_FRAMES + 20))
+    return simulate_take(TakeConfig(kind="hand-controller", num_frames=FEWEST_FRAMES + 20))
 
 
 class Late:

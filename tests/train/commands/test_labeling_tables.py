@@ -12,8 +12,9 @@ from train.evaluation.labeler_evaluation import evaluate_takes
 from train.evaluation.paper import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from train.evaluation.tables import FIGURES, augmentations
 from train.labelers.storage import load_labeler
-from train.simulation.twins import KINDS, TwinConfig, simulate_twin
-from train.simulation.unseen import unseen_markers
+from train.simulation.held_out import held_out_markers
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import TakeConfig, simulate_take
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,7 +25,7 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def takes():
-    return {kind: simulate_twin(TwinConfig(kind=kind, num_frames=40)) for kind in KINDS}
+    return {kind: simulate_take(TakeConfig(kind=kind, num_frames=40)) for kind in KINDS}
 
 
 def cells(text: str, first: str) -> list[str]:
@@ -45,10 +46,10 @@ def test_the_papers_tables_agree_with_each_other():
 
 
 def test_unseen_people_follow_the_seed_and_are_in_no_training_set():
-    first = unseen_markers("dense19", 200, seed=0)
+    first = held_out_markers("dense19", 200, seed=0)
     assert first.shape == (200, 19, 3)
-    np.testing.assert_array_equal(first, unseen_markers("dense19", 200, seed=0))
-    assert not np.isclose(first, unseen_markers("dense19", 200, seed=1)).any()
+    np.testing.assert_array_equal(first, held_out_markers("dense19", 200, seed=0))
+    assert not np.isclose(first, held_out_markers("dense19", 200, seed=1)).any()
 
 
 def test_table_2_trains_and_tests_four_networks(tmp_path, capsys, monkeypatch):
@@ -65,7 +66,7 @@ def test_table_2_trains_and_tests_four_networks(tmp_path, capsys, monkeypatch):
         f"{kind}-{name}" for kind in ("set", "cnn") for name in AUGMENTATIONS
     )
     for kind in ("set", "cnn"):
-        assert f"Table 2, {kind}: unseen simulated frames" in said
+        assert f"Table 2, {kind}: held-out simulated frames" in said
     first = said[: said.index("Table 2, cnn")]
     for test in AUGMENTATIONS:
         for cell, paper in zip(cells(first, test), TABLE2[test], strict=True):

@@ -11,7 +11,7 @@ import torch
 from gloves.captures.formats import read_capture
 from gloves.takes.take import load_take
 from handsim.app.cli import main
-from train.simulation.twins import KINDS, TWINS
+from train.simulation.room_settings import KINDS, TWINS
 
 FRAMES = 60
 

@@ -73,7 +73,7 @@ def test_confusion_agrees_with_the_counts(frames):
     assert confusion.sum() == counts.points
     assert confusion.trace() == counts.points_right
     if frames:
-        assert confusion[-1].sum() == counts.ghosts and confusion[:, -1].sum() == counts.ghosts_said
+        assert confusion[-1].sum() == counts.ghosts and confusion[:, -1].sum() == counts.ghosts_given
     if counts.points:
         assert (figures["macro_f1"] == 1.0) == (figures["point_accuracy"] == 1.0)
 

@@ -66,7 +66,7 @@ def test_damaged_files_are_told(exported, tmp_path):
         ("words.onnx", b"x" * 500),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(WeightsError, match=rf"{name} is damaged or no labeler's"):
+        with pytest.raises(WeightsError, match=rf"{name} is damaged or not a labeler's"):
             OnnxLabeler(tmp_path / name)
     with pytest.raises(WeightsError, match=r"none\.onnx is missing"):
         OnnxLabeler(tmp_path / "none.onnx")

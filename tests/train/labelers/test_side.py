@@ -10,13 +10,13 @@ from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses.shapes.validity import sample_valid_angles
-from train.labelers.side import SideTeller
+from train.labelers.side import SideClassifier
 
 
 @pytest.fixture(scope="module", params=["dense19", "sparse13"])
-def teller(request):
+def classifier(request):
     layout = load_layout(request.param)
-    return layout, SideTeller(layout, rng=np.random.default_rng(0))
+    return layout, SideClassifier(layout, rng=np.random.default_rng(0))
 
 
 def hands(layout, side, rng, count=60):
@@ -26,32 +26,32 @@ def hands(layout, side, rng, count=60):
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_unknown_poses_are_told_also_with_markers_missing(teller, side, rng):
-    layout, tells = teller
+def test_unknown_poses_are_told_also_with_markers_missing(classifier, side, rng):
+    layout, tells = classifier
     right = whole = 0
     for points in hands(layout, side, rng):
-        whole += tells.tell(points, np.arange(len(points)))[0] == side
+        whole += tells.classify(points, np.arange(len(points)))[0] == side
         here = rng.permutation(len(points))[3:]
-        right += tells.tell(points[here], here)[0] == side
+        right += tells.classify(points[here], here)[0] == side
     assert whole >= 58
     assert right >= 55
 
 
-def test_a_mirror_turns_the_answer_and_nothing_else_matters(teller, rng):
-    layout, tells = teller
+def test_a_mirror_turns_the_answer_and_nothing_else_matters(classifier, rng):
+    layout, tells = classifier
     (points,) = hands(layout, "right", rng, count=1)
-    side, clear = tells.tell(points, np.arange(len(points)))
+    side, clear = tells.classify(points, np.arange(len(points)))
     moved = points @ quaternion_matrix(random_quaternions(1, rng=rng))[0].T + [1.0, -2.0, 0.5]
     order = rng.permutation(len(points))
-    assert tells.tell(moved[order], order) == (side, pytest.approx(clear))
-    mirrored, as_clear = tells.tell(points * (1.0, 1.0, -1.0), np.arange(len(points)))
+    assert tells.classify(moved[order], order) == (side, pytest.approx(clear))
+    mirrored, as_clear = tells.classify(points * (1.0, 1.0, -1.0), np.arange(len(points)))
     assert {side, mirrored} == {"left", "right"}
     assert as_clear == pytest.approx(clear)
 
 
-def test_too_few_points_say_nothing(teller, rng):
-    _, tells = teller
+def test_too_few_points_say_nothing(classifier, rng):
+    _, tells = classifier
     points = rng.normal(size=(5, 3))
     for labels in ([0, 1, 2, -1, -1], [-1] * 5):
-        assert tells.tell(points, np.array(labels)) == ("right", 0.0)
-    assert tells.tell(np.zeros((0, 3)), np.zeros(0, dtype=int)) == ("right", 0.0)
+        assert tells.classify(points, np.array(labels)) == ("right", 0.0)
+    assert tells.classify(np.zeros((0, 3)), np.zeros(0, dtype=int)) == ("right", 0.0)

@@ -17,8 +17,9 @@ from handsim.errors import DatasetError
 from handsim.hand.topology import JOINT_NAMES, JOINTS
 from train.data.shards import Dataset, row_dtype
 from train.reports import dataset_page as report
-from train.simulation import synthesis
-from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation import generation
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
 
 ROOT = Path(__file__).resolve().parents[3]
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, f
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthesis, "ROWS_PER_SHARD", 150)
+        patch.setattr(generation, "ROWS_PER_SHARD", 150)
         generate_dataset(DatasetConfig(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
     return Dataset(out)
 
@@ -160,10 +161,10 @@ def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
 def test_only_drawing_loads_matplotlib_and_nothing_loads_pyplot():
     code = """
 import sys
-import train.commands.generate, train.commands.train, train.simulation.synthesis
-import train.reports.dataset_page, train.reports.run_page, train.reports.dataset_plots
+import train.commands.generate, train.commands.train, train.simulation.generation
+import train.reports.dataset_page, train.reports.run_page, train.reports.plot_style
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
-train.reports.dataset_plots.picture((1, 1), lambda figure: figure.subplots())
+train.reports.datasetpicture((1, 1), lambda figure: figure.subplots())
 assert "matplotlib.figure" in sys.modules and "matplotlib.pyplot" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

@@ -8,7 +8,9 @@ import pytest
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONES, bones_of
-from train.reports.hand_plot import HAND_SIZE, _extent, flat_hand, mistakes, place_names
+from train.reports.flat_hand import flat_hand
+from train.reports.hand_plot import HAND_SIZE, arrow_curve, mistakes
+from train.reports.name_placement import name_extent, place_names
 
 
 def any_layout(count: int) -> MarkerLayout:
@@ -75,8 +77,9 @@ def test_names_do_not_lie_on_one_another(count):
     size = (72.0 * HAND_SIZE[0], 72.0 * HAND_SIZE[1])
     dots = 3000.0 * flat_hand(layout).markers + (350.0, 100.0)
     confusion = np.eye(count + 1, dtype=int) + np.roll(np.eye(count + 1, dtype=int), 3, axis=1)
-    places = place_names(list(layout.names), dots, mistakes(confusion), size)
-    half = np.array([_extent(name) for name in layout.names]) / 2.0
+    curves = [arrow_curve(dots[arrow.truth], dots[arrow.called]) for arrow in mistakes(confusion)]
+    places = place_names(list(layout.names), dots, curves, size)
+    half = np.array([name_extent(name) for name in layout.names]) / 2.0
     apart = (np.abs(places[:, None] - places) - (half[:, None] + half)).max(axis=-1)
     assert apart[~np.eye(count, dtype=bool)].min() > 0.0
     assert ((places - half > 0.0) & (places + half < size)).all()

@@ -23,7 +23,8 @@ from train.history import History
 from train.labelers.storage import load_labeler
 from train.loop import CHECKPOINT, train_labeler
 from train.reports.run_page import PAGE, write_run_page
-from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
 from train.training_state import TrainingState
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit

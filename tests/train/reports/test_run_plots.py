@@ -9,7 +9,7 @@ import pytest
 
 from train.evaluation.reliability import reliability
 from train.history import History
-from train.reports.dataset_plots import picture
+from train.reports.plot_style import picture
 from train.reports.run_plots import (
     LONGEST_NAME,
     confusion_size,

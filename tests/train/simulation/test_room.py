@@ -15,13 +15,18 @@ from gloves.layout import load_layout
 from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.strays import StrayConfig
 from gloves.optics.visibility import MAX_FACING
+from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.motion import BodyMotion
 from handsim.space.cameras import CameraRig, look_at, named_rig
 from handsim.space.objects import RigidObject, named_object
 from poses.motion.motions import sample_motion
-from train.simulation.room import Prop, Room, RoomConfig
+from train.simulation.light_sources import sample_light_sources
+from train.simulation.motion import MovingObject, SceneMotion
+from train.simulation.room import pack_take, record_take
+from train.simulation.room_settings import RoomConfig
+from train.simulation.sight import SceneSight
 
 RATE = 120.0
 FRAMES = 120
@@ -39,20 +44,23 @@ def gloved(side: str, aside: float) -> GlovedHand:
     return GlovedHand(attach(load_layout("dense19"), model), qpos)
 
 
-def prop(thing: RigidObject) -> Prop:
-    """It hangs between the hands, turning."""
+def moving(thing: RigidObject) -> MovingObject:
+    """An object that rotates between the hands."""
     angle = np.linspace(0.0, 2.0, FRAMES)
     pose = np.tile(np.eye(4), (FRAMES, 1, 1))
     pose[:, 0, 0], pose[:, 0, 1], pose[:, 1, 0], pose[:, 1, 1] = (
         np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle),
     )  # fmt: skip
     pose[:, :3, 3] = [0.0, 0.05, 1.1]
-    return Prop(thing, BodyMotion(pose, RATE))
+    return MovingObject(thing, BodyMotion(pose, RATE))
 
 
-def two_hands(thing: RigidObject | None = None, config: RoomConfig = CLEAN) -> Room:
-    hands = gloved("right", 0.12), gloved("left", -0.12)
-    return Room(hands, thing and prop(thing), RIG, config)
+def two_hands(thing: RigidObject | None = None) -> SceneMotion:
+    return SceneMotion((gloved("right", 0.12), gloved("left", -0.12)), thing and moving(thing))
+
+
+def record(scene: SceneMotion, config: RoomConfig = CLEAN, *, rng: np.random.Generator) -> Take:
+    return record_take(scene, RIG, config, {}, rng=rng)
 
 
 def noisy(**optics: float) -> RoomConfig:
@@ -65,7 +73,7 @@ def true_markers(hand: GlovedHand) -> np.ndarray:
 
 def test_a_point_lies_at_the_marker_that_its_label_names(rng):
     hand = gloved("right", 0.0)
-    take = Room((hand,), None, RIG, CLEAN).take({}, rng=rng)
+    take = record(SceneMotion((hand,)), rng=rng)
     frame, column = np.nonzero(np.isfinite(take.points[..., 0]))
     label = take.labels[frame, column]
     assert (label >= 0).mean() > 0.999, "nothing but chance makes ghosts here"
@@ -79,7 +87,7 @@ def test_a_point_lies_at_the_marker_that_its_label_names(rng):
 def test_labels_follow_the_order_of_the_hands(rng):
     right, left = gloved("right", 0.12), gloved("left", -0.12)
     for hands in ((right, left), (left, right)):
-        take = Room(hands, None, RIG, CLEAN).take({}, rng=rng)
+        take = record(SceneMotion(hands), rng=rng)
         assert [hand.side for hand in take.hands] == [hand.side for hand in hands]
         for hand, label in zip(hands, take.hand_labels, strict=True):
             off = np.linalg.norm(take.observed(label) - true_markers(hand), axis=-1)
@@ -90,25 +98,26 @@ def test_labels_follow_the_order_of_the_hands(rng):
 @pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")
 @pytest.mark.parametrize("name", ["controller", "mug"])
 def test_markers_are_seen_as_embree_sees_them(name, rng):
-    optics = dataclasses.replace(CLEAN.optics, partial=0.0)
-    room = two_hands(named_object(name), dataclasses.replace(CLEAN, optics=optics))
-    ours = room.markers_seen(rng=rng)
-    markers, normals = room.markers
+    scene_motion = two_hands(named_object(name))
+    sight = SceneSight(scene_motion, RIG)
+    ours = sight.visible_markers(0.0, rng=rng)
+    markers, normals = sight.markers
+    thing = scene_motion.moving_object
     to_camera = RIG.positions - markers[:, :, None]
     ahead = np.einsum("tpci,tpi->tpc", to_camera, normals)
     wanted = RIG.in_view(markers) & (ahead > np.cos(MAX_FACING) * np.linalg.norm(to_camera, axis=-1))
     assert not (ours & ~wanted).any()
-    skins = [(hand.fit.model.skin(hand.qpos), hand) for hand in room.hands]
+    skins = [(hand.fit.model.skin(hand.qpos), hand) for hand in scene_motion.hands]
     frames = np.arange(0, FRAMES, 4)
     reference = np.zeros_like(ours)
     for frame in frames:
-        pose = room.prop.motion.T_world_body[frame]
-        thing = room.prop.thing.vertices @ pose[:3, :3].T + pose[:3, 3]
+        pose = thing.motion.T_world_body[frame]
+        vertices_of_thing = thing.rigid_object.vertices @ pose[:3, :3].T + pose[:3, 3]
         meshes = [
             trimesh.Trimesh(vertices, faces, process=False)
             for vertices, faces in (
-                *((skin[frame], hand.model.surface.faces) for skin, hand in skins),
-                (thing, room.prop.thing.faces),
+                *((skin[frame], hand.fit.model.surface.faces) for skin, hand in skins),
+                (vertices_of_thing, thing.rigid_object.faces),
             )
         ]  # fmt: skip
         scene = trimesh.util.concatenate(meshes)
@@ -131,12 +140,13 @@ def test_two_markers_make_no_body_but_three_do(rng):
             markers=mug.markers[:count],
             marker_normals=mug.marker_normals[:count],
         )
-        room = two_hands(thing)
-        labels = room.sources(rng=rng).labels
+        scene = two_hands(thing)
+        sources = sample_light_sources(SceneSight(scene, RIG), CLEAN, rng=rng)
+        labels = sources.labels
         np.testing.assert_array_equal(labels[:38], np.arange(38))
         expected = np.arange(38, 41) if count == 3 else np.full(count, -1)
         np.testing.assert_array_equal(labels[38 : 38 + count], expected)
-        take = room.take({}, rng=rng)
+        take = pack_take(scene, sources, RIG, CLEAN, {}, rng=rng)
         assert (take.labels >= 38).any() == (count == 3)
         assert take.body is not None and take.body.marker_names == thing.marker_names
 
@@ -145,18 +155,18 @@ def test_only_shiny_things_mirror(rng):
     mug = named_object("mug")
     large = np.array([[0.0, 0.0, 0.06, 0.0, 0.0, 1.0, 0.2]])
     for shiny, share in ((np.empty((0, 7)), 1.0), (large, 0.0), (large, 1.0)):
-        room = two_hands(dataclasses.replace(mug, shiny=shiny), dataclasses.replace(CLEAN, reflectance=share))
-        sources = room.sources(rng=rng)
-        images = sources.places[:, 38 + len(mug.markers) :]
+        sight = SceneSight(two_hands(dataclasses.replace(mug, shiny=shiny)), RIG)
+        sources = sample_light_sources(sight, dataclasses.replace(CLEAN, reflectance=share), rng=rng)
+        images = sources.positions[:, 38 + len(mug.markers) :]
         assert (images.shape[1] > 0) == (len(shiny) > 0 and share > 0.0)
         assert (sources.labels[38 + len(mug.markers) :] == -1).all()
         if images.shape[1]:
-            shown = sources.seen[:, 38 + len(mug.markers) :].any(axis=2)
+            shown = sources.visible[:, 38 + len(mug.markers) :].any(axis=2)
             assert (images[..., 2][shown] < 1.1 + 0.06).all(), "behind the mirror, which lies level"
 
 
 def test_an_id_lasts_as_long_as_its_point_and_a_column_holds_one_a_stretch(rng):
-    take = two_hands(config=noisy(blob_loss=0.3, dropout=0.1, dropout_cameras=8)).take({}, rng=rng)
+    take = record(two_hands(), noisy(blob_loss=0.3, dropout=0.1, dropout_cameras=8), rng=rng)
     there = take.ids >= 0
     np.testing.assert_array_equal(there, np.isfinite(take.points).all(axis=-1))
     stays = there[1:] & there[:-1]
@@ -177,7 +187,7 @@ def test_an_id_lasts_as_long_as_its_point_and_a_column_holds_one_a_stretch(rng):
 
 
 def test_neither_ids_nor_columns_tell_the_marker(rng):
-    take = two_hands().take({}, rng=rng)
+    take = record(two_hands(), rng=rng)
     first = take.labels[0] >= 0
     labels = take.labels[0, first]
     for other in (take.ids[0, first], np.flatnonzero(first)):
@@ -185,8 +195,8 @@ def test_neither_ids_nor_columns_tell_the_marker(rng):
 
 
 def test_a_seed_decides_everything():
-    room = two_hands(named_object("controller"), noisy())
-    takes = [room.take({}, rng=np.random.default_rng(seed)) for seed in (5, 5, 6)]
+    scene = two_hands(named_object("controller"))
+    takes = [record(scene, noisy(), rng=np.random.default_rng(seed)) for seed in (5, 5, 6)]
     for name in ("points", "ids", "labels"):
         first, second, _ = (getattr(take, name).tobytes() for take in takes)
         assert first == second
@@ -197,16 +207,16 @@ def test_losses_cost_markers(rng):
     lossy = OpticsConfig(blob_loss=0.5), OpticsConfig(dropout=0.5, dropout_cameras=13)
     kept = []
     for optics in (CLEAN.optics, *lossy):
-        take = two_hands(config=dataclasses.replace(CLEAN, optics=optics)).take({}, rng=rng)
+        take = record(two_hands(), dataclasses.replace(CLEAN, optics=optics), rng=rng)
         kept.append(np.isfinite(take.observed(range(38))[..., 0]).mean())
     assert kept[0] > kept[1] + 0.01
     assert kept[0] > kept[2] + 0.05
 
 
 def test_a_camera_in_the_hands_is_refused(rng):
-    room = two_hands()
-    middle = room.markers[0][0, 0]
+    scene = two_hands()
+    middle = SceneSight(scene, RIG).markers[0][0, 0]
     poses = np.stack([look_at(middle + [0.0, 0.0, 0.01], middle), look_at(middle + [0.0, 1.5, 0.5], middle)])
-    near = Room(room.hands, None, CameraRig("near", poses, field_of_view=1.0), room.config)
+    near = CameraRig("near", poses, field_of_view=1.0)
     with pytest.raises(ArgumentError, match=r"camera 1 of rig 'near' is 0\.00\d+ m from the hand"):
-        near.take({}, rng=rng)
+        record_take(scene, near, CLEAN, {}, rng=rng)

@@ -9,7 +9,7 @@ import pytest
 
 from gloves.captures.gaps import count_gaps
 from gloves.takes.take import Take
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.objects import named_object
@@ -17,7 +17,10 @@ from handsim.space.transforms import quaternion_matrix
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.object_motion import object_penetration
 from poses.shapes.couplings import HIGH, LOW
-from train.simulation.twins import _SPACE, KINDS, RATE, TWINS, TwinConfig, simulate_twin
+from train.simulation import takes
+from train.simulation.motion import RATE
+from train.simulation.room_settings import KINDS, TWINS
+from train.simulation.takes import WRIST_VOLUME, TakeConfig, simulate_take
 
 FRAMES = 200
 SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
@@ -25,12 +28,12 @@ SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
 
 @functools.cache
 def short(kind: str) -> Take:
-    return simulate_twin(TwinConfig(kind=kind, num_frames=FRAMES))
+    return simulate_take(TakeConfig(kind=kind, num_frames=FRAMES))
 
 
 @functools.cache
 def whole() -> Take:
-    return simulate_twin(TwinConfig(kind="hand-controller"))
+    return simulate_take(TakeConfig(kind="hand-controller"))
 
 
 def models(take: Take) -> tuple[HandModel, HandModel]:
@@ -64,7 +67,7 @@ def test_every_frame_is_valid(kind):
         angles = hand.qpos[:, 7:]
         assert (angles >= LOW - 1e-9).all() and (angles <= HIGH + 1e-9).all()
         assert model.penetration(hand.qpos).max() <= SELF_DEEPEST + 1e-9
-        assert np.abs(hand.qpos[:, :3] - ROOM_CENTER).max() <= _SPACE, "where no camera may stand"
+        assert np.abs(hand.qpos[:, :3] - ROOM_CENTER).max() <= WRIST_VOLUME, "where no camera may stand"
     assert two_hands_penetration(right, left, *(hand.qpos for hand in take.hands)).max() <= DEEPEST
     if take.body is not None:
         thing = named_object(take.body.name)
@@ -93,8 +96,8 @@ def test_the_pen_points_at_markers_of_the_other_hand():
 
 
 def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
-    config = TwinConfig(kind="hand-hand", num_frames=40, glove="sparse13", rig="eight", seed=7)
-    first, again = simulate_twin(config), simulate_twin(config)
+    config = TakeConfig(kind="hand-hand", num_frames=40, glove="sparse13", rig="eight", seed=7)
+    first, again = simulate_take(config), simulate_take(config)
     for name in ("points", "ids", "labels"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert first.hand_labels == (range(13), range(13, 26))
@@ -102,8 +105,28 @@ def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_single_frame_is_a_capture(kind):
-    take = simulate_twin(TwinConfig(kind=kind, num_frames=1))
+    take = simulate_take(TakeConfig(kind=kind, num_frames=1))
     assert take.num_frames == 1 and (take.labels >= 0).sum() > 30
+
+
+def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
+    tried = []
+
+    def out_of_reach(kind, fits, num_frames, *, rng):
+        tried.append(fits)
+        raise PoseError("this hand does not get hold of the pen")
+
+    monkeypatch.setattr(takes, "sample_scene_motion", out_of_reach)
+    with pytest.raises(PoseError, match="none of 10 people can do 'hand-pen'; the last: this hand does not"):
+        simulate_take(TakeConfig(kind="hand-pen", num_frames=5))
+    assert len(tried) == 10
+
+    def broken(kind, fits, num_frames, *, rng):
+        raise ArgumentError("qpos has shape (3,), expected (..., 27)")
+
+    monkeypatch.setattr(takes, "sample_scene_motion", broken)
+    with pytest.raises(ArgumentError, match="qpos has shape"):
+        simulate_take(TakeConfig(kind="hand-pen", num_frames=5))
 
 
 @pytest.mark.parametrize(
@@ -117,7 +140,7 @@ def test_a_single_frame_is_a_capture(kind):
 )  # fmt: skip
 def test_a_mistake_is_one_sentence(arguments, words):
     with pytest.raises(ArgumentError) as caught:
-        TwinConfig(**arguments)
+        TakeConfig(**arguments)
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -126,7 +149,7 @@ def test_a_mistake_is_one_sentence(arguments, words):
 )
 def test_unknown_gloves_and_rigs_are_told(arguments, words):
     with pytest.raises(HandSimError, match=words):
-        simulate_twin(TwinConfig(num_frames=5, **arguments))
+        simulate_take(TakeConfig(num_frames=5, **arguments))
 
 
 def test_the_whole_hand_controller_twin_is_near_table_3():

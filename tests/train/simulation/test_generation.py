@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,46 +13,51 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from handsim.errors import DatasetError, LayoutError
+from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import Population
 from poses.shapes.couplings import HIGH, LOW
-from train.data.shards import Dataset, checksum, hands_name, rows_name
-from train.simulation import synthesis
-from train.simulation.synthesis import DatasetConfig, generate_dataset
+from train.data.shards import MANIFEST, Dataset, checksum, hands_name, redrawn_name, rows_name
+from train.simulation import frame_scenes, generation, people
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.frame_scenes import NO_GRASP, NO_TOUCH, SceneMix
+from train.simulation.generation import generate_dataset
+from train.simulation.people import NO_REST
 
 CONFIG = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
 COMMAND = """
 import sys
 from pathlib import Path
-from train.simulation import synthesis
-synthesis.ROWS_PER_SHARD = 200
+from train.simulation import generation
+from train.simulation.dataset_config import DatasetConfig
+generation.ROWS_PER_SHARD = 200
 if __name__ == "__main__":
-    config = synthesis.DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
-    synthesis.generate_dataset(config, Path(sys.argv[1]), workers=1)
+    config = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
+    generation.generate_dataset(config, Path(sys.argv[1]), workers=1)
 """
 
 # A pause after each shard, so that the kill comes before the end however busy the machine is.
 SLOWLY = """
 import time
-make_shard = synthesis.make_shard
+make_shard = generation.make_shard
 def make_slowly(*arguments):
     shard = make_shard(*arguments)
     time.sleep(1.0)
     return shard
-synthesis.make_shard = make_slowly
+generation.make_shard = make_slowly
 """
 
 
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch):
-    monkeypatch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+    monkeypatch.setattr(generation, "ROWS_PER_SHARD", 200)
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "undisturbed"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+        patch.setattr(generation, "ROWS_PER_SHARD", 200)
         generate_dataset(CONFIG, out, workers=1)
     return out
 
@@ -87,7 +93,7 @@ def test_rows_are_what_they_say(finished):
 
 
 def test_two_workers_make_the_same_bytes(finished, tmp_path, monkeypatch):
-    monkeypatch.setattr(synthesis, "ROWS_PER_SHARD", 200)
+    monkeypatch.setattr(generation, "ROWS_PER_SHARD", 200)
     out = tmp_path / "two"
     script = tmp_path / "make.py"
     script.write_text(COMMAND.replace("workers=1", "workers=2"))
@@ -123,6 +129,61 @@ def test_another_seed_makes_other_rows(finished, tmp_path):
 
     generate_dataset(dataclasses.replace(CONFIG, seed=4), tmp_path / "other", workers=1)
     assert contents(tmp_path / "other")[rows_name(0)] != contents(finished)[rows_name(0)]
+
+
+def test_redraws_are_counted_in_the_manifest(tmp_path, monkeypatch):
+    def no_touch(*args, **kwargs):
+        raise PoseError("no valid pose of these two hands was found")
+
+    monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", no_touch)
+    monkeypatch.setattr(frame_scenes, "settle_hold", no_touch)
+    config = DatasetConfig(
+        num_frames=600,
+        frames_per_hand=20,
+        population=Population(girth_spread=0.2),
+        scenes=SceneMix(alone=0.0, together=1.0, holding=1.0),
+    )
+    manifest = generate_dataset(config, tmp_path / "set", workers=1)
+    assert manifest.redrawn is not None and set(manifest.redrawn) == {NO_REST, NO_TOUCH, NO_GRASP}
+    assert manifest.redrawn[NO_TOUCH] + manifest.redrawn[NO_GRASP] == 30
+    assert Dataset(tmp_path / "set").manifest == manifest
+    for shard in (0, 2):
+        (tmp_path / "set" / rows_name(shard)).unlink()
+    assert generate_dataset(config, tmp_path / "set", workers=1) == manifest, "a resumed run counts the same"
+
+
+def test_errors_other_than_poses_out_of_reach_stop_the_generation(tmp_path, monkeypatch):
+    def broken(*args, **kwargs):
+        raise ArgumentError("qpos has shape (3,), expected (..., 27)")
+
+    monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", broken)
+    config = DatasetConfig(num_frames=20, scenes=SceneMix(alone=0.0, together=1.0, holding=0.0))
+    with pytest.raises(ArgumentError, match="qpos has shape"):
+        generate_dataset(config, tmp_path / "set", workers=1)
+
+
+def test_people_are_not_drawn_for_ever(rng, monkeypatch):
+    def no_rest(model):
+        raise PoseError("this hand's fingers overlap at rest")
+
+    monkeypatch.setattr(people, "resting_angles", no_rest)
+    with pytest.raises(ArgumentError, match="the fingers of all 1000 people drawn"):
+        people.sample_hands(Population(), rng=rng)
+
+
+def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    content = json.loads((copy / MANIFEST).read_text())
+    del content["redrawn"]
+    (copy / MANIFEST).write_text(json.dumps(content))
+    assert Dataset(copy).manifest.redrawn is None
+    (copy / redrawn_name(1)).unlink()
+    assert generate_dataset(CONFIG, copy, workers=1).redrawn is None, (
+        "an older version made one of the shards"
+    )
 
 
 def test_other_settings_in_the_same_folder_are_told(finished):

@@ -1,4 +1,4 @@
-"""Test frames of people and poses that no training set holds."""
+"""Held-out test frames: people and poses that no training set holds."""
 
 from __future__ import annotations
 
@@ -9,25 +9,27 @@ import numpy as np
 from gloves.layout import load_layout
 from handsim.space.cameras import load_rig
 from train.data.shards import row_dtype
-from train.simulation.synthesis import DatasetConfig, sample_hands, simulate_frames
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.people import sample_hands
+from train.simulation.training_frames import simulate_frames
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_KEY: Final = 2**32 - 1  # a shard's number that no training set reaches
+_SPAWN_KEY: Final = 2**32 - 1  # a shard number that no training set reaches
 
 
-def unseen_markers(glove: str, num_frames: int, *, seed: int) -> Float[np.ndarray, "T M 3"]:
+def held_out_markers(glove: str, num_frames: int, *, seed: int) -> Float[np.ndarray, "T M 3"]:
     """True markers of random people's hands [m], drawn as training sets draw them but from other randomness.
 
     Args:
         glove: Marker layout: a shipped name or the path of a .toml file.
-        num_frames: Frames; every 128 another person.
+        num_frames: Number of frames T; another person every 128 frames.
         seed: Seed of the people and poses.
     """
     config = DatasetConfig(glove=glove, num_frames=num_frames, seed=seed)
     layout, rig = load_layout(glove), load_rig(config.rig)
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_KEY,)))
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY,)))
     rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
     for first in range(0, num_frames, config.frames_per_hand):
         block = rows[first : first + config.frames_per_hand]

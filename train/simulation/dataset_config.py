@@ -1,0 +1,52 @@
+"""The settings of a training set: people, poses, scenes, cameras and losses."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from gloves.optics.ghosts import GhostConfig
+from gloves.optics.reconstruction import OpticsConfig
+from handsim.errors import DatasetError
+from handsim.hand.shape import Population
+from poses.shapes.samplers import PoseMix
+from train.simulation.frame_scenes import SceneMix
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetConfig:
+    """Everything that decides the bytes of a training set."""
+
+    glove: str = "dense19"
+    """Marker layout: a shipped name or the path of a .toml file."""
+    num_frames: int = 170_330
+    """Frames; the default is the paper's number."""
+    seed: int = 0
+    rig: str = "figure5"
+    """Camera rig: a shipped name or the path of a .toml file."""
+    min_cameras: int = 2
+    """Cameras that must see a marker before it exists."""
+    frames_per_hand: int = 128
+    """Poses of one hand before the next person puts on the glove."""
+    slip_along: float = 0.1
+    """Standard deviation of the markers' slip along the bones [bone lengths]."""
+    slip_around: float = 10.0
+    """The same around the bones [deg]."""
+    volume: float = 0.3
+    """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
+    population: Population = dataclasses.field(default_factory=lambda: Population(children=0.2))
+    poses: PoseMix = dataclasses.field(default_factory=PoseMix)
+    scenes: SceneMix = dataclasses.field(default_factory=SceneMix)
+    ghosts: GhostConfig = dataclasses.field(default_factory=GhostConfig)
+    optics: OpticsConfig = dataclasses.field(default_factory=OpticsConfig)
+    blob_loss: tuple[float, float] = (0.0, 0.15)
+    """Least and greatest chance that a camera misses a blob; every person draws another."""
+    dropout: tuple[float, float] = (0.0, 0.4)
+    """Least and greatest chance per frame that some cameras lose their pictures."""
+
+    def __post_init__(self) -> None:
+        for name in ("num_frames", "min_cameras", "frames_per_hand"):
+            if getattr(self, name) < 1:
+                raise DatasetError(f"{name} is {getattr(self, name)}, expected at least 1")
+        if self.seed < 0:
+            raise DatasetError(f"seed is {self.seed}, expected 0 or more")

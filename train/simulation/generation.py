@@ -1,0 +1,124 @@
+"""The generation of training sets: in shards on all cores, resumable, reproducible to the byte."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gloves.attachment import attach_markers
+from gloves.layout import load_layout
+from handsim.app.workers import in_processes
+from handsim.errors import DatasetError
+from handsim.files.json_files import claim, load_json, save_json
+from handsim.hand.model import HandModel
+from handsim.hand.records import HAND_DTYPE, pack_hand
+from handsim.hand.topology import SIDES
+from handsim.space.cameras import ROOM_CENTER, check_outside_volume, list_rigs, load_rig
+from train.data.shards import (
+    CONFIG,
+    Manifest,
+    checksum,
+    hands_name,
+    load_redrawn,
+    redrawn_name,
+    row_dtype,
+    rows_name,
+    save_array,
+    save_manifest,
+)
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.people import sample_hands
+from train.simulation.training_frames import simulate_frames
+
+ROWS_PER_SHARD: Final = 8192
+Progress = Callable[[int, int], None]
+"""Called with frames done and frames expected."""
+
+
+def generate_dataset(
+    config: DatasetConfig, out: Path, *, workers: int | None = None, progress: Progress | None = None
+) -> Manifest:
+    """Make a training set, or finish one that was stopped; the bytes depend on the config alone.
+
+    Args:
+        config: What to make.
+        out: Folder to make it in.
+        workers: Processes; all cores when not given.
+        progress: Called after every shard.
+
+    Raises:
+        DatasetError: `out` holds a set of another config, or a worker died.
+        LayoutError: The glove is unknown or does not fit.
+        ArgumentError: The rig is unknown or stands in the hands' way, or no hand of the population can rest.
+    """
+    layout, rig = load_layout(config.glove), load_rig(config.rig)
+    check_outside_volume(rig, np.array(ROOM_CENTER), config.volume)
+    if config.min_cameras > len(rig.positions):
+        raise DatasetError(
+            f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
+        )
+    attach_markers(layout, HandModel.named("M"))  # raises before anything is written
+    settings = {**dataclasses.asdict(config), "layout": dataclasses.asdict(layout)}
+    if config.rig not in list_rigs():  # a file may change
+        settings["cameras"] = {
+            "T_world_camera": rig.T_world_camera.tolist(),
+            "field_of_view": rig.field_of_view,
+        }
+    claim(out / CONFIG, settings, noun="training set", error=DatasetError)
+    shards = range(-(-config.num_frames // ROWS_PER_SHARD))
+    todo = [shard for shard in shards if not _finished(out, shard)]
+    done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
+    for shard in in_processes(
+        functools.partial(make_shard, config, out), todo, workers or os.cpu_count() or 1
+    ):
+        done += _shard_size(config, shard)
+        if progress is not None:
+            progress(done, config.num_frames)
+    names = [name(shard) for shard in shards for name in (rows_name, hands_name)]
+    manifest = Manifest(
+        config=load_json(out / CONFIG),
+        marker_names=layout.names,
+        num_frames=config.num_frames,
+        min_cameras=config.min_cameras,
+        files={name: checksum(out / name) for name in sorted(names)},
+        redrawn=load_redrawn(out, len(shards)),
+    )
+    save_manifest(out, manifest)
+    return manifest
+
+
+def _finished(out: Path, shard: int) -> bool:
+    return (out / rows_name(shard)).is_file() and (out / hands_name(shard)).is_file()
+
+
+def _shard_size(config: DatasetConfig, shard: int) -> int:
+    return min(ROWS_PER_SHARD, config.num_frames - shard * ROWS_PER_SHARD)
+
+
+def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:
+    """Write one shard's hands, counts of redraws and rows; they depend on its number and the seed alone."""
+    rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(shard,)))
+    layout, rig = load_layout(config.glove), load_rig(config.rig)
+    size = _shard_size(config, shard)
+    rows = np.zeros(size, dtype=row_dtype(layout.num_markers))
+    people = -(-size // config.frames_per_hand)
+    redrawn: Counter[str] = Counter()
+    hands = np.zeros(len(SIDES) * people, dtype=HAND_DTYPE)
+    for person in range(people):
+        block = rows[person * config.frames_per_hand : (person + 1) * config.frames_per_hand]
+        models = sample_hands(config.population, redrawn=redrawn, rng=rng)
+        first = len(SIDES) * person
+        hands[first : first + len(SIDES)] = [pack_hand(model.shape) for model in models]
+        simulate_frames(block, models, layout, rig, config, redrawn=redrawn, rng=rng)
+        block["hand"] += first
+    save_array(out / hands_name(shard), hands)
+    save_json(out / redrawn_name(shard), dict(sorted(redrawn.items())))
+    save_array(out / rows_name(shard), rows)  # last: a shard with rows is finished
+    return shard

@@ -1,0 +1,75 @@
+"""The settings of a simulated capture room, and those fitted to the four test captures of Han et al. 2018.
+
+How often cameras drop out and how many reflections flash is fitted to Table 3 and to the ghost ratios of
+Table 4 (docs/room.md says what was fitted to what).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, get_args
+
+from gloves.captures.gaps import GapCounts
+from gloves.optics.reconstruction import OpticsConfig
+from gloves.optics.strays import StrayConfig
+
+Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
+"""A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+
+
+@dataclass(frozen=True, slots=True)
+class RoomConfig:
+    """What the cameras and the surfaces of the room do to what is seen."""
+
+    optics: OpticsConfig = field(default_factory=OpticsConfig)
+    """Noise, losses and triangulation of the optical system."""
+    strays: StrayConfig = field(default_factory=StrayConfig)
+    """Stray reflections carried by every hand and by the object."""
+    reflectance: float = 0.5
+    """Share of the mirror images in shiny patches that are bright enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class TwinSettings:
+    """One of the paper's captures, and the settings that make its simulated twin like it."""
+
+    paper: GapCounts
+    """Table 3."""
+    ghost_ratio: float
+    """Ghosts over expected labels; Table 4."""
+    room: RoomConfig
+    draw: int
+    """Which of many random captures of this kind is the twin: the one nearest to the paper's figures."""
+
+
+def _room(strays: float, **optics: Any) -> RoomConfig:
+    return RoomConfig(
+        optics=OpticsConfig(min_rays_to_start=2, **optics),
+        strays=StrayConfig(number=strays),
+    )
+
+
+def _losses(blob_loss: float, dropout: float, length: float, cameras: int) -> dict[str, float]:
+    return {
+        "blob_loss": blob_loss,
+        "dropout": dropout,
+        "dropout_length": length,
+        "dropout_cameras": cameras,
+    }
+
+
+TWINS: Final[dict[str, TwinSettings]] = {
+    "single-hand": TwinSettings(
+        GapCounts(4785, 44, 2.11, 1.35), 0.0001, _room(0.0, **_losses(0.01, 0.016, 2.2, 6)), draw=8
+    ),
+    "hand-hand": TwinSettings(
+        GapCounts(3312, 331, 4.01, 3.30), 0.1063, _room(7.0, **_losses(0.002, 0.35, 1.5, 4)), draw=8
+    ),
+    "hand-pen": TwinSettings(
+        GapCounts(4511, 481, 3.39, 2.31), 0.0755, _room(3.0, **_losses(0.002, 0.17, 1.4, 6)), draw=15
+    ),
+    "hand-controller": TwinSettings(
+        GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(1.7, **_losses(0.115, 0.0, 1.0, 1)), draw=2
+    ),
+}
