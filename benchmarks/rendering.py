@@ -32,15 +32,15 @@ from machine import describe
 from handsim.app.workers import in_processes
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
+from render.frames.frame import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
-from render.painting.scene import OPENGL_FROM_OPENCV
 from render.session import RenderConfig, draw_frames
 from render.shown_take import ShownTake, show_simulated
 from render.skin.look import ALL_TONES
-from render.studio import Studio
+from render.studio.studio import Studio
 from train.simulation.twins import TwinConfig, simulate_twin
 
 SECTIONS: Final = ("speed", "accuracy", "memory")

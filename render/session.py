@@ -19,7 +19,7 @@ from handsim.files.json_files import claim
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.formats.annotations.common import without_colors
 from render.formats.writer import FORMATS, NEED_COLORS, open_writer
-from render.frames import RenderedFrame
+from render.frames.frame import RenderedFrame
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.painting.figures import sample_people
@@ -31,7 +31,7 @@ from render.sensors.exposure import ExposureConfig, sample_exposure
 from render.sensors.shutter import ShutterConfig, sample_shutter
 from render.shown_take import ShownTake, load_shown_take
 from render.skin.look import ALL_TONES, SkinLook
-from render.studio import PASSES, FrameChoices, Studio
+from render.studio.studio import PASSES, FrameChoices, Studio
 
 Progress = Callable[[int, int], None]
 """Called with pictures done and pictures wanted."""

@@ -204,7 +204,9 @@ def _draw_frame(out: Path, chain: _Chain, seed: int) -> Section:
     points, truth = cloud.points[0][here], cloud.truth[0][here]
     labeling = chain.labeler.label_frames([points])[0]
     model = HandModel(chain.dataset.hands(0)[row["hand"]])
-    hand = load("render.painting.scene:PosedHand")(model, row["qpos"].astype(np.float64), covering="glove")
+    hand = load("render.illustrations.scene:PosedHand")(
+        model, row["qpos"].astype(np.float64), covering="glove"
+    )
     picture = load("render.illustrations.hands:draw_labels")(hand, points, labeling.labels, layout)
     load("render.illustrations.captions:write_png")(out / "labels.png", picture)
     right = int((labeling.labels == truth).sum())

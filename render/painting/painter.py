@@ -12,9 +12,9 @@ import numpy as np
 from render.cameras.camera import Camera
 from render.painting.compiled_painter import paint_compiled
 from render.painting.figures import Drawn
-from render.painting.lights import Lighting
 from render.painting.opengl_painter import paint_opengl
 from render.painting.rasterizer import NEAR
+from render.scenery.lights import Lighting
 
 if TYPE_CHECKING:
     from jaxtyping import Float32, UInt8

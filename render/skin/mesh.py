@@ -16,9 +16,8 @@ import numpy as np
 from handsim.hand.model import HandModel
 from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.topology import NUM_BONES, PALM
-from render.frames import FOREARM
 from render.skin.atlas import RINGS, skin_atlas
-from render.skin.forearm import Forearm, forearm_rings
+from render.skin.forearm import FOREARM, Forearm, forearm_rings
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8

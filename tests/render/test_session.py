@@ -16,7 +16,7 @@ from gloves.takes.take import save_take
 from handsim.errors import CaptureError, HandSimError
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.formats.png_depth import read_depth
-from render.keypoints import KEYPOINT_DIGITS
+from render.frames.keypoints import KEYPOINT_DIGITS
 from render.painting.figures import digit_of_part
 from render.sensors.depth_noise import DepthNoiseConfig
 from render.session import SHEET, RenderConfig, draw_shard, render_take

@@ -11,9 +11,8 @@ from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, SIDES, Side
 from handsim.space.transforms import MIRROR
 from poses.shapes.library import gesture
-from render.frames import FOREARM
 from render.skin.atlas import skin_atlas
-from render.skin.forearm import Forearm, sample_forearm
+from render.skin.forearm import FOREARM, Forearm, sample_forearm
 from render.skin.mesh import SkinMesh, face_parts, mesh_normals
 
 
