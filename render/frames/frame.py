@@ -14,6 +14,8 @@ from render.cameras.camera import Camera
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+PASSES: Final = ("rgb", "depth", "normals", "ids")
+"""Kinds of pictures that can be asked for."""
 PARTS_A_HAND: Final = 32
 """A pixel of bone b of hand h has part 1 + b + 32 h; 0 is no hand."""
 

@@ -1,4 +1,4 @@
-"""Joint orders of other data sets, as indices of our 21 (`render.frames.keypoints`), and the way there and back.
+"""Joint orders of other data sets, as indices of our 21 (`render.frames.keypoints`), and conversions.
 
 One table, because a wrong permutation looks almost right. A place of `ABSENT` is a joint that we do not have.
 
