@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-# What drawing without a screen needs on Debian and Ubuntu: EGL, OpenGL and Mesa's software driver.
+# What --painter opengl needs on Debian and Ubuntu: EGL, OpenGL and Mesa's software driver.
 DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
@@ -16,7 +16,7 @@ help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
 	@sed -n 's/^\([a-z]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST)
 
-demo: $(INSTALLED) drawing  ## run the whole chain on a built-in example, into demo/
+demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
 
 test: $(INSTALLED) drawing lint  ## every check there is: lint, then the tests
@@ -50,5 +50,5 @@ drawing:
 	@dpkg --status $(DRAWING_PACKAGES) >/dev/null 2>&1 || { \
 	  test "$$(id -u)" = 0 && command -v apt-get >/dev/null && apt-get update -qq && \
 	  DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(DRAWING_PACKAGES); } || \
-	  echo "Drawing without a screen, which make demo does, needs EGL and OpenGL; if it fails, have root run" \
+	  echo "Tests of the OpenGL painter need EGL and OpenGL, and skip without them; to run them, have root run" \
 	    "'apt-get install $(DRAWING_PACKAGES)' or install your system's counterparts."

@@ -31,21 +31,22 @@ from machine import describe
 
 from handsim.app.workers import in_processes
 from render.cameras.viewpoints import ViewConfig, Viewpoints
+from render.config import RenderConfig
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
+from render.frames.frame import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
-from render.painting.scene import OPENGL_FROM_OPENCV
-from render.session import RenderConfig, draw_frames
+from render.session import draw_frames
 from render.shown_take import ShownTake, show_simulated
 from render.skin.look import ALL_TONES
-from render.studio import Studio
+from render.studio.studio import Studio
 from train.simulation.takes import TakeConfig, simulate_take
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
-PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None)
+PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None, painter="compiled")
 DEPTH: Final = dataclasses.replace(PLAIN, passes=("depth",))
 COLORS: Final = dataclasses.replace(PLAIN, passes=("rgb", "depth", "ids"))
 KINDS: Final = {
@@ -104,9 +105,9 @@ def plain_pyrender(take: ShownTake, color: bool) -> None:
     for frame in range(take.num_frames):
         scene, camera = pyrender.Scene(), view.cameras(frame)[0]
         for hand in take.hands:
-            skin = hand.model.skin(hand.qpos[frame : frame + 1])[0]
+            skin = hand.fit.model.skin(hand.qpos[frame : frame + 1])[0]
             scene.add(
-                pyrender.Mesh.from_trimesh(trimesh.Trimesh(skin, hand.model.surface.faces, process=False))
+                pyrender.Mesh.from_trimesh(trimesh.Trimesh(skin, hand.fit.model.surface.faces, process=False))
             )
         pose = camera.T_world_camera @ OPENGL_FROM_OPENCV
         scene.add(pyrender.IntrinsicsCamera(600.0, 600.0, 320.0, 240.0), pose=pose)
@@ -117,7 +118,7 @@ def plain_pyrender(take: ShownTake, color: bool) -> None:
 def mujoco_loop(take: ShownTake, color: bool) -> None:
     """MuJoCo's renderer on one hand's capsules; it needs MUJOCO_GL=egl where there is no screen."""
     hand = take.hands[0]
-    model = hand.model.mj_model
+    model = hand.fit.model.mj_model
     data = mujoco.MjData(model)
     with mujoco.Renderer(model, 480, 640) as renderer:
         if not color:

@@ -20,7 +20,7 @@ from handsim.hand.model import HandModel
 from render.cameras.camera import Camera, preset
 from render.cameras.viewpoints import ViewConfig
 from render.formats.png_depth import read_depth
-from render.keypoints import hand_keypoints
+from render.frames.keypoints import hand_keypoints
 from render.session import RenderConfig, render_take
 from track.capture_tracking import track_capture
 from track.tracker import Tracker

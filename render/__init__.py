@@ -10,15 +10,16 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from render.frames import RenderedFrame
-    from render.session import RenderConfig, draw_frames, render_take
+    from render.config import RenderConfig
+    from render.frames.frame import RenderedFrame
+    from render.session import draw_frames, render_take
     from render.skin.look import SkinLook
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "RenderConfig": "render.session",
-        "RenderedFrame": "render.frames",
+        "RenderConfig": "render.config",
+        "RenderedFrame": "render.frames.frame",
         "SkinLook": "render.skin.look",
         "draw_frames": "render.session",
         "render_take": "render.session",

@@ -6,32 +6,32 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import cv2
 import numpy as np
 
 from handsim.app.workers import in_processes
-from handsim.errors import ArgumentError, HandSimError, choices
+from handsim.errors import HandSimError, choices
 from handsim.files.json_files import claim
-from render.cameras.viewpoints import ViewConfig, Viewpoints
+from render.cameras.viewpoints import Viewpoints
+from render.config import RenderConfig
 from render.formats.annotations.common import without_colors
 from render.formats.writer import FORMATS, NEED_COLORS, open_writer
-from render.frames import RenderedFrame
+from render.frames.frame import RenderedFrame
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.painting.figures import sample_people
-from render.painting.painter import Painter
-from render.scenery.backgrounds import BackgroundConfig, photo_files
+from render.painting.painter import choose_painter
+from render.scenery.photographs import photo_files
 from render.scenery.surroundings import sample_surroundings
-from render.sensors.depth_noise import DepthNoiseConfig, sample_depth_noise
-from render.sensors.exposure import ExposureConfig, sample_exposure
-from render.sensors.shutter import ShutterConfig, sample_shutter
+from render.sensors.depth_noise import sample_depth_noise
+from render.sensors.exposure import sample_exposure
+from render.sensors.shutter import sample_shutter
 from render.shown_take import ShownTake, load_shown_take
-from render.skin.look import ALL_TONES, SkinLook
-from render.studio import PASSES, FrameChoices, Studio
+from render.skin.look import SkinLook
+from render.studio.studio import FrameChoices, Studio
 
 Progress = Callable[[int, int], None]
 """Called with pictures done and pictures wanted."""
@@ -40,45 +40,6 @@ SHEET: Final = "contact_sheet.png"
 _ON_SHEET: Final = 9
 _PATHS: Final = 1  # spawn keys of what is drawn for the whole take, and for a shard
 _SHARDS: Final = 2
-
-
-@dataclass(frozen=True, slots=True)
-class RenderConfig:
-    """Everything that decides the bytes of a rendering.
-
-    Raises:
-        ArgumentError: A pass is unknown, or a number is none.
-    """
-
-    passes: tuple[str, ...] = PASSES
-    """Some of rgb, depth, normals, ids."""
-    view: ViewConfig = field(default_factory=ViewConfig)
-    dress: Literal["skin", "glove"] = "skin"
-    """Bare hands, or the marker glove with its markers."""
-    tones: tuple[float, float] = ALL_TONES
-    """Between which individual typology angles skin is drawn [deg]."""
-    background: BackgroundConfig = field(default_factory=BackgroundConfig)
-    vary: Literal["shard", "frame"] = "shard"
-    """When light and background change; the people change with the shard."""
-    depth_sensor: DepthNoiseConfig | None = field(default_factory=DepthNoiseConfig)
-    """None: depth is perfect only."""
-    color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
-    """None: colors are perfect only."""
-    painter: Painter = "compiled"
-    """Who paints colors: opengl is worth it where there is a graphics card."""
-    shutter: ShutterConfig | None = None
-    """None: pictures of moments; else motion blur and rolling shutters, which take a drawing a sub-frame."""
-    every: int = 1
-    """Each so many frames of the take one is drawn."""
-    frames_per_shard: int = 64
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in self.passes:
-            if name not in PASSES:
-                raise ArgumentError(choices(name, PASSES, noun="pass"))
-        if not self.passes or self.every < 1 or self.frames_per_shard < 1:
-            raise ArgumentError("a rendering wants at least one pass, one frame a step and one frame a shard")
 
 
 def render_take(
@@ -107,6 +68,7 @@ def render_take(
         HandSimError: The take or the settings cannot be drawn; shards that are finished are kept.
     """
     _check_formats(formats, config)
+    config = config.with_chosen_painter()
     take = load_shown_take(path)
     if config.background.photo > 0.0:
         photo_files(Path(str(config.background.photos)))
@@ -202,7 +164,8 @@ def draw_shard(
     rng = np.random.default_rng(seeds[0])
     people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
     colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in take.bodies]
-    studio = Studio(take, people, colors, config.passes, painter=config.painter)
+    painter = choose_painter(config.with_chosen_painter().painter)
+    studio = Studio(take, people, colors, config.passes, painter=painter)
     skin = people[0].skin if config.dress == "skin" else None
     kept = _choices(config, skin, rng)
     for frame, seed in zip(frames, seeds[1:], strict=True):

@@ -1,1 +1,5 @@
-"""TODO map."""
+"""The commands `handsim glove` and `handsim render`.
+
+- glove: `glove list`, `show`, `new` and `check`.
+- render: `render`, with its options.
+"""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -11,88 +12,93 @@ from rich.console import Console
 
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError, choices
-from render.cameras.viewpoints import Placement, ViewConfig
-from render.painting.painter import Painter
-from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind, photo_files
+from render.cameras.viewpoints import ViewConfig
+from render.config import RenderConfig
+from render.painting.painter import PainterChoice
+from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind
+from render.scenery.photographs import photo_files
 from render.sensors.depth_noise import SENSORS, DepthNoiseConfig
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
-from render.session import SHEET, RenderConfig, render_take
+from render.session import SHEET, render_take
 from render.skin.look import ALL_TONES, TONES
 
 _NO_SENSOR: Final = "none"
+_DEFAULT: Final = RenderConfig()
+_AS_IN_CONFIG: Final = ("passes", "view", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
+
+
+@dataclass(frozen=True, slots=True)
+class RenderOptions:
+    """`RenderConfig` as the options of the command name it."""
+
+    view: Annotated[ViewConfig, tyro.conf.arg(name="")] = field(default_factory=ViewConfig)
+    """Cameras, and where they stand."""
+    passes: tuple[str, ...] = _DEFAULT.passes
+    """Pictures to draw: rgb, depth, normals, ids."""
+    dress: Literal["skin", "glove"] = _DEFAULT.dress
+    """Bare skin, or the marker glove with its markers."""
+    tones: tuple[str, ...] = ()
+    """Classes of skin tone: very-light, light, intermediate, tan, brown, dark; all when not given."""
+    background: tuple[BackgroundKind, ...] = ()
+    """Kinds of background: plain, gradient, noise, clutter, room, photo; a mixture when not given."""
+    photos: Path | None = None
+    """Folder of photographs, for backgrounds of the kind photo."""
+    vary: Literal["shard", "frame"] = _DEFAULT.vary
+    """Whether light and background change with every shard or with every frame."""
+    depth_sensor: tuple[str, ...] = ("kinect2",)
+    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only."""
+    color_sensor: bool = True
+    """Whether noisy colors are written beside the perfect ones."""
+    motion_blur: bool = False
+    """Whether shutters blur motion, and some of them roll; takes eight drawings per picture."""
+    painter: PainterChoice = _DEFAULT.painter
+    """What paints colors: our own compiled code, opengl, or auto: opengl where there is hardware for it."""
+    every: int = _DEFAULT.every
+    """Step between the frames that are drawn."""
+    frames_per_shard: int = _DEFAULT.frames_per_shard
+    """Frames that are written together."""
+    seed: int = _DEFAULT.seed
+    """Seed of all random choices."""
+
+    def config(self) -> RenderConfig:
+        """The configuration that these options stand for.
+
+        Raises:
+            HandSimError: A name is unknown, or a number is out of range.
+        """
+        return RenderConfig(
+            **{name: getattr(self, name) for name in _AS_IN_CONFIG},
+            tones=_angles(self.tones),
+            background=_backgrounds(self.background, self.photos),
+            depth_sensor=_sensors(self.depth_sensor),
+            color_sensor=ExposureConfig() if self.color_sensor else None,
+            shutter=ShutterConfig() if self.motion_blur else None,
+        )
 
 
 def render(
     take: Annotated[Path, tyro.conf.Positional],
     out: Path,
+    options: Annotated[RenderOptions, tyro.conf.arg(name="")],
     format: tuple[str, ...] = ("webdataset",),
-    passes: tuple[str, ...] = ("rgb", "depth", "normals", "ids"),
-    placement: Placement = "still",
-    camera: str = "vga",
-    views: int = 1,
-    distance: tuple[float, float] = (0.55, 0.9),
-    rig: str = "six",
-    dress: Literal["skin", "glove"] = "skin",
-    tones: tuple[str, ...] = (),
-    background: tuple[BackgroundKind, ...] = (),
-    photos: Path | None = None,
-    vary: Literal["shard", "frame"] = "shard",
-    depth_sensor: tuple[str, ...] = ("kinect2",),
-    color_sensor: bool = True,
-    motion_blur: bool = False,
-    painter: Painter = "compiled",
-    every: int = 1,
-    frames_per_shard: int = 64,
-    seed: int = 0,
     workers: int | None = None,
 ) -> None:
-    """Draw the hands of a take: colors, depth, normals and ids, with the truth of each picture.
+    """Draw the hands of a take: colors, depth, normals and ids, with the ground truth of each picture.
 
-    The same command goes on where it was stopped.
+    The same command resumes where it was stopped.
 
     Args:
         take: A tracked take (.npz), or the truth of a simulated one (.truth.npz).
         out: Folder for the pictures, their annotations and contact_sheet.png.
-        format: Of the files: webdataset, coco, freihand, interhand, exr, png; several go into folders.
-        passes: What to draw: rgb, depth, normals, ids.
-        placement: Where cameras stand: still, orbit, head, anywhere, rig.
-        camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye.
-        views: Cameras that look at once.
-        distance: Nearest and farthest [m].
-        rig: For the placement rig: a shipped name or the path of a .toml file.
-        dress: Bare skin, or the marker glove with its markers.
-        tones: Classes of skin tone: very-light, light, intermediate, tan, brown, dark; all when not given.
-        background: Kinds: plain, gradient, noise, clutter, room, photo; a mixture when not given.
-        photos: Folder of photographs, for backgrounds of the kind photo.
-        vary: When light and background change.
-        depth_sensor: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only.
-        color_sensor: Whether there are noisy colors beside the perfect ones.
-        motion_blur: Whether there are shutters, some of them rolling; takes eight drawings a picture.
-        painter: Who paints colors: our own code, or opengl, which is quicker where there is a graphics card.
-        every: Draw each so many frames one.
-        frames_per_shard: Frames that are finished together.
-        seed: Of all that is random.
+        options: What to draw.
+        format: File formats: webdataset, coco, freihand, interhand, exr, png; several go into folders.
         workers: Processes; all cores when not given.
     """
-    config = RenderConfig(
-        passes=passes,
-        view=ViewConfig(placement, camera, views, distance, rig),
-        dress=dress,
-        tones=_angles(tones),
-        background=_backgrounds(background, photos),
-        vary=vary,
-        depth_sensor=_sensors(depth_sensor),
-        color_sensor=ExposureConfig() if color_sensor else None,
-        shutter=ShutterConfig() if motion_blur else None,
-        painter=painter,
-        every=every,
-        frames_per_shard=frames_per_shard,
-        seed=seed,
-    )
+    config = options.config()
     start = time.perf_counter()
-    if photos is not None:
-        _tell_left_out(photos)
+    if options.photos is not None:
+        _print_left_out(options.photos)
     with progress_bar("images") as (bar, task):
         count = render_take(
             take,
@@ -100,17 +106,17 @@ def render(
             format,
             config,
             workers=workers,
-            progress=lambda done, wanted: bar.update(task, completed=done, total=wanted),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     seconds = time.perf_counter() - start
     console = Console()
     console.print(f"{out}: {count} images in {seconds:.0f} s", soft_wrap=True, markup=False)
-    if {"rgb", "depth"} & set(passes):
+    if {"rgb", "depth"} & set(config.passes):
         console.print(f"{out / SHEET}: some of them at one glance", soft_wrap=True, markup=False)
 
 
 def _angles(tones: tuple[str, ...]) -> tuple[float, float]:
-    """From the darkest to the lightest of the classes."""
+    """Typology angles [deg] from the darkest to the lightest of the classes."""
     if not tones:
         return ALL_TONES
     known = {name.replace(" ", "-"): angles for name, angles in TONES.items()}
@@ -125,16 +131,16 @@ def _backgrounds(kinds: tuple[BackgroundKind, ...], photos: Path | None) -> Back
     folder = None if photos is None else str(photos)
     if not kinds and folder is None:
         return BackgroundConfig()
-    wanted = kinds or ("photo",)
-    return BackgroundConfig(**{kind: float(kind in wanted) for kind in KINDS}, photos=folder)
+    chosen = kinds or ("photo",)
+    return BackgroundConfig(**{kind: float(kind in chosen) for kind in KINDS}, photos=folder)
 
 
-def _tell_left_out(photos: Path) -> None:
+def _print_left_out(photos: Path) -> None:
     _, broken = photo_files(photos)
     if broken:
         more = f" and {len(broken) - 1} more" if len(broken) > 1 else ""
         Console(stderr=True).print(
-            f"left out: {broken[0]}{more}, no readable photographs", soft_wrap=True, markup=False
+            f"left out: {broken[0]}{more}, not readable as photographs", soft_wrap=True, markup=False
         )
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.atomic import atomic_write
 from render.cameras.camera import Camera, camera_from_record
-from render.frames import Pictures, RenderedFrame
+from render.frames.frame import Pictures, RenderedFrame
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, UInt8

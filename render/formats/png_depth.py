@@ -16,7 +16,7 @@ import numpy as np
 
 from handsim.errors import DatasetError, HandSimError
 from render.formats.annotations.common import as_sensed
-from render.frames import Pictures, RenderedFrame
+from render.frames.frame import Pictures, RenderedFrame
 
 if TYPE_CHECKING:
     from jaxtyping import Float32, UInt8

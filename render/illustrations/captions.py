@@ -11,7 +11,7 @@ import numpy as np
 
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
-from render.painting.materials import BACKGROUND
+from render.illustrations.palette import BACKGROUND
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8

@@ -11,10 +11,10 @@ import numpy as np
 
 from handsim.errors import HandSimError
 from render.formats.annotations.common import CENTER, as_sensed
-from render.frames import HandTruth, RenderedFrame
+from render.frames.frame import HandTruth, RenderedFrame
+from render.frames.keypoints import KEYPOINT_DIGITS, SKELETON
 from render.illustrations.captions import pad, side_by_side
-from render.keypoints import KEYPOINT_DIGITS, SKELETON
-from render.painting.materials import BACKGROUND, bone_colors
+from render.illustrations.palette import BACKGROUND, bone_colors
 
 if TYPE_CHECKING:
     from jaxtyping import Float32, UInt8

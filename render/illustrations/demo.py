@@ -15,11 +15,12 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.records import unpack_hand
 from handsim.space.cameras import named_rig
 from poses.shapes.library import gesture
+from render.config import RenderConfig
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
-from render.painting.scene import PosedHand
-from render.session import RenderConfig, draw_frames
+from render.illustrations.scene import PosedHand
+from render.session import draw_frames
 from render.shown_take import show_tracked
 
 GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")

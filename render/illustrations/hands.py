@@ -18,7 +18,8 @@ from handsim.space.cameras import CameraRig
 from poses.shapes.library import gesture
 from poses.shapes.validity import make_valid
 from render.illustrations.captions import captioned, pad, side_by_side, titled, with_names
-from render.painting.materials import (
+from render.illustrations.drawing import render_depth, render_rgb, unoccluded
+from render.illustrations.palette import (
     BACKGROUND,
     HIDDEN_COLOR,
     SEEN_COLOR,
@@ -26,8 +27,7 @@ from render.painting.materials import (
     Covering,
     bone_colors,
 )
-from render.painting.passes import nothing_before, render_depth, render_rgb
-from render.painting.scene import Balls, HandScene, PosedHand, view_along
+from render.illustrations.scene import Balls, HandScene, PosedHand, view_along
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -129,7 +129,7 @@ def draw_glove(
         view = view_along(ahead, FINGERS_UP, np.concatenate([vertices, markers]), size, margin=0.03)
         scene = HandScene(view, (hand,))
         radius = fit.layout.radius
-        shown = nothing_before(render_depth(scene, size), view, markers, slack=1.5 * radius)
+        shown = unoccluded(render_depth(scene, size), view, markers, slack=1.5 * radius)
         pixels = np.where(shown[:, None], view.project(markers, size), np.nan)
         picture = with_names(render_rgb(scene, size), pixels, fit.layout.names, colors)
         pictures.append(titled(picture, side))
@@ -204,14 +204,11 @@ def draw_labels(
     view = view_along(ahead, up, np.concatenate([vertices, points]), size)
     radius = 1.2 * layout.radius
     gray = render_rgb(HandScene(view, balls=(Balls(points, radius, UNLABELED_COLOR),)), size)
-    double = (2 * size[0], 2 * size[1])
-    balls = HandScene(view, balls=(Balls(points[~ghost], radius, palette[labels[~ghost]]),))
     bare = PosedHand(hand.model, hand.qpos, covering=hand.covering)
-    faint = render_rgb(HandScene(view, (bare,)), double).astype(np.float32)
+    faint = render_rgb(HandScene(view, (bare,)), size).astype(np.float32)
     faint += 0.72 * (255 * np.array(BACKGROUND, dtype=np.float32) - faint)
-    drawn = render_depth(balls, double)[..., None] > 0
-    large = np.where(drawn, render_rgb(balls, double), np.rint(faint).astype(np.uint8))
-    colored = cv2.resize(large, size, interpolation=cv2.INTER_AREA)
+    balls = HandScene(view, balls=(Balls(points[~ghost], radius, palette[labels[~ghost]]),))
+    colored = render_rgb(balls, size, behind=np.rint(faint).astype(np.uint8))
     pixels = view.project(points, size)
     for x, y in np.rint(pixels[ghost]).astype(int):
         cv2.circle(colored, (x, y), 9, byte_color(HIDDEN_COLOR), 2, cv2.LINE_AA)

@@ -14,10 +14,10 @@ import numpy as np
 
 from render.cameras.camera import Camera
 from render.painting.figures import Drawn
-from render.painting.lights import Lighting
 from render.painting.rasterizer import nearest_faces, project
 from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, light_up, read_texels
 from render.painting.shadow_map import shadow_map
+from render.scenery.lights import Lighting
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8

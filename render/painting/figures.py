@@ -12,7 +12,7 @@ import numpy as np
 from gloves.fit import GloveFit
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES
-from render.frames import PARTS_A_HAND
+from render.frames.frame import PARTS_A_HAND
 from render.painting.materials import (
     MARKER_COLOR,
     Material,

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from render.cameras.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.gl import load_pyrender, offscreen_renderer
-from render.painting.lights import Lighting, add_lights
 from render.painting.materials import Material
-from render.painting.scene import OPENGL_FROM_OPENCV
+from render.painting.opengl_lights import add_lights
+from render.scenery.lights import Lighting
 
 if TYPE_CHECKING:
     from jaxtyping import UInt8
     from numpy.typing import NDArray
 
+OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
 _NEAR, _FAR = 0.01, 30.0  # [m]
+_GL_LINEAR: Final = 0x2601
 
 
 def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
@@ -38,7 +41,7 @@ def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> 
             indices=one.triangles.faces,
             texcoord_0=one.uv,
             color_0=one.colors,
-            material=_material(one.material()),
+            material=pyrender_material(one.material()),
         )
         scene.add(pyrender.Mesh([primitive]))
     lens = pyrender.IntrinsicsCamera(*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]], znear=_NEAR, zfar=_FAR)
@@ -50,6 +53,31 @@ def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> 
 
 
 @functools.lru_cache(maxsize=16)
-def _material(material: Material) -> Any:
-    """Kept, so that textures go to the card once."""
-    return material.for_pyrender()
+def pyrender_material(material: Material) -> Any:
+    """A material for pyrender; kept, so that textures go to the card once.
+
+    Raises:
+        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+    """
+    pyrender, textures = load_pyrender(), {}
+    if material.texels is not None:
+        # No smaller copies of the texture: they would mix tiles that are no neighbors on the hand.
+        sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
+        rough = np.zeros((*material.texels.shape[:2], 3), dtype=np.uint8)
+        rough[..., 0] = material.texels[..., 3]  # its shader looks for roughness in red and metal in green
+        sources = {
+            "baseColorTexture": np.ascontiguousarray(material.texels[..., :3]),
+            "normalTexture": np.ascontiguousarray(material.texels[..., 4:7]),
+            "metallicRoughnessTexture": rough,
+        }
+        textures = {
+            name: pyrender.Texture(source=source, source_channels="RGB", sampler=sampler)
+            for name, source in sources.items()
+        }
+    return pyrender.MetallicRoughnessMaterial(
+        baseColorFactor=[*material.color, 1.0],
+        metallicFactor=0.0,
+        roughnessFactor=material.roughness,
+        emissiveFactor=np.sqrt(material.glow * material.color),  # its shader squares it
+        **textures,
+    )

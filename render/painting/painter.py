@@ -12,16 +12,25 @@ import numpy as np
 from render.cameras.camera import Camera
 from render.painting.compiled_painter import paint_compiled
 from render.painting.figures import Drawn
-from render.painting.lights import Lighting
+from render.painting.hardware import opengl_has_hardware
 from render.painting.opengl_painter import paint_opengl
 from render.painting.rasterizer import NEAR
+from render.scenery.lights import Lighting
 
 if TYPE_CHECKING:
     from jaxtyping import Float32, UInt8
 
 Painter = Literal["compiled", "opengl"]
+PainterChoice = Literal["auto", "compiled", "opengl"]
 _WHITE: Final = 255.0
 _STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL begin anew
+
+
+def choose_painter(choice: PainterChoice) -> Painter:
+    """The painter itself; `auto` is OpenGL where it draws on hardware, and our own painter elsewhere."""
+    if choice == "auto":
+        return "opengl" if opengl_has_hardware() else "compiled"
+    return choice
 
 
 def paint(

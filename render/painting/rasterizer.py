@@ -15,7 +15,7 @@ import numpy as np
 
 from handsim.errors import ArgumentError
 from render.cameras.camera import Camera
-from render.frames import Pictures
+from render.frames.frame import Pictures
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, Int32, UInt8
@@ -35,7 +35,7 @@ class Triangles:
     normals: Float[np.ndarray, "V 3"]
     """Unit normals in the world."""
     parts: UInt8[np.ndarray, "F"]
-    """See `render.frames.Pictures`, as the next two."""
+    """See `render.frames.frame.Pictures`, as the next two."""
     instances: UInt8[np.ndarray, "F"]
     markers: UInt8[np.ndarray, "F"]
 

@@ -6,7 +6,6 @@ picture.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -15,6 +14,7 @@ import cv2
 import numpy as np
 
 from handsim.errors import HandSimError, choices
+from render.scenery.photographs import draw_photo, pick_photo
 from render.scenery.rooms import draw_room, paint_tint
 
 if TYPE_CHECKING:
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
-PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
-_TRIES: Final = 50  # a folder in which so many files in turn cannot be read is no folder of photographs
 _GAMMA: Final = 2.2
 
 
@@ -81,7 +79,7 @@ def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> 
     kind = KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
     first, second = _color(rng), _color(rng)
     blur = float(rng.uniform(0.0, 0.008)) if kind in ("room", "clutter", "photo") else 0.0
-    photo = str(_pick_photo(Path(str(config.photos)), rng)) if kind == "photo" else None
+    photo = str(pick_photo(Path(str(config.photos)), rng)) if kind == "photo" else None
     return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo)
 
 
@@ -109,7 +107,7 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
     elif background.kind == "room":
         picture = draw_room(size, rng=rng)
     elif background.kind == "photo":
-        picture = _photo(Path(str(background.photo)), size, rng)
+        picture = draw_photo(Path(str(background.photo)), size, rng)
     else:
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
@@ -200,63 +198,3 @@ def _lay_down(picture: NDArray[np.float32], outline: NDArray[np.float64], color:
     mask[:] = 0.0
     cv2.fillPoly(mask, [np.rint(16.0 * (outline - low)).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
     part += mask[..., None] * (color - part)
-
-
-@functools.lru_cache(maxsize=2)
-def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Photographs in a folder and its subfolders: those that are some by their first bytes, and the others.
-
-    Raises:
-        HandSimError: There is no such folder, or none in it is readable.
-    """
-    if not folder.is_dir():
-        raise HandSimError(f"{folder}: no such folder of photographs")
-    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
-    good = tuple(file for file in files if cv2.haveImageReader(str(file)))
-    if not good:
-        raise _no_photo(folder)
-    return good, tuple(file for file in files if file not in set(good))
-
-
-def _pick_photo(folder: Path, rng: np.random.Generator) -> Path:
-    """A random photograph that can be read whole."""
-    files, _ = photo_files(folder)
-    for place in rng.permutation(len(files))[:_TRIES]:
-        if _read(files[place]) is not None:
-            readable: Path = files[place]
-            return readable
-    raise _no_photo(folder)
-
-
-def _no_photo(folder: Path) -> HandSimError:
-    endings = ", ".join(PHOTO_SUFFIXES)
-    return HandSimError(f"{folder}: no photograph that can be read; expected files that end in {endings}")
-
-
-def _read(file: Path) -> NDArray[np.uint8] | None:
-    try:
-        data = np.fromfile(file, dtype=np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    except (OSError, cv2.error):
-        return None
-    return None if picture is None else np.asarray(picture)
-
-
-def _photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
-    """A random part of a photograph in the picture's proportions, as large as fits at up to half the zoom."""
-    photo = _read(file)
-    if photo is None:
-        raise HandSimError(f"{file}: not a readable photograph")
-    height, width = photo.shape[:2]
-    scale = min(width / size[0], height / size[1]) * rng.uniform(0.5, 1.0)
-    part = np.maximum(np.array(size) * scale, 1.0).astype(int)
-    left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
-    cut = photo[top : top + part[1], left : left + part[0], ::-1]
-    if rng.random() < 0.5:
-        cut = cut[:, ::-1]
-    shrinks = part[0] > size[0]
-    scaled = cv2.resize(
-        np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    )
-    light: NDArray[np.float32] = (scaled.astype(np.float32) / 255.0) ** _GAMMA
-    return light

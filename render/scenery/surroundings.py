@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from render.painting.lights import Lighting, sample_lighting
 from render.scenery.backgrounds import Background, BackgroundConfig, draw_background, sample_background
+from render.scenery.lights import Lighting, sample_lighting
 from render.skin.look import SkinLook
 
 if TYPE_CHECKING:

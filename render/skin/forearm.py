@@ -14,12 +14,15 @@ import numpy as np
 
 from handsim.errors import HandSimError
 from handsim.hand.shape import HandShape
+from handsim.hand.topology import NUM_BONES
 from handsim.space.transforms import MIRROR
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
+FOREARM: Final = NUM_BONES
+"""Number of the forearm among a hand's parts, after those of its bones (`topology.BONES`)."""
 _LONGEST: Final = 0.5  # [m]
 _WRIST_GIRTH: Final = 1.92  # [hand breadths]
 _ARM_GIRTH: Final = 3.0

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
 
 from handsim.errors import HandSimError
-from render.painting.materials import GLOVE_COLOR
 from render.skin.atlas import skin_atlas
 from render.skin.fields import bump, noise
 from render.skin.forearm import Forearm
@@ -19,6 +18,9 @@ from render.skin.texture import SkinTexture, lab_to_srgb
 
 if TYPE_CHECKING:
     from handsim.hand.topology import Side
+
+GLOVE_COLOR: Final = (0.235, 0.25, 0.29)
+"""Of an average glove, sRGB in [0, 1]."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,10 +15,10 @@ import numpy as np
 
 from handsim.hand.model import HandModel
 from handsim.hand.skin.skinning import skin_frames
+from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import NUM_BONES, PALM
-from render.frames import FOREARM
 from render.skin.atlas import RINGS, skin_atlas
-from render.skin.forearm import Forearm, forearm_rings
+from render.skin.forearm import FOREARM, Forearm, forearm_rings
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
@@ -83,7 +83,7 @@ class SkinMesh:
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
         points = self.merged(transforms)
-        normals = mesh_normals(points, self.faces)
+        normals = vertex_normals(points, self.faces)
         hidden = self._hidden(transforms, points, normals)
         shade = np.clip(1.0 - np.maximum(hidden - self._rest_shade, 0.0), _DARKEST, 1.0)
         corners = atlas.corners
@@ -107,7 +107,7 @@ class SkinMesh:
         self, transforms: NDArray[np.float64], points: NDArray[np.float64], faces: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """What neighboring capsules hide in the flat hand, where they are the same flesh."""
-        return self._hidden(transforms, points, mesh_normals(points, faces))
+        return self._hidden(transforms, points, vertex_normals(points, faces))
 
     def _hidden(
         self, transforms: NDArray[np.float64], points: NDArray[np.float64], normals: NDArray[np.float64]
@@ -130,42 +130,6 @@ def face_parts() -> UInt8[np.ndarray, "F"]:
     parts: NDArray[np.uint8] = shares[atlas.faces].sum(axis=1).argmax(axis=1).astype(np.uint8)
     parts.setflags(write=False)
     return parts
-
-
-def mesh_normals(
-    vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
-) -> Float[np.ndarray, "V 3"]:
-    """`handsim.hand.skin.surface.vertex_normals`, compiled: outward unit normals, area-weighted."""
-    normals: NDArray[np.float64] = _normals(vertices, faces)
-    return normals
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _normals(vertices: Any, faces: Any) -> Any:
-    normals = np.zeros_like(vertices)
-    for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ux, uy, uz = (
-            vertices[b, 0] - vertices[a, 0],
-            vertices[b, 1] - vertices[a, 1],
-            vertices[b, 2] - vertices[a, 2],
-        )
-        vx, vy, vz = (
-            vertices[c, 0] - vertices[a, 0],
-            vertices[c, 1] - vertices[a, 1],
-            vertices[c, 2] - vertices[a, 2],
-        )
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        for corner in (a, b, c):
-            normals[corner, 0] += x
-            normals[corner, 1] += y
-            normals[corner, 2] += z
-    for v in range(len(normals)):
-        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
-        if length > 0.0:
-            for i in range(3):
-                normals[v, i] /= length
-    return normals
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]

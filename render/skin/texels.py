@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from handsim.hand.model import HandModel
+from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import DIGITS, NUM_BONES
 from render.skin.atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin.fields import smooth
 from render.skin.forearm import Forearm
-from render.skin.mesh import SkinMesh, mesh_normals
+from render.skin.mesh import SkinMesh
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,7 +63,7 @@ def skin_texels() -> Texels:
     """The one map of texels."""
     model, atlas = HandModel.named("M"), skin_atlas()
     mesh = SkinMesh(model, REFERENCE)
-    normals = mesh_normals(mesh.rest, mesh.faces)
+    normals = vertex_normals(mesh.rest, mesh.faces)
     weights = np.zeros((atlas.num_vertices, NUM_BONES))
     surface = model.surface
     rows = np.arange(atlas.num_hand)[:, None]

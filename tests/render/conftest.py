@@ -11,8 +11,8 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
 from handsim.space.cameras import look_at
 from render.cameras.camera import Camera, pinhole
-from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
-from render.keypoints import hand_keypoints
+from render.frames.frame import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
+from render.frames.keypoints import hand_keypoints
 
 
 @pytest.fixture(scope="session")

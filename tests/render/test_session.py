@@ -15,11 +15,12 @@ import pytest
 from gloves.takes.take import save_take
 from handsim.errors import CaptureError, HandSimError
 from render.cameras.viewpoints import ViewConfig, Viewpoints
+from render.config import RenderConfig
 from render.formats.png_depth import read_depth
-from render.keypoints import KEYPOINT_DIGITS
+from render.frames.keypoints import KEYPOINT_DIGITS
 from render.painting.figures import digit_of_part
 from render.sensors.depth_noise import DepthNoiseConfig
-from render.session import SHEET, RenderConfig, draw_shard, render_take
+from render.session import SHEET, draw_shard, render_take
 from render.shown_take import load_shown_take
 from render.skin.look import TONES
 from train.simulation.takes import TakeConfig, simulate_take
@@ -136,18 +137,20 @@ def test_a_full_disk_is_one_sentence_and_finished_tars_are_kept(path, tmp_path):
 
 
 def test_no_driver_is_one_sentence_where_opengl_is_wanted(path, tmp_path):
-    command = [sys.executable, "-c", MAIN, "render", str(path), "--out", str(tmp_path / "out")]
+    command = [sys.executable, "-c", MAIN, "render", str(path), "--every", "48", "--workers", "1"]
     environment = {**os.environ, "PYOPENGL_PLATFORM": "egl", "EGL_DEVICE_ID": "4711"}
-    for painter, code in (("opengl", 1), ("compiled", 0)):
+    for painter, code in (("opengl", 1), ("compiled", 0), ("auto", 0)):
+        out = tmp_path / painter
         done = subprocess.run(
-            [*command, "--every", "48", "--workers", "1", "--painter", painter],
+            [*command, "--out", str(out), "--painter", painter],
             capture_output=True,
             text=True,
             env=environment,
             check=False,
         )
         assert done.returncode == code, done
-        (tmp_path / "out" / "render.json").unlink()
+        saved = json.loads((out / "render.json").read_text())["painter"]
+        assert saved == ("opengl" if code else "compiled")
         said = done.stderr.strip()
         if painter == "opengl":
             assert said.startswith("handsim render: drawing without a screen failed (egl: ")
@@ -177,6 +180,6 @@ def test_a_camera_inside_a_hand_is_refused(path):
     config = dataclasses.replace(PLAIN, view=ViewConfig(distance=(0.05, 0.05)))
     inside = Viewpoints(config.view, take, rng=np.random.default_rng(0))
     inside._poses[0] = np.broadcast_to(np.eye(4), (48, 4, 4)).copy()
-    inside._poses[0][:, :3, 3] = take.hands[0].model.skin(take.hands[0].qpos)[:, 100] + 0.002
+    inside._poses[0][:, :3, 3] = take.hands[0].fit.model.skin(take.hands[0].qpos)[:, 100] + 0.002
     with pytest.raises(HandSimError, match="mm from a hand or thing in frame 0"):
         list(draw_shard(take, inside, config, 0, [0]))

@@ -1,1 +1,8 @@
-"""Rendered frames as the files of other people's datasets have them: one module a format, no pictures."""
+"""Ground truth of rendered frames in the JSON of other data sets.
+
+- joint_orders: joint orders of other data sets, to and from our 21 keypoints.
+- common: helpers that all annotations share (masks, boxes, rounding, JSON).
+- hands_json: our own JSON of a frame.
+- coco, freihand, interhand: the annotations of these data sets.
+- umetrack_hand: our hand as a UmeTrack hand model.
+"""

@@ -14,8 +14,8 @@ import numpy as np
 
 from render.cameras.camera import Camera
 from render.formats.annotations.common import CENTER, hand_mask, is_seen, rounded, run_lengths
-from render.frames import HandTruth, RenderedFrame
-from render.keypoints import KEYPOINT_NAMES, SKELETON
+from render.frames.frame import HandTruth, RenderedFrame
+from render.frames.keypoints import KEYPOINT_NAMES, SKELETON
 
 CATEGORY: Final[dict[str, Any]] = {
     "id": 1,

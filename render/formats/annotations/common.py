@@ -18,7 +18,8 @@ from handsim.hand.shape import HandShape
 from handsim.hand.topology import Side
 from handsim.space.transforms import rotation_quaternions
 from render.cameras.camera import Camera
-from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
+from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
+from render.skin.forearm import FOREARM
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float

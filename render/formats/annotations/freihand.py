@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from render.formats.annotations.common import centered_K, is_seen, rounded
-from render.frames import RenderedFrame
+from render.frames.frame import RenderedFrame
 
 SET: Final = "training"
 LISTS: Final = ("K", "xyz", "scale", "mano", "info")

@@ -25,7 +25,7 @@ from render.formats.annotations.common import (
 from render.formats.annotations.joint_orders import to_order
 from render.formats.annotations.umetrack_hand import umetrack_hand, umetrack_wrist
 from render.formats.png_depth import METERS_PER_UNIT
-from render.frames import HandTruth, RenderedFrame
+from render.frames.frame import HandTruth, RenderedFrame
 
 HAND_SHAPES: Final = "__hand_shapes.json__"
 """File of a clip with the hand model; webdataset passes over such names."""

@@ -17,8 +17,8 @@ from handsim.hand.topology import DIGITS, SIDES, Side
 from render.cameras.camera import Camera
 from render.formats.annotations.common import by_side, centered_K, is_seen, rounded, to_json
 from render.formats.annotations.joint_orders import to_order
-from render.frames import HandTruth, RenderedFrame
-from render.keypoints import NUM_KEYPOINTS
+from render.frames.frame import HandTruth, RenderedFrame
+from render.frames.keypoints import NUM_KEYPOINTS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

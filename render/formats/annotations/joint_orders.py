@@ -1,4 +1,4 @@
-"""How others order a hand's joints, as places in our 21 (`render.keypoints`), and the way there and back.
+"""Joint orders of other data sets, as indices of our 21 (`render.frames.keypoints`), and conversions.
 
 One table, because a wrong permutation looks almost right. A place of `ABSENT` is a joint that we do not have.
 
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.errors import ArgumentError, choices
-from render.keypoints import NUM_KEYPOINTS
+from render.frames.keypoints import NUM_KEYPOINTS
 
 if TYPE_CHECKING:
     from jaxtyping import Float

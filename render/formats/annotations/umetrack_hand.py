@@ -16,7 +16,7 @@ from handsim.hand.shape import HandShape
 from handsim.hand.topology import JOINTS, NUM_BONES, NUM_JOINTS
 from render.formats.annotations.common import rounded
 from render.formats.annotations.joint_orders import joint_order, to_order
-from render.keypoints import KEYPOINT_DIGITS, hand_keypoints
+from render.frames.keypoints import KEYPOINT_DIGITS, hand_keypoints
 
 if TYPE_CHECKING:
     from jaxtyping import Float

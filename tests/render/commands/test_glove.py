@@ -26,7 +26,7 @@ def test_show_lists_every_marker(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_new_writes_a_file_that_checks_and_keeps_what_is_there(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], drawing: None
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "mine.toml"
     assert main(["glove", "new", str(file)]) == 0

@@ -10,7 +10,7 @@ from handsim.errors import DatasetError, HandSimError
 from render.cameras.camera import Camera
 from render.cameras.lens import Lens
 from render.formats.exr import linear_light, read_exr, srgb, write_exr
-from render.frames import Pictures
+from render.frames.frame import Pictures
 
 
 def same(first: Pictures, second: Pictures) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimError
-from render.frames import Pictures
+from render.frames.frame import Pictures
 from render.illustrations.contact_sheet import colored_depth, contact_sheet, draw_keypoints
 
 

@@ -18,10 +18,10 @@ from handsim.space.cameras import look_at
 from poses.shapes.library import gesture
 from render.cameras.camera import Camera, pinhole
 from render.painting.figures import Drawn, HandFigure, sample_people
-from render.painting.lights import Lamp, Lighting, sample_lighting
 from render.painting.materials import Material
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import Triangles, rasterize
+from render.scenery.lights import Lamp, Lighting, sample_lighting
 from render.skin.look import TONES
 
 CAMERA = pinhole("small", (96, 72), 90.0)

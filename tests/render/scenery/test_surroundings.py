@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import HandSimError
-from render.painting.lights import Lighting, sample_lighting
 from render.scenery.backgrounds import BackgroundConfig
+from render.scenery.lights import Lighting, sample_lighting
 from render.scenery.surroundings import expose_for, irradiance, sample_surroundings, surround
 from render.skin.look import SkinLook
 

@@ -6,10 +6,12 @@ import pytest
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import SIDES, Side
 from poses.shapes.library import gesture
+from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
-from render.painting.lights import Lamp, Lighting, add_lights
 from render.painting.materials import skin_material
-from render.painting.scene import OPENGL_FROM_OPENCV, view_along
+from render.painting.opengl_lights import add_lights
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV, pyrender_material
+from render.scenery.lights import Lamp, Lighting
 from render.skin.atlas import skin_atlas
 from render.skin.mesh import SkinMesh
 from render.skin.relief import normal_map, relief
@@ -66,7 +68,7 @@ def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> No
             normals=skin.normals,
             indices=skin.faces,
             texcoord_0=skin.uv,
-            material=skin_material(paint).for_pyrender(),
+            material=pyrender_material(skin_material(paint)),
         )
         scene.add(pyrender.Mesh([primitive]))
         camera = pyrender.PerspectiveCamera(view.field_of_view, znear=0.05, zfar=10.0)

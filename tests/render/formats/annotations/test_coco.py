@@ -9,8 +9,8 @@ import pytest
 
 from render.formats.annotations.common import hand_mask
 from render.formats.writer import open_writer
-from render.frames import RenderedFrame
-from render.keypoints import KEYPOINT_NAMES
+from render.frames.frame import RenderedFrame
+from render.frames.keypoints import KEYPOINT_NAMES
 
 
 @pytest.fixture

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from render.formats.annotations.common import hand_mask, run_lengths, to_json
-from render.frames import FOREARM, PARTS_A_HAND
+from render.frames.frame import PARTS_A_HAND
+from render.skin.forearm import FOREARM
 
 
 @given(hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)))

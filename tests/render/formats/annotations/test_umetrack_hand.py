@@ -10,7 +10,7 @@ from handsim.hand.topology import Side
 from handsim.space.transforms import axis_angle_matrix, random_quaternions
 from render.formats.annotations.joint_orders import to_order
 from render.formats.annotations.umetrack_hand import umetrack_hand, umetrack_wrist
-from render.keypoints import hand_keypoints
+from render.frames.keypoints import hand_keypoints
 
 
 def bone_frames(record: dict, angles: np.ndarray, wrist: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -15,24 +15,22 @@ from gloves.fit import GlovedHand
 from handsim.errors import HandSimError
 from render.cameras.camera import Camera
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
-from render.frames import BodyTruth, Pictures, RenderedFrame
+from render.frames.frame import PASSES, BodyTruth, Pictures, RenderedFrame
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
-from render.painting.lights import Lighting
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
 from render.painting.shading import GAMMA
 from render.scenery.backgrounds import Background, draw_background
+from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
 from render.sensors.exposure import Exposure, expose, linear_of
 from render.sensors.shutter import Shutter, combine, shutter_times
 from render.shown_take import ShownTake
-from render.truth import hand_truth
+from render.studio.hand_truth import hand_truth
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, UInt8
     from numpy.typing import NDArray
-
-PASSES: Final = ("rgb", "depth", "normals", "ids")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from handsim.hand.shape import HandShape
-from handsim.hand.topology import NUM_BONES
 from render.cameras.camera import Camera
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-FOREARM: Final = NUM_BONES
-"""Part of a hand's picture beyond its bones."""
+PASSES: Final = ("rgb", "depth", "normals", "ids")
+"""Kinds of pictures that can be asked for."""
 PARTS_A_HAND: Final = 32
 """A pixel of bone b of hand h has part 1 + b + 32 h; 0 is no hand."""
 
@@ -50,7 +49,7 @@ class HandTruth:
     """Whose hand; `shape.side` is which one."""
     qpos: Float[np.ndarray, "27"]
     keypoints: Float[np.ndarray, "21 3"]
-    """See `render.keypoints`; in the world [m]."""
+    """See `render.frames.keypoints`; in the world [m]."""
     pixels: Float[np.ndarray, "21 2"]
     """Their pixels, inside the picture or not; NaN where the lens cannot see them."""
     visible: Bool[np.ndarray, "21"]

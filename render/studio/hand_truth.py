@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from render.cameras.camera import Camera
-from render.frames import FOREARM, PARTS_A_HAND, HandTruth, Pictures
-from render.keypoints import KEYPOINT_DIGITS, NUM_KEYPOINTS, hand_keypoints
+from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures
+from render.frames.keypoints import KEYPOINT_DIGITS, NUM_KEYPOINTS, hand_keypoints
 from render.painting.figures import HandFigure, digit_of_part
+from render.skin.forearm import FOREARM
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, UInt8

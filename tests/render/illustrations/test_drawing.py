@@ -9,13 +9,11 @@ from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.cameras import look_at
 from poses.shapes.library import gesture
-from render.painting.passes import nothing_before, render_depth, render_rgb
-from render.painting.scene import Balls, HandScene, PosedHand, View, view_along
+from render.illustrations.drawing import render_depth, render_rgb, unoccluded
+from render.illustrations.scene import Balls, HandScene, PosedHand, View, view_along
 
 SIZE = (160, 120)
 UP = np.array([1.0, 0.0, 0.0])
-
-pytestmark = pytest.mark.usefixtures("drawing")
 
 
 def pixel_rays(view: View, pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -124,9 +122,9 @@ def test_what_stands_before_a_point() -> None:
     view = View(np.eye(4), 1.0)
     depth = render_depth(HandScene(view, balls=(Balls(np.array([[0.0, 0.0, 1.0]]), 0.1),)), SIZE)
     points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.95], [0.0, 0.0, 2.0], [0.3, 0.0, 2.0], [9.0, 0.0, 1.0]])
-    assert nothing_before(depth, view, points, slack=0.11).tolist() == [True, True, False, True, False]
+    assert unoccluded(depth, view, points, slack=0.11).tolist() == [True, True, False, True, False]
 
 
 def test_pictures_of_no_size_are_told() -> None:
-    with pytest.raises(HandSimError, match="picture size is 0 x 10"):
+    with pytest.raises(HandSimError, match="pictures of 0 x 10 pixels"):
         render_depth(HandScene(View(np.eye(4), 1.0)), (0, 10))

@@ -1,36 +1,19 @@
 from __future__ import annotations
 
-import dataclasses
-import json
-
 import numpy as np
 import pytest
 
-from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from poses.shapes.library import gesture
+from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
-from render.painting.lights import STUDIO, Lamp, Lighting, add_lights, frame_with_z, sample_lighting
 from render.painting.materials import shade_colors, skin_material
-from render.painting.scene import OPENGL_FROM_OPENCV, view_along
+from render.painting.opengl_lights import add_lights, frame_with_z
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV, pyrender_material
+from render.scenery.lights import STUDIO, Lamp, Lighting
 from render.skin.look import SkinLook
 from render.skin.mesh import SkinMesh
 from render.skin.texture import skin_texture
-
-
-def test_lightings_are_plain_values_and_repeat() -> None:
-    first, again = (sample_lighting(rng=np.random.default_rng(4)) for _ in range(2))
-    assert first == again
-    assert json.loads(json.dumps(dataclasses.asdict(first)))["ambient"] == list(first.ambient)
-
-
-def test_lightings_neither_blind_nor_leave_in_the_dark(rng: np.random.Generator) -> None:
-    for _ in range(200):
-        lighting = sample_lighting(rng=rng)
-        total = sum(lamp.strength for lamp in lighting.lamps) + np.mean(lighting.ambient)
-        assert 0.5 < total < 2.2
-        assert lighting.lamps[0].direction == lighting.lamps[-1].direction  # the key light's unshadowed part
-        assert all(0.6 < level < 1.6 for lamp in lighting.lamps for level in lamp.color)
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, -2.0, 0.5), (0.0, -3.0, 0.0)])
@@ -54,7 +37,7 @@ def draw(lighting: Lighting) -> np.ndarray:
         indices=skin.faces,
         texcoord_0=skin.uv,
         color_0=shade_colors(skin.shade),
-        material=skin_material(skin_texture(SkinLook())).for_pyrender(),
+        material=pyrender_material(skin_material(skin_texture(SkinLook()))),
     )
     scene.add(pyrender.Mesh([primitive]))
     camera = pyrender.PerspectiveCamera(view.field_of_view, znear=0.05, zfar=10.0)
@@ -93,8 +76,3 @@ def test_a_white_surface_sends_back_what_a_lamp_gives() -> None:
     texture = skin_texture(look)
     own = np.median(texture.color.reshape(-1, 3), axis=0)
     assert np.abs(shown - own).max() < 45.0
-
-
-def test_too_many_lamps_are_told() -> None:
-    with pytest.raises(HandSimError, match="6 lamps"):
-        Lighting((Lamp((0.0, 0.0, -1.0), 1.0),) * 6, (0.0, 0.0, 0.0))

@@ -1,9 +1,9 @@
-"""What is in a picture: posed hands, markers, free points, and the camera that looks at them."""
+"""The scene of a ready-made picture: posed hands, markers, free points, and the view of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -13,27 +13,18 @@ from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import NUM_QPOS
-from render.painting.gl import load_pyrender
-from render.painting.lights import STUDIO, add_lights
-from render.painting.materials import (
-    BACKGROUND,
-    MARKER_COLOR,
-    Covering,
-    Material,
-    ball_material,
-    covering_material,
-    linear,
-    skin_tint,
-)
+from render.cameras.camera import Camera, pinhole
+from render.illustrations.palette import BACKGROUND, Covering, covering_material, skin_tint
+from render.painting.figures import Drawn
+from render.painting.materials import MARKER_COLOR, Material, ball_material, linear
+from render.painting.rasterizer import NEAR, Triangles
 from render.painting.spheres import sphere_surface
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
-_NEAR, _FAR = 0.01, 20.0  # [m]
+_BALL_LEVEL: Final = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,10 +45,22 @@ class View:
         if not 0.0 < self.field_of_view < np.pi:
             raise HandSimError(f"field_of_view is {self.field_of_view:g}, expected radians between 0 and pi")
 
+    def camera(self, size: tuple[int, int]) -> Camera:
+        """The pinhole camera of this view.
+
+        Args:
+            size: Width and height of its pictures [px].
+
+        Raises:
+            ArgumentError: No picture has that size.
+        """
+        focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
+        return pinhole("view", size, float(focal)).at(self.T_world_camera)
+
     def project(
         self, points: Float[np.ndarray, "*batch 3"], size: tuple[int, int]
     ) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of world points in a picture (width, height): x right, y down, first center at 0.5."""
+        """Pixels of world points [m] in a picture (width, height) [px]; counted as by `Camera`."""
         rotation, center = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
         local = (points - center) @ rotation
         focal = 0.5 * size[1] / np.tan(self.field_of_view / 2)
@@ -153,70 +156,54 @@ def view_along(
     # A point is inside when |x - x0| <= slope (z + distance), two linear limits; so is y.
     above = (local[:, :2] - slope * local[:, 2:]).max(axis=0)
     below = (-local[:, :2] - slope * local[:, 2:]).max(axis=0)
-    distance = max(*((above + below) / (2 * slope)), 2 * _NEAR - local[:, 2].min())
+    distance = max(*((above + below) / (2 * slope)), 2 * NEAR - local[:, 2].min())
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = rotation @ np.array([*(above - below) / 2, -distance])
     return View(pose, field_of_view)
 
 
-def build_scene(scene: HandScene) -> Any:
-    """The pyrender scene: meshes with smooth normals, three lights that go with the camera, the camera.
-
-    Raises:
-        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
-    """
-    pyrender = load_pyrender()
-    built = pyrender.Scene(bg_color=[*scene.background, 1.0])
+def scene_surfaces(scene: HandScene) -> list[Drawn]:
+    """The surfaces of a scene: skins with smooth normals, markers and free points."""
+    surfaces: list[Drawn] = []
     for hand in scene.hands:
-        built.add(_hand_mesh(pyrender, hand))
+        surfaces.append(_hand_surface(hand))
         if isinstance(hand.hand, GloveFit):
-            radius = hand.hand.layout.radius
-            _add_balls(pyrender, built, Balls(hand.markers(), radius, hand.marker_colors))
+            surfaces += _ball_surfaces(Balls(hand.markers(), hand.hand.layout.radius, hand.marker_colors))
     for balls in scene.balls:
-        _add_balls(pyrender, built, balls)
-    camera = pyrender.PerspectiveCamera(yfov=scene.view.field_of_view, znear=_NEAR, zfar=_FAR)
-    built.add(camera, pose=scene.view.T_world_camera @ OPENGL_FROM_OPENCV)
-    add_lights(pyrender, built, STUDIO, scene.view.T_world_camera)
-    return built
+        surfaces += _ball_surfaces(balls)
+    return surfaces
 
 
-def _hand_mesh(pyrender: Any, hand: PosedHand) -> Any:
+def _hand_surface(hand: PosedHand) -> Drawn:
     vertices, faces = hand.vertices(), hand.model.surface.faces
-    colors = np.ones((len(vertices), 4))
-    if hand.covering == "skin":
-        colors[:, :3] = skin_tint(hand.model)
-    normals = vertex_normals(vertices, faces)
-    return _mesh(pyrender, vertices, normals, faces, colors, covering_material(hand.covering))
+    colors = skin_tint(hand.model) if hand.covering == "skin" else np.ones((len(vertices), 3))
+    return _surface(
+        vertices, vertex_normals(vertices, faces), faces, colors, covering_material(hand.covering)
+    )
 
 
-def _add_balls(pyrender: Any, built: Any, balls: Balls) -> None:
-    """One mesh for all balls, told apart by vertex colors."""
+def _ball_surfaces(balls: Balls) -> list[Drawn]:
+    """All balls as one surface, with colors by vertex; nothing where no center is known."""
     known = np.isfinite(balls.centers).all(axis=-1)
     centers = balls.centers[known]
     if not len(centers):
-        return
-    vertices, normals, faces = sphere_surface(centers, balls.radius, level=3)
-    each = len(vertices) // len(centers)
-    colors = np.ones((len(vertices), 4))
+        return []
+    vertices, normals, faces = sphere_surface(centers, balls.radius, level=_BALL_LEVEL)
     tint = linear(np.broadcast_to(np.asarray(balls.colors, dtype=np.float64), balls.centers.shape)[known])
-    colors[:, :3] = np.repeat(tint, each, axis=0)
-    built.add(_mesh(pyrender, vertices, normals, faces, colors, ball_material()))
+    colors = np.repeat(tint, len(vertices) // len(centers), axis=0)
+    return [_surface(vertices, normals, faces, colors, ball_material())]
 
 
-def _mesh(
-    pyrender: Any,
+def _surface(
     vertices: NDArray[np.float64],
     normals: NDArray[np.float64],
     faces: NDArray[np.int64],
     colors: NDArray[np.float64],
     material: Material,
-) -> Any:
-    primitive = pyrender.Primitive(
-        positions=vertices,
-        normals=normals,
-        indices=faces,
-        color_0=colors,
-        material=material.for_pyrender(),
-    )
-    return pyrender.Mesh(primitives=[primitive])
+) -> Drawn:
+    """A surface without ids, its colors (V, 3) linear factors on the material's."""
+    ids = np.zeros(len(faces), dtype=np.uint8)
+    factors = np.ones((len(vertices), 4), dtype=np.float32)
+    factors[:, :3] = colors
+    return Drawn(Triangles(vertices, faces, normals, ids, ids, ids), factors, None, lambda: material)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.cameras import look_at
-from render.painting.scene import PosedHand, View, view_along
+from render.illustrations.scene import PosedHand, View, view_along
 
 SIZE = (320, 240)
 

@@ -1,0 +1,70 @@
+"""`RenderConfig`: everything that decides the bytes of a rendering."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+from handsim.errors import ArgumentError, choices
+from render.cameras.viewpoints import ViewConfig
+from render.frames.frame import PASSES
+from render.painting.painter import PainterChoice, choose_painter
+from render.scenery.backgrounds import BackgroundConfig
+from render.sensors.depth_noise import DepthNoiseConfig
+from render.sensors.exposure import ExposureConfig
+from render.sensors.shutter import ShutterConfig
+from render.skin.look import ALL_TONES
+
+
+@dataclass(frozen=True, slots=True)
+class RenderConfig:
+    """Everything that decides the bytes of a rendering; it is saved beside the pictures.
+
+    Raises:
+        ArgumentError: A pass is unknown, or a number is out of range.
+    """
+
+    passes: tuple[str, ...] = PASSES
+    """Pictures to draw: some of rgb, depth, normals, ids."""
+    view: ViewConfig = field(default_factory=ViewConfig)
+    """Cameras, and where they stand."""
+    dress: Literal["skin", "glove"] = "skin"
+    """Bare hands, or the marker glove with its markers."""
+    tones: tuple[float, float] = ALL_TONES
+    """Range of individual typology angles that skins are drawn from [deg]; see `render.skin.look.TONES`."""
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    """Shares of the kinds of background."""
+    vary: Literal["shard", "frame"] = "shard"
+    """Whether light and background change with every shard or every frame; people change with every shard."""
+    depth_sensor: DepthNoiseConfig | None = field(default_factory=DepthNoiseConfig)
+    """Sensors that add noise to depth; None: perfect depth alone."""
+    color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
+    """Exposure and noise of colors; None: perfect colors alone."""
+    painter: PainterChoice = "auto"
+    """What paints colors: opengl, compiled, or auto: opengl where there is hardware for it."""
+    shutter: ShutterConfig | None = None
+    """Motion blur and rolling shutters, which take a drawing per sub-frame; None: pictures of an instant."""
+    every: int = 1
+    """Step between the frames that are drawn."""
+    frames_per_shard: int = 64
+    """Frames that are written together."""
+    seed: int = 0
+    """Seed of all random choices."""
+
+    def __post_init__(self) -> None:
+        for name in self.passes:
+            if name not in PASSES:
+                raise ArgumentError(choices(name, PASSES, noun="pass"))
+        if not self.passes or self.every < 1 or self.frames_per_shard < 1:
+            raise ArgumentError(
+                f"passes are {self.passes}, every is {self.every}, frames_per_shard is "
+                f"{self.frames_per_shard}, expected at least one pass, and numbers of at least 1"
+            )
+
+    def with_chosen_painter(self) -> RenderConfig:
+        """The same with compiled or opengl in the place of auto; without colors there is no need to look."""
+        if self.painter != "auto":
+            return self
+        painter = choose_painter("auto") if "rgb" in self.passes else "compiled"
+        return dataclasses.replace(self, painter=painter)

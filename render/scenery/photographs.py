@@ -1,0 +1,79 @@
+"""A user's own photographs as backgrounds."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import cv2
+import numpy as np
+
+from handsim.errors import HandSimError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
+_TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
+_GAMMA: Final = 2.2
+
+
+@functools.lru_cache(maxsize=2)
+def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Photographs in a folder and its subfolders: those that are some by their first bytes, and the others.
+
+    Raises:
+        HandSimError: There is no such folder, or none in it is readable.
+    """
+    if not folder.is_dir():
+        raise HandSimError(f"{folder}: no such folder of photographs")
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTO_SUFFIXES)
+    good = tuple(file for file in files if cv2.haveImageReader(str(file)))
+    if not good:
+        raise _no_photo(folder)
+    return good, tuple(file for file in files if file not in set(good))
+
+
+def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
+    """A random photograph that can be read whole."""
+    files, _ = photo_files(folder)
+    for place in rng.permutation(len(files))[:_TRIES]:
+        if _read(files[place]) is not None:
+            readable: Path = files[place]
+            return readable
+    raise _no_photo(folder)
+
+
+def _no_photo(folder: Path) -> HandSimError:
+    endings = ", ".join(PHOTO_SUFFIXES)
+    return HandSimError(f"{folder}: no photograph that can be read; expected files that end in {endings}")
+
+
+def _read(file: Path) -> NDArray[np.uint8] | None:
+    try:
+        data = np.fromfile(file, dtype=np.uint8)
+        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    except (OSError, cv2.error):
+        return None
+    return None if picture is None else np.asarray(picture)
+
+
+def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
+    """A random part of a photograph in the picture's proportions, as large as fits at up to half the zoom."""
+    photo = _read(file)
+    if photo is None:
+        raise HandSimError(f"{file}: not a readable photograph")
+    height, width = photo.shape[:2]
+    scale = min(width / size[0], height / size[1]) * rng.uniform(0.5, 1.0)
+    part = np.maximum(np.array(size) * scale, 1.0).astype(int)
+    left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
+    cut = photo[top : top + part[1], left : left + part[0], ::-1]
+    if rng.random() < 0.5:
+        cut = cut[:, ::-1]
+    shrinks = part[0] > size[0]
+    scaled = cv2.resize(
+        np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
+    light: NDArray[np.float32] = (scaled.astype(np.float32) / 255.0) ** _GAMMA
+    return light
