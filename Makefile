@@ -10,7 +10,7 @@ DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format clean drawing
+.PHONY: help demo test lint format figures docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -31,6 +31,9 @@ lint: $(INSTALLED)  ## style, format, types and the order of imports
 format: $(INSTALLED)  ## put the code into its format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+figures: $(INSTALLED)  ## write docs/figures.toml into the pages; ONLY=table5 runs that command anew
+	$(BIN)/python docs/renew_figures.py $(if $(ONLY),--only $(ONLY))
 
 clean:  ## remove .venv, caches and what the demo wrote
 	rm -rf $(VENV) demo build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
