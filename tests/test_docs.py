@@ -6,6 +6,7 @@ A page's blocks run in order, in one process, one namespace and one empty folder
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import re
@@ -108,3 +109,30 @@ def test_a_block_that_fails_is_named(tmp_path):
     assert run_blocks([hidden], tmp_path) == [""]
     with pytest.raises(AssertionError, match=r'page\.md:8", line 2(.|\n)*ValueError: 3'):
         run_blocks([hidden, shown], tmp_path)
+
+
+def test_every_module_that_a_page_names_exists():
+    missing = []
+    for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
+        for name in re.findall(
+            r"`((?:handsim|poses|gloves|render|train|track)(?:\.(?!py\b)\w+)+)", path.read_text()
+        ):
+            if not _exists(name):
+                missing.append(f"{path.name}: {name}")
+    assert missing == []
+
+
+def _exists(name: str) -> bool:
+    """Whether a dotted name is a module, or something that a module has."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        try:
+            thing: object = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[length:]:
+            if not hasattr(thing, part) and part not in getattr(thing, "__annotations__", {}):
+                return False
+            thing = getattr(thing, part, None)
+        return True
+    return False
