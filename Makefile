@@ -10,7 +10,7 @@ DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format clean drawing
+.PHONY: help demo test lint format figures docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -19,7 +19,7 @@ help:  ## list the targets (this)
 demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
 
-test: $(INSTALLED) drawing lint  ## every check there is: lint, then the tests
+test: $(INSTALLED) drawing lint docs  ## every check there is: lint, the documents, then the tests
 	$(BIN)/pytest -n 2
 
 lint: $(INSTALLED)  ## style, format, types and the order of imports
@@ -32,8 +32,14 @@ format: $(INSTALLED)  ## put the code into its format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+docs: $(INSTALLED)  ## the guide and the API reference, into docs/_build
+	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs docs/_build
+
+figures: $(INSTALLED)  ## write docs/figures.toml into the pages; ONLY=table5 runs that command anew
+	$(BIN)/python docs/renew_figures.py $(if $(ONLY),--only $(ONLY))
+
 clean:  ## remove .venv, caches and what the demo wrote
-	rm -rf $(VENV) demo build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) demo docs/_build docs/api build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # setuptools goes in first so that the build needs no isolated environment with versions of its own.

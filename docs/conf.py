@@ -1,0 +1,72 @@
+"""Sphinx: the pages of this folder are the guide; the API reference is read from the packages' `__all__`."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+DOCS: Final = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent))
+
+from handsim import __version__  # noqa: E402
+
+PACKAGES: Final = ("handsim", "poses", "gloves", "render", "train", "track")
+
+project = "handsim"
+author = project_copyright = "The handsim authors"
+version = release = __version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = f"handsim {__version__}"
+html_show_sourcelink = html_copy_source = False
+myst_heading_anchors = 3
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True}
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True  # attributes of a dataclass are described once, beside the field
+
+
+def write_reference() -> None:
+    """Write one page per package, api/PACKAGE.md, with its public names; unchanged pages are not touched."""
+    folder = DOCS / "api"
+    folder.mkdir(exist_ok=True)
+    for name in PACKAGES:
+        package = importlib.import_module(name)
+        lines = [f"# {name}", "", "```{eval-rst}", f".. automodule:: {name}", "   :no-members:", ""]
+        for public in package.__all__:
+            if not public.startswith("__"):
+                lines += [f".. {_directive(getattr(package, public))}:: {name}.{public}", ""]
+        text = "\n".join([*lines, "```", ""])
+        path = folder / f"{name}.md"
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def _directive(thing: object) -> str:
+    if inspect.isclass(thing):
+        return "autoexception" if issubclass(thing, BaseException) else "autoclass"
+    return "autofunction" if callable(thing) else "autodata"
+
+
+def plain_to_rst(_app: Sphinx, _what: str, _name: str, _thing: Any, _options: Any, lines: list[str]) -> None:
+    """Docstrings are plain text with `code`: make code literal, and signs that RST reads as markup plain."""
+    for number, line in enumerate(lines):
+        parts = re.split(r"(`+[^`]+`+)", line)
+        parts[1::2] = [f"``{part.strip('`')}``" for part in parts[1::2]]
+        parts[::2] = [re.sub(r"([*|\\])|(?<=\w)(_)(?!\w)", r"\\\1\2", part) for part in parts[::2]]
+        lines[number] = "".join(parts)
+
+
+def setup(app: Sphinx) -> None:
+    """Write the reference, and read docstrings as plain text before napoleon does."""
+    write_reference()
+    app.connect("autodoc-process-docstring", plain_to_rst, priority=400)
