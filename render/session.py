@@ -1,4 +1,4 @@
-"""A whole take, drawn in shards: on all cores, resumable, the same bytes whatever the number of workers."""
+"""Rendering of takes in shards: on all cores, resumable, with the same bytes for any number of workers."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from render.skin.look import SkinLook
 from render.studio.studio import FrameChoices, Studio
 
 Progress = Callable[[int, int], None]
-"""Called with pictures done and pictures wanted."""
+"""Called with the numbers of finished pictures and of all pictures."""
 CONFIG: Final = "render.json"
 SHEET: Final = "contact_sheet.png"
 _ON_SHEET: Final = 9
-_PATHS: Final = 1  # spawn keys of what is drawn for the whole take, and for a shard
+_PATHS: Final = 1  # spawn keys of choices for the whole take, and for one shard
 _SHARDS: Final = 2
 
 
@@ -51,21 +51,21 @@ def render_take(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> int:
-    """Draw a take; called again it goes on where it was stopped.
+    """Draw a take; a second call resumes where the first was stopped.
 
     Args:
         path: A tracked take, or the truth of a simulated one.
-        out: Folder; each format has its own in it where there are several.
+        out: Folder; each of several formats has a folder of its own in it.
         formats: Some of `render.formats.writer.FORMATS`.
         config: What to draw.
         workers: Processes; all cores when not given.
-        progress: Told after every shard.
+        progress: Called after every shard.
 
     Returns:
         Number of pictures.
 
     Raises:
-        HandSimError: The take or the settings cannot be drawn; shards that are finished are kept.
+        HandSimError: The take or the settings cannot be drawn; finished shards are kept.
     """
     _check_formats(formats, config)
     config = config.with_chosen_painter()
@@ -111,9 +111,9 @@ def _finished(out: Path, formats: Sequence[str]) -> frozenset[int]:
 
 
 def _shards(take: ShownTake, config: RenderConfig) -> list[list[int]]:
-    """Frames of each shard: those in which there is a hand."""
-    there = np.isfinite(take.wrists()[..., 0]).any(axis=1)
-    frames = [frame for frame in range(0, take.num_frames, config.every) if there[frame]]
+    """Frames of each shard; frames without a hand are left out."""
+    present = np.isfinite(take.wrists()[..., 0]).any(axis=1)
+    frames = [frame for frame in range(0, take.num_frames, config.every) if present[frame]]
     size = config.frames_per_shard
     return [frames[first : first + size] for first in range(0, len(frames), size)]
 
@@ -125,8 +125,8 @@ def _viewpoints(take: ShownTake, config: RenderConfig) -> Viewpoints:
 
 @functools.lru_cache(maxsize=1)
 def _opened(path: Path, config: RenderConfig) -> tuple[ShownTake, Viewpoints]:
-    """A take and its cameras; kept, because a worker draws many of its shards."""
-    cv2.setNumThreads(1)  # there is a process a core
+    """A take and its cameras; cached, because a worker draws many of its shards."""
+    cv2.setNumThreads(1)  # present is one process per core
     take = load_shown_take(path)
     return take, _viewpoints(take, config)
 
@@ -148,10 +148,10 @@ def draw_frames(
     """Some frames of a take, seen by all its cameras.
 
     Args:
-        take: What happens.
+        take: The take.
         config: What to draw.
         frames: Numbers of frames in the take.
-        shard: People change with the shard, as does all else that does not vary by frame.
+        shard: Number of the shard; people change with it, as does all else that does not vary by frame.
     """
     return draw_shard(take, _viewpoints(take, config), config, shard, frames)
 
@@ -189,15 +189,15 @@ def _choices(config: RenderConfig, skin: SkinLook | None, rng: np.random.Generat
 
 
 def _write_sheet(out: Path, take: ShownTake, config: RenderConfig, shards: list[list[int]]) -> None:
-    """A few of the pictures at one glance."""
+    """Write a few of the pictures on one sheet."""
     if not {"rgb", "depth"} & set(config.passes):
         return
     viewpoints, frames = _viewpoints(take, config), []
     for shard in np.unique(np.linspace(0, len(shards) - 1, _ON_SHEET).round().astype(int)):
-        wanted = (
+        chosen_frames = (
             shards[shard][:1]
             if len(shards) >= _ON_SHEET
             else shards[shard][:: max(1, len(shards[shard]) // 3)][:3]
         )
-        frames += list(draw_shard(take, viewpoints, config, int(shard), wanted))
+        frames += list(draw_shard(take, viewpoints, config, int(shard), chosen_frames))
     write_png(out / SHEET, contact_sheet(frames[:_ON_SHEET]))

@@ -1,4 +1,4 @@
-"""A take as pictures need it, simulated or tracked: who and what is where in every frame."""
+"""`ShownTake`, the content of a simulated or tracked take that pictures need."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownBody:
-    """One rigid thing of a take."""
+    """One rigid body of a take."""
 
     name: str
     thing: RigidObject | None
-    """What it looks like; None for a thing of the user's own, of which only its markers are known."""
+    """Its shape; None for a body of the user's own, of which only the markers are known."""
     markers: Float[np.ndarray, "Q 3"]
-    """In its own frame [m]."""
+    """Markers in the body's frame [m]."""
     T_world_body: Float[np.ndarray, "T 4 4"]
-    """NaN where it is lost."""
+    """Poses of the body; NaN where it is lost."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownTake:
-    """Motion of hands and things, and what the optical system saw of them."""
+    """Motion of hands and rigid bodies, and the points that the optical system saw of them."""
 
     rate: float
-    """Frames a second [Hz]."""
+    """Frames per second [Hz]."""
     times: Float[np.ndarray, "T"]
-    """[s]"""
+    """Time of each frame [s]."""
     hands: tuple[GlovedHand, ...]
     bodies: tuple[ShownBody, ...]
     points: Float[np.ndarray, "T N 3"]
     """World [m], NaN where a column has no point."""
     labels: Int[np.ndarray, "T N"]
-    """Places in `label_names`, -1 for none."""
+    """Indices of `label_names`, -1 for a ghost."""
     label_names: tuple[str, ...]
 
     @property
@@ -56,7 +56,7 @@ class ShownTake:
         return len(self.times)
 
     def wrists(self) -> Float[np.ndarray, "T H 27"]:
-        """Poses of all hands."""
+        """Qpos of all H hands."""
         return np.stack([hand.qpos for hand in self.hands], axis=1)
 
 
@@ -64,7 +64,7 @@ def load_shown_take(path: Path) -> ShownTake:
     """Read a tracked take, or the truth of a simulated one.
 
     Raises:
-        CaptureError: No such file, of another kind or schema, damaged, or without any pose.
+        CaptureError: The file is missing, of another kind or schema, damaged, or without any pose.
     """
     shown = (
         show_simulated(load_take(path))
@@ -89,17 +89,17 @@ def show_simulated(take: Take) -> ShownTake:
 
 
 def show_tracked(take: TrackedTake) -> ShownTake:
-    """What a tracker made of a capture."""
+    """The result of a tracker."""
     hands = tuple(
         GlovedHand(
             hand,
-            np.where(take.status[:, place, None] == LOST, np.nan, take.qpos[:, place]),
+            np.where(take.status[:, index, None] == LOST, np.nan, take.qpos[:, index]),
         )
-        for place, hand in enumerate(take.hands)
+        for index, hand in enumerate(take.hands)
     )
     bodies = tuple(
-        _body(body.name, body.positions, _transforms(take.body_poses[:, place]))
-        for place, body in enumerate(take.bodies)
+        _body(body.name, body.positions, _transforms(take.body_poses[:, index]))
+        for index, body in enumerate(take.bodies)
     )
     labels = take.labels.astype(np.int64)
     return ShownTake(take.rate, take.times, hands, bodies, take.points, labels, take.label_names)
@@ -111,7 +111,7 @@ def _body(name: str, markers: NDArray[np.float64], poses: NDArray[np.float64]) -
 
 
 def _transforms(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices (T, 4, 4) of places and quaternions (T, 7); NaN where there are none."""
+    """Transforms (T, 4, 4) of positions and quaternions (T, 7); NaN where there are none."""
     transforms = np.tile(np.eye(4), (len(poses), 1, 1))
     there = np.isfinite(poses[:, 0])
     transforms[there, :3, :3] = quaternion_matrix(poses[there, 3:])

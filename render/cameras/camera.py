@@ -1,4 +1,4 @@
-"""The camera of a picture: how large, how wide, where it stands, and what its lens does."""
+"""`Camera`, a calibrated camera with its pose and its lens, and the cameras that come with the package."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Camera:
     (0.5, 0.5); OpenCV's and MuJoCo's own counts begin half a pixel later.
 
     Raises:
-        ArgumentError: The size is no picture's, `K` is no camera matrix, or the pose no rigid transform.
+        ArgumentError: The size is out of range, `K` is not a camera matrix, or the pose is not rigid.
     """
 
     name: str
@@ -50,13 +50,15 @@ class Camera:
         rest = self.K.copy()
         rest[0, 0] = rest[1, 1] = rest[0, 2] = rest[1, 2] = 0.0
         if not (self.K[0, 0] > 0.0 and self.K[1, 1] > 0.0) or np.abs(rest - np.diag([0, 0, 1])).max() > 0.0:
-            raise ArgumentError(f"camera '{self.name}': K is no matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+            raise ArgumentError(
+                f"camera '{self.name}': K is not a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            )
         rotation = self.T_world_camera[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5 or np.linalg.det(rotation) < 0.0:
-            raise ArgumentError(f"camera '{self.name}': T_world_camera is no rigid transform")
+            raise ArgumentError(f"camera '{self.name}': T_world_camera is not a rigid transform")
 
     def at(self, T_world_camera: Float[np.ndarray, "4 4"]) -> Camera:
-        """The same camera in another place."""
+        """The same camera with another pose [m]."""
         return dataclasses.replace(self, T_world_camera=T_world_camera)
 
     def local(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
@@ -65,20 +67,20 @@ class Camera:
         return local
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Pixels of world points [px], inside the picture or not; NaN for what the lens cannot see."""
-        places = self.lens.distort(self.local(points))
-        pixels: NDArray[np.float64] = places * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
+        """Pixels of world points [m], inside the picture or not [px]; NaN for what the lens cannot see."""
+        normalized = self.lens.distort(self.local(points))
+        pixels: NDArray[np.float64] = normalized * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
         return pixels
 
     def rays(self) -> Float[np.ndarray, "H W 3"]:
         """Unit directions in the camera's axes through the centers of all pixels."""
         width, height = self.size
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        places = (np.stack([columns, rows], axis=-1) - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
-        return self.lens.undistort(places)
+        normalized = (np.stack([columns, rows], axis=-1) - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
+        return self.lens.undistort(normalized)
 
     def record(self) -> dict[str, Any]:
-        """All of it as JSON."""
+        """The camera as a JSON record."""
         return {
             "name": self.name,
             "size": list(self.size),
@@ -91,13 +93,20 @@ class Camera:
 def pinhole(
     name: str, size: tuple[int, int], focal: float, center: tuple[float, float] | None = None
 ) -> Camera:
-    """A camera without distortion; its axis meets the picture's middle unless told otherwise [px]."""
+    """A camera without distortion.
+
+    Args:
+        name: Its name.
+        size: Width and height [px].
+        focal: Focal length [px].
+        center: Principal point [px]; the picture's center when not given.
+    """
     x, y = (size[0] / 2, size[1] / 2) if center is None else center
     return Camera(name, size, np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]]))
 
 
 def camera_from_record(record: dict[str, Any]) -> Camera:
-    """What `Camera.record` wrote."""
+    """The camera of a record of `Camera.record`."""
     lens = Lens(record["lens"]["kind"], tuple(record["lens"]["coefficients"]))
     size = int(record["size"][0]), int(record["size"][1])
     return Camera(record["name"], size, np.array(record["K"]), np.array(record["T_world_camera"]), lens)

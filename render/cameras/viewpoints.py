@@ -1,6 +1,6 @@
-"""Where cameras stand while a take goes by: still, in a ring, on a head, going round, or anywhere.
+"""Camera poses for each frame of a take: still, in orbit, on a head, anywhere, or on a rig.
 
-Paths are made once for a whole take, from the hands' own motion, so that any frame can be drawn alone.
+Paths are computed once for a whole take, from the motion of its hands, so that any frame can be drawn alone.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 PLACEMENTS: Final[tuple[Placement, ...]] = ("still", "orbit", "head", "anywhere", "rig")
-_REACH: Final = 0.08  # [m] from the wrist to the middle of the hand
+_HAND_CENTER: Final = 0.08  # [m] from the wrist to the center of the hand
 _EYES: Final = (0.32, 0.38)  # [m] of the head's camera behind and above the hands
-_PAST: Final = np.deg2rad(50.0)  # between a head's line of sight and a forearm, at least
-_SWAY: Final = 1.0  # [s] over which a head follows the hands
-_TURN: Final = 12.0  # [s] of a camera that goes round once
+_HEAD_CLEARANCE: Final = np.deg2rad(50.0)  # between a head's line of sight and a forearm, at least
+_HEAD_DELAY: Final = 1.0  # [s] over which a head follows the hands
+_ORBIT_PERIOD: Final = 12.0  # [s] of one revolution of a camera in orbit
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
 _TRIES: Final = 20
-_ASIDE: Final = np.deg2rad(35.0)  # between their view and a forearm, at least
+_ARM_CLEARANCE: Final = np.deg2rad(35.0)  # between a view and a forearm, at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,20 +39,20 @@ class ViewConfig:
     """Cameras of a take.
 
     Raises:
-        ArgumentError: There is no such placement, no camera, or the distances are none.
+        ArgumentError: The placement is unknown, there is no camera, or the distances are out of range.
     """
 
     placement: Placement = "still"
-    """`still`: in front of the hands. `orbit`: around them. `head`: where the user's eyes are. `anywhere`:
-    another place in every frame. `rig`: where the cameras of a rig stand."""
+    """Position of the cameras. still: in front of the hands. orbit: around them. head: at the user's eyes.
+    anywhere: at another position in every frame. rig: at the cameras of a rig."""
     camera: str = "vga"
-    """One of `render.cameras.camera.PRESETS`."""
+    """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
     views: int = 1
-    """How many cameras look at the hands at once; a rig has its own number."""
+    """Number of cameras; a rig has its own number."""
     distance: tuple[float, float] = (0.55, 0.9)
-    """From the middle of the hands [m], drawn evenly."""
+    """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
     rig: str = "six"
-    """A shipped rig or a .toml file, for the placement `rig`."""
+    """Rig for the placement rig: a shipped name or the path of a .toml file."""
 
     def __post_init__(self) -> None:
         if self.placement not in PLACEMENTS:
@@ -69,9 +69,9 @@ class Viewpoints:
     """Cameras of every frame.
 
     Args:
-        config: Where they stand.
-        take: What they look at.
-        rng: Decides what is left open, once.
+        config: Placement of the cameras.
+        take: The take whose hands they look at.
+        rng: Source of all random choices.
     """
 
     def __init__(self, config: ViewConfig, take: ShownTake, *, rng: np.random.Generator) -> None:
@@ -87,8 +87,8 @@ class Viewpoints:
 
 
 def hand_centers(take: ShownTake) -> Float[np.ndarray, "T 3"]:
-    """Middle of the hands that are there [m]; where there are none, straight from before to after."""
-    middles = take.wrists()[..., :3] + _REACH * _along(take)
+    """Center of the hands of each frame [m]; interpolated linearly over frames without hands."""
+    middles = take.wrists()[..., :3] + _HAND_CENTER * _along(take)
     there = np.isfinite(middles[..., :1])
     counts = there.sum(axis=1)
     centers = np.where(there, middles, 0.0).sum(axis=1) / np.maximum(counts, 1)
@@ -103,7 +103,7 @@ def _along(take: ShownTake) -> NDArray[np.float64]:
 
 
 def _towards_user(take: ShownTake) -> NDArray[np.float64]:
-    """Level direction from the hands to the body that they belong to: where their forearms point."""
+    """Level unit direction (3,) from the hands to the user's body: where the forearms point."""
     level = np.append(np.nanmean(-_along(take)[..., :2].reshape(-1, 2), axis=0), 0.0)
     length = float(np.linalg.norm(level))
     return level / length if length > 1e-3 else np.array([0.0, -1.0, 0.0])
@@ -121,13 +121,13 @@ def _middle(take: ShownTake) -> NDArray[np.float64]:
 
 
 def _still(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """In front of the user, spread over a fan where there are several."""
+    """In front of the user; several cameras form a fan."""
     middle, user = _middle(take), _towards_user(take)
     front = np.arctan2(-user[1], -user[0])
     spread = np.deg2rad(40.0) * (np.arange(config.views) - 0.5 * (config.views - 1))
     paths = []
-    for turn in spread:
-        direction = _spherical(front + turn + rng.uniform(-0.15, 0.15), rng.uniform(0.1, 0.6))
+    for azimuth in spread:
+        direction = _spherical(front + azimuth + rng.uniform(-0.15, 0.15), rng.uniform(0.1, 0.6))
         pose = look_at(middle + rng.uniform(*config.distance) * direction, middle)
         paths.append(np.broadcast_to(pose, (take.num_frames, 4, 4)))
     return paths
@@ -138,15 +138,17 @@ def _orbit(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> lis
     for number in range(config.views):
         start = rng.uniform(-np.pi, np.pi) + 2.0 * np.pi * number / config.views
         elevation, distance = rng.uniform(0.0, 0.8), rng.uniform(*config.distance)
-        turns = start + 2.0 * np.pi * (take.times - take.times[0]) / _TURN
-        places = [middle + distance * _spherical(turn, elevation) for turn in turns]
-        paths.append(np.array([look_at(place, middle) for place in places]))
+        azimuths = start + 2.0 * np.pi * (take.times - take.times[0]) / _ORBIT_PERIOD
+        positions = [middle + distance * _spherical(azimuth, elevation) for azimuth in azimuths]
+        paths.append(np.array([look_at(position, middle) for position in positions]))
     return paths
 
 
 def _head(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """Where the eyes are, following the hands a little late; several look from side by side, as two eyes."""
-    centers = uniform_filter1d(hand_centers(take), max(1, round(_SWAY * take.rate)), axis=0, mode="nearest")
+    """At the eyes, following the hands with a delay; several cameras are side by side, as two eyes are."""
+    centers = uniform_filter1d(
+        hand_centers(take), max(1, round(_HEAD_DELAY * take.rate)), axis=0, mode="nearest"
+    )
     user = _towards_user(take)
     back, up = _EYES[0] + rng.uniform(-0.05, 0.05), _EYES[1] + rng.uniform(-0.05, 0.05)
     direction = _past_forearms(take, back * user + [0.0, 0.0, up])
@@ -160,43 +162,45 @@ def _head(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list
 
 
 def _past_forearms(take: ShownTake, offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same way from the hands, turned aside until no forearm usually lies in the line of sight."""
+    """The offset (3,) [m] from the hands, rotated until no forearm usually lies in the line of sight."""
     length = float(np.linalg.norm(offset))
     direction = offset / length
     medians = np.nanmedian(-_along(take), axis=0)
     medians /= np.linalg.norm(medians, axis=1, keepdims=True)
     for arm in [*medians] * 2:  # past one may be into the other
-        if direction @ arm > np.cos(_PAST):
+        if direction @ arm > np.cos(_HEAD_CLEARANCE):
             across = direction - (direction @ arm) * arm
             if np.linalg.norm(across) < 1e-3:
                 across = np.cross(arm, [1.0, 0.0, 0.0])
-            direction = np.cos(_PAST) * arm + np.sin(_PAST) * across / np.linalg.norm(across)
+            direction = np.cos(_HEAD_CLEARANCE) * arm + np.sin(_HEAD_CLEARANCE) * across / np.linalg.norm(
+                across
+            )
     return length * direction
 
 
 def _anywhere(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     centers, paths = hand_centers(take), []
     for _ in range(config.views):
-        places = np.empty_like(centers)
-        left = np.arange(take.num_frames)
+        positions = np.empty_like(centers)
+        remaining = np.arange(take.num_frames)
         for _ in range(_TRIES):
-            turns = rng.uniform(-np.pi, np.pi, len(left))
-            rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), len(left)))
-            distance = rng.uniform(*config.distance, len(left))
-            directions = [_spherical(*one) for one in zip(turns, rise, strict=True)]
-            places[left] = centers[left] + distance[:, None] * np.array(directions)
-            left = left[_behind_arms(take, places)[left]]
-            if not len(left):
+            azimuths = rng.uniform(-np.pi, np.pi, len(remaining))
+            rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), len(remaining)))
+            distance = rng.uniform(*config.distance, len(remaining))
+            directions = [_spherical(*one) for one in zip(azimuths, rise, strict=True)]
+            positions[remaining] = centers[remaining] + distance[:, None] * np.array(directions)
+            remaining = remaining[_behind_arms(take, positions)[remaining]]
+            if not len(remaining):
                 break
-        paths.append(np.array([look_at(*pair) for pair in zip(places, centers, strict=True)]))
+        paths.append(np.array([look_at(*pair) for pair in zip(positions, centers, strict=True)]))
     return paths
 
 
-def _behind_arms(take: ShownTake, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each frame's place is where a forearm points, so that little but the arm would be seen."""
-    away = places[:, None] - take.wrists()[..., :3]
+def _behind_arms(take: ShownTake, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each frame's position (T, 3) [m] is behind a forearm, from where little but the arm is seen."""
+    away = positions[:, None] - take.wrists()[..., :3]
     cosines = -(away * _along(take)).sum(axis=-1) / np.linalg.norm(away, axis=-1)
-    behind: NDArray[np.bool_] = (cosines > np.cos(_ASIDE)).any(axis=1)
+    behind: NDArray[np.bool_] = (cosines > np.cos(_ARM_CLEARANCE)).any(axis=1)
     return behind  # NaN, where there is no hand, never is
 
 

@@ -1,7 +1,7 @@
-"""Pictures through a lens, from pictures that pinhole cameras take from the same place.
+"""Pictures through a lens, resampled from pinhole pictures of the same position.
 
-One pinhole picture does for a lens that sees little to the side; else the faces of a cube around the camera
-do. Of each face only what the lens sees is drawn, as finely as the lens has it where it has it finest.
+One pinhole picture suffices for a lens with a narrow field of view; other lenses take the faces of a cube
+around the camera. Only the part of a face that the lens sees is drawn, at the lens's finest resolution.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 Interpolation = Literal["nearest", "linear"]
 _MARGIN: Final = 2  # [px] around what is looked up
-_WIDEST: Final = 1.4  # slope up to which one flat picture does: 54 degrees
+_WIDEST: Final = 1.4  # tangent up to which one flat picture suffices: 54 degrees
 _ONE_SURFACE: Final = 0.01  # share of the depth by which neighboring pixels of one surface differ
 # Axes of the cube's faces in the camera's axes, as columns: ahead, right, left, down, up, back.
-_TURNS: Final = (
+_FACE_AXES: Final = (
     ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
     ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
@@ -44,22 +44,22 @@ class _Face:
     size: tuple[int, int]
     focal: float
     center: tuple[float, float]
-    turn: NDArray[np.float64]
-    """Rotation (3, 3) of the face's axes into the camera's."""
+    rotation: NDArray[np.float64]
+    """Rotation (3, 3): the face's axes in the camera's."""
     part: tuple[slice, slice]
     """Rows and columns of the lens's picture that hold all of this face's pixels."""
     mask: Bool[np.ndarray, "h w"]
     """Which of the part's pixels are this face's."""
-    places: Float32[np.ndarray, "h w 2"]
-    """Where they are in the face, counted from the middle of its first pixel [px]."""
+    pixels: Float32[np.ndarray, "h w 2"]
+    """Their pixels in the face, counted from the center of its first pixel [px]."""
     ahead: Float32[np.ndarray, "h w"]
     """Depth along the camera's axis of what has depth 1 along the face's; 0 for what is not ahead."""
 
 
 def faces_for(camera: Camera) -> list[Camera]:
-    """Pinhole cameras at the same place that together see what a camera sees.
+    """Pinhole cameras at the same position that together see what a camera sees.
 
-    A pinhole camera is its own only face.
+    A pinhole camera is its only face.
 
     Raises:
         ArgumentError: The lens sees nothing, or its faces would be larger than pictures may be.
@@ -67,10 +67,10 @@ def faces_for(camera: Camera) -> list[Camera]:
     if camera.lens.kind == "pinhole":
         return [camera]
     cameras = []
-    for number, face in enumerate(_plan(camera)):
+    for number, face in enumerate(_faces(camera)):
         K = np.array([[face.focal, 0, face.center[0]], [0, face.focal, face.center[1]], [0, 0, 1.0]])
         pose = camera.T_world_camera.copy()
-        pose[:3, :3] = pose[:3, :3] @ face.turn
+        pose[:3, :3] = pose[:3, :3] @ face.rotation
         cameras.append(Camera(f"{camera.name}_face{number}", face.size, K, pose))
     return cameras
 
@@ -80,7 +80,7 @@ def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interp
 
     Args:
         camera: With the lens.
-        pictures: One a face of `faces_for`, (h, w) or (h, w, channels).
+        pictures: One per face of `faces_for`, (h, w) or (h, w, channels).
         interpolation: `linear` for colors, `nearest` for ids.
 
     Raises:
@@ -92,7 +92,7 @@ def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interp
     whole = np.zeros((height, width, *pictures[0].shape[2:]), pictures[0].dtype)
     flag = cv2.INTER_LINEAR if interpolation == "linear" else cv2.INTER_NEAREST
     for face, picture in _matched(camera, pictures):
-        _fill(whole, face, _looked_up(picture, face, flag))
+        _fill(whole, face, _resampled(picture, face, flag))
     return whole
 
 
@@ -104,7 +104,7 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
 
     Args:
         camera: With the lens.
-        depths: One a face of `faces_for` [m], 0 where there is nothing.
+        depths: One per face of `faces_for` [m], 0 where there is nothing.
 
     Raises:
         ArgumentError: The pictures are not those of the camera's faces.
@@ -115,8 +115,8 @@ def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> 
     for face, depth in _matched(camera, depths):
         with np.errstate(divide="ignore"):
             reciprocal = np.where(depth > 0.0, np.float32(1.0) / depth, np.float32(0.0))
-        nearest = _looked_up(reciprocal, face, cv2.INTER_NEAREST)
-        smooth = _looked_up(reciprocal, face, cv2.INTER_LINEAR)
+        nearest = _resampled(reciprocal, face, cv2.INTER_NEAREST)
+        smooth = _resampled(reciprocal, face, cv2.INTER_LINEAR)
         whole_surface = np.abs(smooth - nearest) <= np.float32(_ONE_SURFACE) * nearest
         value = np.where(whole_surface, smooth, nearest)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -131,7 +131,7 @@ def warp_normals(
 
     Args:
         camera: With the lens.
-        normals: One a face of `faces_for`, 0 where there is nothing.
+        normals: One per face of `faces_for`, 0 where there is nothing.
 
     Raises:
         ArgumentError: The pictures are not those of the camera's faces.
@@ -140,24 +140,24 @@ def warp_normals(
         return normals[0].copy()
     whole = np.zeros((*camera.size[::-1], 3), np.float32)
     for face, picture in _matched(camera, normals):
-        looked_up = _looked_up(picture, face, cv2.INTER_NEAREST)
-        _fill(whole, face, cv2.transform(looked_up, face.turn))
+        resampled = _resampled(picture, face, cv2.INTER_NEAREST)
+        _fill(whole, face, cv2.transform(resampled, face.rotation))
     return whole
 
 
 def _matched(camera: Camera, pictures: Sequence[NDArray[Any]]) -> list[tuple[_Face, NDArray[Any]]]:
-    faces = _plan(camera)
-    wanted, given = [face.size[::-1] for face in faces], [picture.shape[:2] for picture in pictures]
-    if wanted != given:
+    faces = _faces(camera)
+    expected, given = [face.size[::-1] for face in faces], [picture.shape[:2] for picture in pictures]
+    if expected != given:
         raise ArgumentError(
-            f"pictures of {given} rows and columns, expected camera '{camera.name}' faces': {wanted}"
+            f"pictures of {given} rows and columns, expected camera '{camera.name}' faces': {expected}"
         )
     return list(zip(faces, pictures, strict=True))
 
 
-def _looked_up(picture: NDArray[Any], face: _Face, flag: int) -> NDArray[Any]:
-    looked_up: NDArray[Any] = cv2.remap(picture, face.places, None, flag, borderMode=cv2.BORDER_REPLICATE)
-    return looked_up
+def _resampled(picture: NDArray[Any], face: _Face, flag: int) -> NDArray[Any]:
+    resampled: NDArray[Any] = cv2.remap(picture, face.pixels, None, flag, borderMode=cv2.BORDER_REPLICATE)
+    return resampled
 
 
 def _fill(whole: NDArray[Any], face: _Face, part: NDArray[Any]) -> None:
@@ -165,9 +165,9 @@ def _fill(whole: NDArray[Any], face: _Face, part: NDArray[Any]) -> None:
     np.copyto(whole[face.part], part, where=mask)
 
 
-def _plan(camera: Camera) -> tuple[_Face, ...]:
+def _faces(camera: Camera) -> tuple[_Face, ...]:
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
-    faces = _planned(camera.size, (fx, fy, cx, cy), camera.lens)
+    faces = _faces_of_lens(camera.size, (fx, fy, cx, cy), camera.lens)
     if not faces or max(max(face.size) for face in faces) > 8192:
         largest = max((face.size for face in faces), default=(0, 0))
         raise ArgumentError(
@@ -179,7 +179,7 @@ def _plan(camera: Camera) -> tuple[_Face, ...]:
 
 
 @functools.lru_cache(maxsize=16)
-def _planned(
+def _faces_of_lens(
     size: tuple[int, int], middle: tuple[float, float, float, float], lens: Lens
 ) -> tuple[_Face, ...]:
     fx, fy, cx, cy = middle
@@ -188,47 +188,48 @@ def _planned(
     known = np.isfinite(rays).all(axis=-1)
     rays = np.where(known[..., None], rays, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        slopes = np.abs(rays[..., :2]).max(axis=-1) / rays[..., 2]
-    if ((rays[..., 2] > 0.0) & (slopes <= _WIDEST))[known].all():
+        tangents = np.abs(rays[..., :2]).max(axis=-1) / rays[..., 2]
+    if ((rays[..., 2] > 0.0) & (tangents <= _WIDEST))[known].all():
         owners = np.where(known, 0, -1)
     else:
-        turns = np.array(_TURNS, dtype=np.float64)
-        owners = np.where(known, (rays @ turns[:, :, 2].T).argmax(axis=-1), -1)
+        rotations = np.array(_FACE_AXES, dtype=np.float64)
+        owners = np.where(known, (rays @ rotations[:, :, 2].T).argmax(axis=-1), -1)
     faces = (
-        _face(rays, owners == number, np.array(axes, dtype=np.float64)) for number, axes in enumerate(_TURNS)
+        _face(rays, owners == number, np.array(axes, dtype=np.float64))
+        for number, axes in enumerate(_FACE_AXES)
     )
     return tuple(face for face in faces if face is not None)
 
 
-def _face(rays: NDArray[np.float64], mine: NDArray[np.bool_], turn: NDArray[np.float64]) -> _Face | None:
+def _face(rays: NDArray[np.float64], mine: NDArray[np.bool_], rotation: NDArray[np.float64]) -> _Face | None:
     """The face that has some of a picture's pixels."""
     rows, columns = np.flatnonzero(mine.any(axis=1)), np.flatnonzero(mine.any(axis=0))
     if not len(rows):
         return None
     part = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
-    local = rays[part] @ turn
+    local = rays[part] @ rotation
     mask = mine[part]
     along = np.where(mask, local[..., 2], 1.0)
     flat = np.where(mask[..., None], local[..., :2] / along[..., None], 0.0)
-    focal = _finest(rays @ turn, mine)
+    focal = _finest(rays @ rotation, mine)
     low, high = focal * flat[mask].min(axis=0) - _MARGIN, focal * flat[mask].max(axis=0) + _MARGIN
     size = np.ceil(high - low).astype(int)
-    places = np.where(mask[..., None], focal * flat - low - 0.5, 0.0)
+    pixels = np.where(mask[..., None], focal * flat - low - 0.5, 0.0)
     ahead = np.where(mask & (rays[part][..., 2] > 1e-3), rays[part][..., 2] / along, 0.0)
     return _Face(
         size=(int(size[0]), int(size[1])),
         focal=focal,
         center=(float(-low[0]), float(-low[1])),
-        turn=turn,
+        rotation=rotation,
         part=part,
         mask=mask,
-        places=np.ascontiguousarray(places, dtype=np.float32),
+        pixels=np.ascontiguousarray(pixels, dtype=np.float32),
         ahead=ahead.astype(np.float32),
     )
 
 
 def _finest(local: NDArray[np.float64], mine: NDArray[np.bool_]) -> float:
-    """Pixels that a slope of one needs, so that no step between the lens's pixels is less than a pixel."""
+    """Focal length [px] at which no step between the lens's pixels is less than a pixel of the face."""
     near = local[..., 2] > 0.2  # a face's own pixels are, and their neighbors
     flat = np.full_like(local[..., :2], np.nan)
     flat[near] = local[near][:, :2] / local[near][:, 2:]

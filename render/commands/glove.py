@@ -59,7 +59,7 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
 
 
 def new_glove(file: Annotated[Path, tyro.conf.Positional]) -> None:
-    """Write a commented layout file to begin one's own glove with.
+    """Write a commented layout file as a start for a glove of your own.
 
     Args:
         file: A new .toml file.
@@ -78,7 +78,7 @@ def check_glove(
     out: Path | None = None,
     size: Literal["XS", "S", "M", "L", "XL"] = "M",
 ) -> None:
-    """Put a layout on hands of all five sizes, and draw it from the back, the palm and the thumb's side.
+    """Check a layout on hands of all five sizes, and draw it from the back, the palm and the thumb's side.
 
     Args:
         glove: A .toml file or a shipped name.

@@ -41,7 +41,7 @@ _TOE, _TOE_SLOPE, _POWER, _SCALE, _SHIFT = 0.04045, 12.92, 2.4, 1.055, 0.055
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExrFrame:
-    """What an OpenEXR file holds of a frame."""
+    """The content of an OpenEXR file of a frame."""
 
     camera: Camera
     ideal: Pictures
@@ -94,7 +94,7 @@ def write_exr(path: str | Path, frame: RenderedFrame) -> None:
     with atomic_write(path) as temporary:
         try:
             OpenEXR.File(header, channels).write(str(temporary))
-        except RuntimeError as error:  # its way to tell a full disk
+        except RuntimeError as error:  # raised on a full disk
             raise OSError(errno.EIO, str(error), str(path)) from error
 
 
@@ -102,7 +102,7 @@ def read_exr(path: str | Path) -> ExrFrame:
     """Read what `write_exr` wrote.
 
     Raises:
-        DatasetError: There is no such file, it is damaged, or somebody else's.
+        DatasetError: The file is missing, damaged, or not written by handsim.
     """
     import OpenEXR
 
@@ -133,12 +133,12 @@ def _channels(pictures: Pictures) -> dict[str, NDArray[Any]]:
     channels: dict[str, NDArray[Any]] = {}
     if pictures.rgb is not None:
         light = linear_light(pictures.rgb).astype(np.float16)
-        channels |= {name: light[..., place] for place, name in enumerate(_RGB)}
+        channels |= {name: light[..., index] for index, name in enumerate(_RGB)}
     if pictures.depth is not None:
         channels["Z"] = pictures.depth.astype(np.float32)
     if pictures.normals is not None:
         normals = pictures.normals.astype(np.float16)
-        channels |= {name: normals[..., place] for place, name in enumerate(_NORMALS)}
+        channels |= {name: normals[..., index] for index, name in enumerate(_NORMALS)}
     for field, name in _IDS.items():
         ids = getattr(pictures, field)
         if ids is not None:

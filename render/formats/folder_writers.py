@@ -1,4 +1,4 @@
-"""Formats that are a folder of pictures a shard, each named after its frame: png, exr, coco and interhand."""
+"""Formats with one folder of pictures per shard, named after their frames: png, exr, coco, interhand."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from render.frames.frame import RenderedFrame
 
 
 class FolderWriter:
-    """A folder a shard: pictures named after their frames, and an index of records."""
+    """One folder per shard: pictures named after their frames, and an index of records."""
 
     def __init__(self, folder: Path, inside: str = ".") -> None:
         self.folder = folder
@@ -41,12 +41,12 @@ class FolderWriter:
         Raises:
             HandSimError: The format cannot hold these frames, or the disk takes no more.
         """
-        place = self.pictures / shard_name(shard)
-        with one_sentence(self.folder, f"writing shard {shard}"), new_folder(place) as temporary:
-            save_index(temporary, list(self._add_all(temporary, frames, place.name)))
+        folder = self.pictures / shard_name(shard)
+        with one_sentence(self.folder, f"writing shard {shard}"), new_folder(folder) as temporary:
+            save_index(temporary, list(self._add_all(temporary, frames, folder.name)))
 
     def finish(self) -> None:
-        """Nothing needs to be merged unless the format says so."""
+        """Nothing to merge, unless a format overrides this."""
 
     def _add_all(self, folder: Path, frames: Iterable[RenderedFrame], name: str) -> Iterator[dict[str, Any]]:
         keys = set()
@@ -136,8 +136,8 @@ class InterhandWriter(FolderWriter):
 
         def joints() -> Iterator[str]:
             yield f'{{"{interhand.CAPTURE}":{{'
-            for place, (number, record) in enumerate(interhand.frames_once(self._records())):
-                yield f'{"," if place else ""}\n"{number}":{to_json(record)}'
+            for index, (number, record) in enumerate(interhand.frames_once(self._records())):
+                yield f'{"," if index else ""}\n"{number}":{to_json(record)}'
             yield "\n}}\n"
 
         category = {"id": 1, "name": "hand", "supercategory": "hand"}

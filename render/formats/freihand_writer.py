@@ -32,7 +32,7 @@ _KINDS: Final = {"rgb": ".jpg", "mask": ".jpg", "depth": ".png"}
 class FreihandWriter:
     """`training/rgb/00000000.jpg`, `training/mask/00000000.jpg` and the lists `training_*.json`.
 
-    One entry a hand: a picture of two hands is there twice. Shards wait in `parts` until `finish` moves their
+    One entry per hand: a picture of two hands comes twice. Shards wait in `parts` until `finish` moves their
     pictures to their numbers, which a shard keeps: what is rendered later comes after it. The shards' lists
     stay in `parts`.
 
@@ -54,13 +54,13 @@ class FreihandWriter:
         """Write a shard.
 
         Raises:
-            HandSimError: The shard has its numbers already, a camera is no pinhole camera, there are no
+            HandSimError: The shard has its numbers already, a camera is not a pinhole camera, there are no
                 color pictures, or the disk takes no more.
         """
         if str(shard) in self._numbers():
             raise HandSimError(f"{self.folder}: shard {shard} is numbered already and cannot be written anew")
-        place = self.parts / shard_name(shard)
-        with one_sentence(self.folder, f"writing shard {shard}"), new_folder(place) as temporary:
+        folder = self.parts / shard_name(shard)
+        with one_sentence(self.folder, f"writing shard {shard}"), new_folder(folder) as temporary:
             entries: list[dict[str, Any]] = []
             for kind in _KINDS:
                 (temporary / kind).mkdir()
@@ -117,11 +117,11 @@ class FreihandWriter:
     def _move(self, shard: int, first: int, count: int) -> None:
         for kind, suffix in _KINDS.items():
             target = self.folder / SET / kind
-            for place in range(count):
-                source = self.parts / shard_name(shard) / kind / f"{place:08d}{suffix}"
+            for index in range(count):
+                source = self.parts / shard_name(shard) / kind / f"{index:08d}{suffix}"
                 if source.exists():  # it does not after an earlier `finish`, nor without such a picture
                     target.mkdir(parents=True, exist_ok=True)
-                    source.replace(target / f"{first + place:08d}{suffix}")
+                    source.replace(target / f"{first + index:08d}{suffix}")
 
 
 def _is_pair(value: Any) -> bool:

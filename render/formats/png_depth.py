@@ -1,7 +1,7 @@
-"""Pictures as bytes of PNG and JPEG files; depth as 16-bit PNG that says its own unit.
+"""Pictures as bytes of PNG and JPEG files; depth as 16-bit PNG that contains its unit.
 
 Depth counts tenths of a millimeter up to 6.5535 m, and 0 is nothing, as sensors have it. What is farther
-becomes 0 too: a hole says "unknown", which is true, where 65535 would be a wall that is not there.
+becomes 0 too: a hole means "unknown", whereas 65535 would look like a wall.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 METERS_PER_UNIT: Final = 1e-4
-"""What a step of a depth picture is worth, unless its file says otherwise [m]."""
+"""Unit of a depth picture [m], unless its file contains another."""
 _KEYWORD: Final = b"metres_per_unit"
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 _FIRST_CHUNK: Final = slice(8, 33)  # IHDR: length, name, 13 bytes, checksum
@@ -48,10 +48,10 @@ def encode_depth(depth: Float32[np.ndarray, "H W"], *, meters_per_unit: float = 
 
     Args:
         depth: Meters; 0, NaN and what does not fit into 65535 units become 0.
-        meters_per_unit: What a step is worth [m].
+        meters_per_unit: Depth of one unit [m].
 
     Raises:
-        HandSimError: The unit is no positive number.
+        HandSimError: The unit is not a positive number.
     """
     if not 0.0 < meters_per_unit < np.inf:
         raise HandSimError(f"meters_per_unit is {meters_per_unit:g}, expected a positive number of meters")
@@ -71,7 +71,7 @@ def decode_depth(data: bytes, *, name: str = "depth picture") -> Float32[np.ndar
         name: What to call it in messages.
 
     Raises:
-        DatasetError: It is no such picture.
+        DatasetError: It is not such a picture.
     """
     unit = _unit(data, name)
     steps = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
@@ -89,7 +89,7 @@ def read_depth(path: str | Path) -> Float32[np.ndarray, "H W"]:
     """Depth [m] of a file that `encode_depth` made.
 
     Raises:
-        DatasetError: The file cannot be read, or is no such picture.
+        DatasetError: The file cannot be read, or is not such a picture.
     """
     try:
         data = Path(path).read_bytes()
@@ -154,10 +154,10 @@ def _unit(data: bytes, name: str) -> float:
     """Unit that a PNG states, ours when it states none."""
     if not data.startswith(_SIGNATURE):
         raise DatasetError(f"{name}: not a PNG file")
-    place = len(_SIGNATURE)
-    while place + 8 <= len(data):
-        length, kind = struct.unpack(">I4s", data[place : place + 8])
-        content = data[place + 8 : place + 8 + length]
+    offset = len(_SIGNATURE)
+    while offset + 8 <= len(data):
+        length, kind = struct.unpack(">I4s", data[offset : offset + 8])
+        content = data[offset + 8 : offset + 8 + length]
         keyword, _, text = content.partition(b"\0")
         if kind == b"tEXt" and keyword == _KEYWORD:
             try:
@@ -167,5 +167,5 @@ def _unit(data: bytes, name: str) -> float:
             if not 0.0 < unit < np.inf:
                 raise DatasetError(f"{name}: damaged: its unit '{text!r}' is no number of meters")
             return unit
-        place += 12 + length
+        offset += 12 + length
     return METERS_PER_UNIT

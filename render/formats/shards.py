@@ -1,4 +1,4 @@
-"""Shards of pictures on disk: each a tar file or a folder, there whole or not at all."""
+"""Shards of pictures on disk: each a tar file or a folder, complete or absent."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from handsim.files.atomic import atomic_write
 from render.formats.annotations.common import to_json
 
 INDEX: Final = "index.json"
-"""What a shard's folder says about its pictures: a list of records."""
+"""Index file of a shard's folder: a list of records of its pictures."""
 _NAME: Final = re.compile(r"shard-(\d{5,})(\.tar)?")
 
 
@@ -35,25 +35,25 @@ def shards_in(folder: Path, *, suffix: str = "") -> frozenset[int]:
 
 
 @contextmanager
-def one_sentence(place: Path, doing: str) -> Iterator[None]:
+def one_sentence(folder: Path, doing: str) -> Iterator[None]:
     """Tell trouble with the disk in one sentence.
 
     Raises:
-        HandSimError: In place of an OSError.
+        HandSimError: Instead of an OSError.
     """
     try:
         yield
     except OSError as error:
         reason = error.strerror or str(error)
         raise HandSimError(
-            f"{place}: {doing} failed: {reason}; shards that were finished before are whole, and the same "
+            f"{folder}: {doing} failed: {reason}; shards that were finished before are whole, and the same "
             "command goes on after them"
         ) from error
 
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """A temporary folder beside `path` that takes its name, and its place, when the block ends well."""
+    """A temporary folder beside `path` that replaces it when the block ends without an error."""
     temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
     clear_leftovers(path)
     temporary.mkdir(parents=True)
@@ -132,15 +132,15 @@ def load_index(folder: Path) -> list[dict[str, Any]]:
         DatasetError: The index is missing or damaged.
     """
     path = folder / INDEX
-    advice = f"delete the folder {folder.name} and render again"
+    remedy = f"delete the folder {folder.name} and render again"
     try:
         records = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror}; {advice}") from error
+        raise DatasetError(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
     except ValueError as error:
-        raise DatasetError(f"{path}: damaged: it holds no JSON; {advice}") from error
+        raise DatasetError(f"{path}: damaged: it holds no JSON; {remedy}") from error
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
-        raise DatasetError(f"{path}: damaged: it holds no list of records; {advice}")
+        raise DatasetError(f"{path}: damaged: it holds no list of records; {remedy}")
     return records
 
 

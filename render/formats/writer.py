@@ -2,7 +2,7 @@
 
 Frames go out in shards, so that rendering can be killed and go on: a shard is written under a temporary name
 and renamed when it is complete. Several processes may write different shards into one folder; when all are
-done, one of them calls `finish`, which merges what the format wants in one file.
+done, one of them calls `finish`, which merges what the format stores in one file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from render.frames.frame import RenderedFrame
 
 
 class FrameWriter(Protocol):
-    """What `open_writer` returns."""
+    """A writer of one format, as `open_writer` returns it."""
 
     def done(self) -> frozenset[int]:
         """Numbers of the shards that are complete."""
@@ -36,7 +36,7 @@ class FrameWriter(Protocol):
         """
 
     def finish(self) -> None:
-        """Merge what all complete shards say into the files that the format wants; may be called again.
+        """Merge all complete shards into the files that the format requires; may be called again.
 
         Raises:
             HandSimError: A shard is damaged, or the disk takes no more.

@@ -1,4 +1,4 @@
-"""What a rendered frame is: pictures, and the truth about all that is in them."""
+"""`RenderedFrame`: the pictures of one camera at one time, and their ground truth."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 PASSES: Final = ("rgb", "depth", "normals", "ids")
 """Kinds of pictures that can be asked for."""
 PARTS_A_HAND: Final = 32
-"""A pixel of bone b of hand h has part 1 + b + 32 h; 0 is no hand."""
+"""Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is not a hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pictures:
-    """The pictures of one frame; those that were not asked for are None."""
+    """The pictures of one frame; those that were not requested are None."""
 
     rgb: UInt8[np.ndarray, "H W 3"] | None = None
     """sRGB."""
@@ -33,12 +33,12 @@ class Pictures:
     parts: UInt8[np.ndarray, "H W"] | None = None
     """Bone of each pixel's hand, see `PARTS_A_HAND`."""
     instances: UInt8[np.ndarray, "H W"] | None = None
-    """1, 2.. for the hands in their order, then the bodies; 0 for the background.
+    """1, 2, ... for the hands in their order, then the bodies; 0 for the background.
 
-    A hand's forearm and markers are its own.
+    A hand's forearm and markers have the number of the hand.
     """
     markers: UInt8[np.ndarray, "H W"] | None = None
-    """1 + marker of each pixel, counted through the hands; 0 for no marker."""
+    """1 + marker of each pixel, counted over all hands; 0 for no marker."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,16 +46,17 @@ class HandTruth:
     """One hand of a frame."""
 
     shape: HandShape
-    """Whose hand; `shape.side` is which one."""
+    """Shape and side of the hand."""
     qpos: Float[np.ndarray, "27"]
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
     keypoints: Float[np.ndarray, "21 3"]
-    """See `render.frames.keypoints`; in the world [m]."""
+    """Keypoints in the world [m]; see `render.frames.keypoints`."""
     pixels: Float[np.ndarray, "21 2"]
-    """Their pixels, inside the picture or not; NaN where the lens cannot see them."""
+    """Pixels of the keypoints, inside the picture or not [px]; NaN where the lens cannot see them."""
     visible: Bool[np.ndarray, "21"]
-    """Whether each is in the picture, with nothing in front of its own digit."""
+    """Whether each keypoint is in the picture, with nothing in front of its own digit."""
     box: Float[np.ndarray, "4"]
-    """Left, top, width, height [px] of what is seen of the hand without its forearm; NaN where nothing is."""
+    """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     vertices: Float32[np.ndarray, "V 3"]
     """Skin in the world [m]."""
     marker_names: tuple[str, ...] = ()
@@ -65,36 +66,37 @@ class HandTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyTruth:
-    """One rigid thing of a frame."""
+    """One rigid body of a frame."""
 
     name: str
     T_world_body: Float[np.ndarray, "4 4"]
+    """Pose in the world [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedFrame:
-    """Pictures of one camera at one time, and all that is known of them."""
+    """Pictures of one camera at one time, and their ground truth."""
 
     number: int
-    """Of the take."""
+    """Number of the frame in the take."""
     time: float
-    """In the take [s]."""
+    """Time in the take [s]."""
     camera: Camera
     hands: tuple[HandTruth, ...]
     bodies: tuple[BodyTruth, ...]
     ideal: Pictures
-    """As a perfect sensor would have them."""
+    """Pictures of a perfect sensor."""
     noisy: Pictures
-    """Colors and depth as the sensor has them; None for what has no noise."""
+    """Colors and depth of the simulated sensors; None for those without noise."""
     points: Float[np.ndarray, "N 3"]
-    """What the optical system saw, in the world [m]."""
+    """Points that the optical system saw, in the world [m]."""
     labels: Int[np.ndarray, "N"]
-    """Place of each point's name in `label_names`; -1 for what is no marker."""
+    """Index of each point's label in `label_names`; -1 for a ghost."""
     label_names: tuple[str, ...]
     choices: Mapping[str, Any]
     """Every random choice that made the pictures, as JSON."""
 
     @property
     def key(self) -> str:
-        """The frame's name in files: camera and number."""
+        """Name of the frame in files: camera and number."""
         return f"{self.camera.name}_{self.number:06d}"

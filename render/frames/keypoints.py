@@ -1,7 +1,7 @@
-"""The 21 keypoints of a hand: wrist, and four a digit from its first joint to its tip.
+"""The 21 keypoints of a hand: the wrist, and four per digit from its first joint to its tip.
 
-The order is FreiHAND's and MediaPipe's: wrist, thumb, index, middle, ring, little. Joints are the
-centers that the hand turns about; a tip is the far end of the last bone, on the skin.
+The order is FreiHAND's and MediaPipe's: wrist, thumb, index, middle, ring, little. Joints are centers
+of rotation; a tip is the far end of the last bone, on the skin.
 """
 
 from __future__ import annotations
@@ -30,11 +30,15 @@ SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
     for digit in range(len(DIGITS))
     for part in range(4)
 )
-"""Pairs of keypoints that a line joins."""
+"""Pairs of keypoints that are joined by a line."""
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
     """Keypoints in the world [m].
+
+    Args:
+        model: The hand.
+        qpos: Poses.
 
     Raises:
         ArgumentError: `qpos` is not (T, 27) or not finite.

@@ -59,18 +59,18 @@ def titled(picture: Picture, title: str) -> Picture:
     band = round(_TEXT_HEIGHT * 2.2)
     result = pad(picture, (band, 0), (0, 0))
     width = text_width(title)
-    place = ((picture.shape[1] - width) // 2, band - _PADDING // 2)
-    _write(result, title, place, _INK)
+    origin = ((picture.shape[1] - width) // 2, band - _PADDING // 2)
+    _write(result, title, origin, _INK)
     return result
 
 
 def captioned(picture: Picture, captions: Sequence[tuple[float, str]]) -> Picture:
-    """The picture with a line of captions below it, each centered on its own place across [pixels]."""
+    """The picture with a line of captions below it, each centered on its own column [px]."""
     band = round(_TEXT_HEIGHT * 2.0)
     result = pad(picture, (0, band), (0, 0))
     for center, caption in captions:
-        place = (round(center - text_width(caption) / 2), picture.shape[0] + round(_TEXT_HEIGHT * 1.2))
-        _write(result, caption, place, _INK)
+        origin = (round(center - text_width(caption) / 2), picture.shape[0] + round(_TEXT_HEIGHT * 1.2))
+        _write(result, caption, origin, _INK)
     return result
 
 
@@ -80,12 +80,12 @@ def with_names(
     names: Sequence[str],
     colors: Float[np.ndarray, "M 3"] | None = None,
 ) -> Picture:
-    """The picture between two columns of names, a thin line from each name to its place in the picture.
+    """The picture between two columns of names, with a thin line from each name to its point in the picture.
 
     Args:
-        picture: What the names are about.
-        pixels: Places in it, x right and y down; NaN rows get no name.
-        names: One a place.
+        picture: The picture.
+        pixels: Points in it, x right and y down [px]; NaN rows get no name.
+        names: One per point.
         colors: sRGB in [0, 1] of each name; ink when not given.
     """
     shown = np.flatnonzero(np.isfinite(pixels).all(axis=1))
@@ -113,14 +113,14 @@ def with_names(
     return result
 
 
-def spread_out(wanted: Float[np.ndarray, "N"], step: float, low: float, high: float) -> NDArray[np.float64]:
-    """Ascending places near the wanted ascending ones, at least `step` apart, between `low` and `high`.
+def spread_out(desired: Float[np.ndarray, "N"], step: float, low: float, high: float) -> NDArray[np.float64]:
+    """Ascending heights near the desired ones, at least `step` apart, between `low` and `high` [px].
 
-    They are the nearest such places in the sense of least squares, by pooling neighbors that meet.
+    They are the least-squares solution, by pooling adjacent violators.
     """
-    slots = step * np.arange(len(wanted))
-    blocks: list[tuple[float, int]] = []  # mean of wanted - slot, how many
-    for offset in wanted - slots:
+    slots = step * np.arange(len(desired))
+    blocks: list[tuple[float, int]] = []  # mean of desired - slot, how many
+    for offset in desired - slots:
         mean, count = float(offset), 1
         while blocks and blocks[-1][0] > mean:
             before, size = blocks.pop()
@@ -128,8 +128,8 @@ def spread_out(wanted: Float[np.ndarray, "N"], step: float, low: float, high: fl
         blocks.append((mean, count))
     means = np.repeat([mean for mean, _ in blocks], [count for _, count in blocks]) if blocks else slots
     most = max(low, high - (slots[-1] if len(slots) else 0.0))
-    places: NDArray[np.float64] = np.clip(means, low, most) + slots
-    return places
+    heights: NDArray[np.float64] = np.clip(means, low, most) + slots
+    return heights
 
 
 def pad(picture: Picture, rows: tuple[int, int], columns: tuple[int, int]) -> Picture:
@@ -150,5 +150,5 @@ def _scale() -> float:
     return _TEXT_HEIGHT / 32.0
 
 
-def _write(picture: Picture, text: str, place: tuple[int, int], ink: tuple[int, ...]) -> None:
-    cv2.putText(picture, text, place, _FONT, _scale(), ink, 2, cv2.LINE_AA)
+def _write(picture: Picture, text: str, origin: tuple[int, int], ink: tuple[int, ...]) -> None:
+    cv2.putText(picture, text, origin, _FONT, _scale(), ink, 2, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""A sheet of many pictures at one glance: keypoints drawn in, depth colored beside."""
+"""A sheet of rendered frames, with keypoints and colored depth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _GAP: Final = 6  # [px]
 _FRACTION_BITS: Final = 4  # OpenCV draws between pixels in sixteenths
-_NOTHING: Final = tuple(round(255 * level) for level in BACKGROUND)
+_EMPTY: Final = tuple(round(255 * level) for level in BACKGROUND)
 
 
 def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: int = 320) -> Picture:
@@ -32,8 +32,8 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
 
     Args:
         frames: At least one; a frame without colors shows its depth alone.
-        columns: Frames a row.
-        width: Of each picture [px]; smaller ones stay as they are.
+        columns: Frames per row.
+        width: Width of each picture [px]; smaller ones keep theirs.
 
     Raises:
         HandSimError: There are no frames, or one has neither colors nor depth.
@@ -44,7 +44,7 @@ def contact_sheet(frames: Sequence[RenderedFrame], *, columns: int = 3, width: i
     height = max(cell.shape[0] for cell in cells)
     across = max(cell.shape[1] for cell in cells)
     cells = [_padded(cell, height, across) for cell in cells]
-    blank = np.broadcast_to(np.array(_NOTHING, dtype=np.uint8), cells[0].shape)
+    blank = np.broadcast_to(np.array(_EMPTY, dtype=np.uint8), cells[0].shape)
     columns = min(columns, len(cells))
     cells += [blank] * (math.ceil(len(cells) / columns) * columns - len(cells))
     rows = [side_by_side(cells[start : start + columns]) for start in range(0, len(cells), columns)]
@@ -55,9 +55,9 @@ def draw_keypoints(picture: Picture, hands: Sequence[HandTruth], *, scale: float
     """The picture with the hands' skeletons in it, in the digits' colors.
 
     Args:
-        picture: Left as it is.
-        hands: Their `pixels` are drawn where they are known.
-        scale: Pixels of this picture for one of the camera's.
+        picture: The picture; not changed.
+        hands: Hands whose `pixels` are drawn where they are known.
+        scale: Pixels of this picture per pixel of the camera.
     """
     drawn = np.ascontiguousarray(picture).copy()
     colors = np.rint(255 * bone_colors()).astype(int)
@@ -66,30 +66,30 @@ def draw_keypoints(picture: Picture, hands: Sequence[HandTruth], *, scale: float
     style = {"lineType": cv2.LINE_AA, "shift": _FRACTION_BITS}
     for hand in hands:
         known = np.isfinite(hand.pixels).all(axis=1) & (np.abs(np.nan_to_num(hand.pixels)) < 1e5).all(axis=1)
-        places = (
+        pixels = (
             np.rint(unit * (scale * np.nan_to_num(hand.pixels) - CENTER)).astype(int).clip(-(2**24), 2**24)
         )
         for start, end in SKELETON:
             if known[start] and known[end]:
-                cv2.line(drawn, places[start].tolist(), places[end].tolist(), inks[end], 1, **style)
-        for keypoint, place in enumerate(places.tolist()):
+                cv2.line(drawn, pixels[start].tolist(), pixels[end].tolist(), inks[end], 1, **style)
+        for keypoint, pixel in enumerate(pixels.tolist()):
             if known[keypoint]:
                 thickness = -1 if hand.visible[keypoint] else 1
-                cv2.circle(drawn, place, 3 * unit, inks[keypoint], thickness, **style)
+                cv2.circle(drawn, pixel, 3 * unit, inks[keypoint], thickness, **style)
     return drawn
 
 
 def colored_depth(depth: Float32[np.ndarray, "H W"]) -> Picture:
     """Depth as colors, the nearest red, the farthest blue; background where there is nothing."""
-    something = depth > 0.0
+    present = depth > 0.0
     picture: NDArray[np.uint8] = np.empty((*depth.shape, 3), dtype=np.uint8)
-    picture[:] = _NOTHING
-    if something.any():
-        near, far = depth[something].min(), depth[something].max()
+    picture[:] = _EMPTY
+    if present.any():
+        near, far = depth[present].min(), depth[present].max()
         share = (far - depth) / max(far - near, 1e-9)
         levels = np.rint(255 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
         colors = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]
-        picture[something] = colors[something]
+        picture[present] = colors[present]
     return picture
 
 

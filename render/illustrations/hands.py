@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from render.illustrations.captions import Picture
 
 FINGERS_UP: Final = np.array([1.0, 0.0, 0.0])
-# Where the camera looks, in the wrist frame of a right hand; a left hand's is mirrored.
+# Directions of view in the wrist frame of a right hand; mirrored for a left hand.
 SIDES_OF_HAND: Final[Mapping[str, tuple[float, float, float]]] = {
     "back": (0.0, 0.0, -1.0),
     "palm": (0.0, 0.0, 1.0),
@@ -55,32 +55,32 @@ def draw_row(
     """Hands side by side at one scale, wrists on one line, each with its caption.
 
     Args:
-        hands: Caption, model and pose of each hand; the wrist's place in the pose is not used.
-        direction: Where the camera looks.
+        hands: Caption, model and pose of each hand; the wrist's position in the pose is not used.
+        direction: Direction of view.
         covering: Bare skin or a dark glove.
-        width: Of the picture [pixels].
+        width: Width of the picture [px].
     """
     ahead = np.asarray(direction, dtype=np.float64)
     right = np.cross(ahead, FINGERS_UP) / np.linalg.norm(np.cross(ahead, FINGERS_UP))
-    posed, centers, reach = [], [], 0.0
+    posed, centers, extent = [], [], 0.0
     for _, model, qpos in hands:
         at_origin = np.array(qpos)
         at_origin[:3] = 0.0
         vertices = PosedHand(model, at_origin).vertices()
         across = vertices @ right
-        at_origin[:3] = right * (reach - across.min())
+        at_origin[:3] = right * (extent - across.min())
         at_origin[0] -= vertices[:, 0].min()
         centers.append(at_origin[:3] + right * (across.min() + across.max()) / 2)
-        reach += float(np.ptp(across)) + _GAP
+        extent += float(np.ptp(across)) + _GAP
         posed.append(PosedHand(model, at_origin, covering=covering))
     points = np.concatenate([hand.vertices() for hand in posed])
-    tall = float(np.ptp(points[:, 0])) / (reach - _GAP)
+    tall = float(np.ptp(points[:, 0])) / (extent - _GAP)
     size = (width, round(width * min(1.0, tall) * 1.04))
-    # A narrow view from far away: at one scale, and without a look at the outer hands' sides.
+    # A narrow view from far away shows all hands at one scale, and not the sides of the outer ones.
     view = view_along(ahead, FINGERS_UP, points, size, field_of_view=np.deg2rad(4.0), margin=0.015)
     picture = render_rgb(HandScene(view, tuple(posed)), size)
-    places = view.project(np.array(centers), size)[:, 0]
-    return captioned(picture, [(float(x), hand[0]) for x, hand in zip(places, hands, strict=True)])
+    pixels = view.project(np.array(centers), size)[:, 0]
+    return captioned(picture, [(float(x), hand[0]) for x, hand in zip(pixels, hands, strict=True)])
 
 
 def draw_sizes() -> Picture:
@@ -114,7 +114,7 @@ def draw_glove(
     Args:
         fit: The hand in the glove.
         sides: Some of `SIDES_OF_HAND`.
-        height: Of the hand's pictures [pixels].
+        height: Height of the hand's pictures [px].
     """
     colors = marker_colors(fit.layout)
     hand = PosedHand(fit, join_qpos(gesture("spread")[None])[0], "glove")
@@ -144,7 +144,14 @@ def draw_camera(
     *,
     size: tuple[int, int] = (1100, 900),
 ) -> tuple[Picture, Bool[np.ndarray, "M"]]:
-    """What one camera of a rig has before it, zoomed in: seen markers green, hidden ones as red rings.
+    """The view of one camera of a rig, zoomed in: seen markers green, hidden ones as red rings.
+
+    Args:
+        fit: The hand in the glove.
+        qpos: Its pose.
+        rig: The cameras.
+        camera: Index of the camera.
+        size: Width and height of the picture without names [px].
 
     Returns:
         The picture, and which markers this camera sees.
@@ -171,7 +178,9 @@ def zoom(
 ) -> float:
     """Vertical opening angle [rad] at which a camera `towards` away from the points just holds them."""
     angle = 0.2
-    for _ in range(20):  # the nearest place for an angle is known; find the angle whose place is the camera's
+    for _ in range(
+        20
+    ):  # the nearest position for an angle is known; find the angle whose position is the camera's
         view = view_along(towards, up, points, size, field_of_view=angle)
         distance = float(np.linalg.norm(points.mean(axis=0) - view.T_world_camera[:3, 3]))
         angle = 2 * np.arctan(np.tan(angle / 2) * distance / float(np.linalg.norm(towards)))
@@ -186,14 +195,14 @@ def draw_labels(
     *,
     size: tuple[int, int] = (640, 800),
 ) -> Picture:
-    """A frame's points as they come, and beside them with the names they were given.
+    """A frame's points without labels, and beside them with their labels.
 
     Args:
-        hand: The hand behind the points, drawn faintly on the named side.
+        hand: The hand behind the points, drawn faintly on the labeled side.
         points: All points of the frame [m], ghosts among them.
         labels: Marker of each point in `layout`, -1 for a ghost.
         layout: The glove.
-        size: Of one side without its names [pixels].
+        size: Width and height of one side without names [px].
     """
     ghost = labels < 0
     palette = np.concatenate([marker_colors(layout), [HIDDEN_COLOR]])
@@ -227,6 +236,6 @@ def marker_colors(layout: MarkerLayout) -> Float[np.ndarray, "M 3"]:
 
 
 def byte_color(color: tuple[float, float, float]) -> tuple[int, int, int]:
-    """The color with 0 to 255 a channel."""
+    """The color with 0 to 255 per channel."""
     red, green, blue = (round(255 * level) for level in color)
     return red, green, blue

@@ -34,7 +34,7 @@ _ROUGHNESS: Final = {"skin": 0.62, "glove": 0.85}
 
 
 def bone_colors() -> Float[np.ndarray, "L 3"]:
-    """One color a digit, and one for the palm, in the order of `topology.BONES`."""
+    """One color (sRGB) per digit, and one for the palm, in the order of `topology.BONES`."""
     colors = [_PALM_COLOR if bone.digit < 0 else _DIGIT_COLORS[bone.digit] for bone in BONES]
     return np.array(colors)
 

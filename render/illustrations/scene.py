@@ -29,10 +29,10 @@ _BALL_LEVEL: Final = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera: its pose and how wide it sees.
+    """A camera: its pose and its field of view.
 
     Raises:
-        HandSimError: The pose is not (4, 4), or the angle is no camera's.
+        HandSimError: The pose is not (4, 4), or the angle is out of range.
     """
 
     T_world_camera: Float[np.ndarray, "4 4"]
@@ -87,7 +87,7 @@ class PosedHand:
     hand: GloveFit | HandModel
     """In a glove whose markers are drawn, or without one."""
     qpos: Float[np.ndarray, "27"]
-    """Wrist position [m], wrist orientation (wxyz), hinge angles [rad]."""
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
     covering: Covering = "skin"
     """Bare skin or a dark glove."""
     marker_colors: Float[np.ndarray, "M 3"] | tuple[float, float, float] = MARKER_COLOR
@@ -96,7 +96,7 @@ class PosedHand:
     def __post_init__(self) -> None:
         qpos = check_array("qpos", self.qpos, (NUM_QPOS,))
         if qpos.ndim != 1:
-            raise HandSimError(f"qpos has shape {qpos.shape}, expected ({NUM_QPOS},): one pose a hand")
+            raise HandSimError(f"qpos has shape {qpos.shape}, expected ({NUM_QPOS},): one pose per hand")
         object.__setattr__(self, "qpos", qpos)
 
     @property
@@ -119,7 +119,7 @@ class PosedHand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandScene:
-    """All that one picture shows."""
+    """The content of one picture."""
 
     view: View
     hands: tuple[PosedHand, ...] = ()
@@ -140,12 +140,12 @@ def view_along(
     """The nearest view in a given direction that has all points in the picture.
 
     Args:
-        direction: Where the camera looks, in the world.
-        up: What shall point up in the picture.
-        points: What must be seen [m].
-        size: Width and height of the picture [pixels].
+        direction: Direction of view in the world.
+        up: Direction in the world that points up in the picture.
+        points: Points that must be in the picture [m].
+        size: Width and height of the picture [px].
         field_of_view: Full vertical opening angle [rad].
-        margin: Room left free on each side [share of the picture].
+        margin: Free margin on each side [share of the picture].
     """
     ahead = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     right = np.cross(ahead, up)

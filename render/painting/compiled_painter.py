@@ -1,7 +1,7 @@
-"""Colors by the z-buffer and the shading of our own: quick on any processor, and without OpenGL.
+"""Colors by our own compiled z-buffer and shading: fast on any processor, and without OpenGL.
 
-A software OpenGL shades triangles in blocks of pixels, most of which a fine mesh throws away; here each pixel
-is shaded once, after its nearest face is known, and four times only where one surface ends before another.
+A software OpenGL shades triangles in blocks of pixels, most of which are discarded for a fine mesh; here each
+pixel is shaded once, after its nearest face is known, and four times only at edges of a surface.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from render.cameras.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.rasterizer import nearest_faces, project
-from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, light_up, read_texels
+from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, read_texels, shade
 from render.painting.shadow_map import shadow_map
 from render.scenery.lights import Lighting
 
@@ -55,7 +55,7 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     shadows = shadow_map(vertices[:, 3:], faces, lamps[0, :3])
     sums = np.zeros((height, width, 4), dtype=np.float32)
     for mesh in meshes:
-        _shade(nearness, first, *mesh, lamps, around, *shadows, TO_LINEAR, TO_DISPLAY, sums)
+        _shade_surface(nearness, first, *mesh, lamps, around, *shadows, TO_LINEAR, TO_DISPLAY, sums)
     painted: NDArray[np.uint8] = np.rint(63.75 * sums).astype(np.uint8)
     return painted
 
@@ -82,7 +82,7 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
 
 
 def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
-    """See `shading.light_up`; lamps in one direction share a row."""
+    """Rows for `shading.shade`; lamps in one direction share a row."""
     rows: dict[tuple[float, float, float], NDArray[np.float64]] = {}
     for number, lamp in enumerate(lighting.lamps):
         towards = np.array(lamp.direction) / np.linalg.norm(lamp.direction)
@@ -95,7 +95,7 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
 
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _shade(
+def _shade_surface(
     nearness: Any,
     first: Any,
     begin: int,
@@ -112,7 +112,25 @@ def _shade(
     to_display: Any,
     sums: Any,
 ) -> None:
-    """Add one surface's colors, and how many of four samples a pixel it fills."""
+    """Add one surface's colors, and how many of four samples per pixel it fills.
+
+    Args:
+        nearness: One over the depth (2 H, 2 W) [1/m].
+        first: Nearest face of each sample (2 H, 2 W), counted over all surfaces; -1 for none.
+        begin: Number of this surface's first face.
+        faces: Triangles (F, 3).
+        vertices: Rows (V, 14) of `_Mesh.vertices`.
+        texels: Texture (h, w, 8), empty for none; see `Material.texels`.
+        finish: Linear color (3), roughness and glow.
+        lamps: Rows (L, 9) of `_lamp_table`.
+        ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
+        to_map: `ShadowMap.to_map` (3, 4).
+        nearest: `ShadowMap.nearest` (N, N) [m].
+        bias: `ShadowMap.bias` [m].
+        to_linear: `shading.TO_LINEAR` (256,).
+        to_display: `shading.TO_DISPLAY` (2048,).
+        sums: Sums of display colors and samples (H, W, 4), added to.
+    """
     spot, light = np.empty(SPOT), np.empty(3)
     for row in range(len(sums)):
         for column in range(sums.shape[1]):
@@ -125,12 +143,12 @@ def _shade(
                     if not 0 <= face < len(faces):
                         continue
                     x, y = (1.0, 1.0) if smooth else (j + 0.5, i + 0.5)
-                    _look(vertices, faces, face, 2 * column + x, 2 * row + y, spot)
+                    _interpolate(vertices, faces, face, 2 * column + x, 2 * row + y, spot)
                     spot[14:18] = finish[:4]
                     if len(texels):
                         read_texels(texels, to_linear, spot)
-                        _bend(vertices, faces, face, spot)
-                    light_up(spot, finish[4], lamps, ambient, to_map, nearest, bias, light)
+                        _apply_normal_map(vertices, faces, face, spot)
+                    shade(spot, finish[4], lamps, ambient, to_map, nearest, bias, light)
                     share = 4.0 if smooth else 1.0
                     for k in range(3):
                         sums[row, column, k] += share * display(spot[9 + k] * light[k], to_display)
@@ -139,7 +157,16 @@ def _shade(
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _samples(nearness: Any, first: Any, begin: int, end: int, row: int, column: int) -> Any:
-    """How many of a pixel's samples a surface fills, and whether they are all and close together."""
+    """How many of a pixel's four samples a surface fills, and whether it fills all with similar depths.
+
+    Args:
+        nearness: One over the depth (2 H, 2 W) [1/m].
+        first: Nearest face of each sample (2 H, 2 W).
+        begin: Number of the surface's first face.
+        end: Number after its last face.
+        row: Row of the pixel.
+        column: Column of the pixel.
+    """
     count, most, least = 0, 0.0, np.inf
     for i in range(2):
         for j in range(2):
@@ -151,8 +178,17 @@ def _samples(nearness: Any, first: Any, begin: int, end: int, row: int, column: 
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _look(vertices: Any, faces: Any, face: int, x: float, y: float, spot: Any) -> None:
-    """Write what a face shows at a place of the doubled picture: the means of its corners' rows."""
+def _interpolate(vertices: Any, faces: Any, face: int, x: float, y: float, spot: Any) -> None:
+    """Write the surface point of a face behind a pixel: its corners' rows, interpolated with perspective.
+
+    Args:
+        vertices: Rows (V, 14) of `_Mesh.vertices`.
+        faces: Triangles (F, 3).
+        face: Index of the face.
+        x: Column in the doubled picture [px].
+        y: Row in the doubled picture [px].
+        spot: See `shading.SPOT`; columns 3 to 13 are written.
+    """
     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
     ax, ay = vertices[a, 0], vertices[a, 1]
     bx, by = vertices[b, 0] - ax, vertices[b, 1] - ay
@@ -166,12 +202,19 @@ def _look(vertices: Any, faces: Any, face: int, x: float, y: float, spot: Any) -
     first, second, third = first * scale, second * scale, third * scale
     for i in range(3, 14):
         spot[i] = first * vertices[a, i] + second * vertices[b, i] + third * vertices[c, i]
-    _shorten_normal(spot)
+    _normalize(spot)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _bend(vertices: Any, faces: Any, face: int, spot: Any) -> None:
-    """Turn a normal by the texture's, whose first axis is where u grows."""
+def _apply_normal_map(vertices: Any, faces: Any, face: int, spot: Any) -> None:
+    """Replace a normal (of `spot`) by the texture's, whose first axis is the direction in which u grows.
+
+    Args:
+        vertices: Rows (V, 14) of `_Mesh.vertices`.
+        faces: Triangles (F, 3).
+        face: Index of the face.
+        spot: See `shading.SPOT`; the normal is written.
+    """
     a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
     bu, bv = vertices[b, 12] - vertices[a, 12], vertices[b, 13] - vertices[a, 13]
     cu, cv = vertices[c, 12] - vertices[a, 12], vertices[c, 13] - vertices[a, 13]
@@ -190,11 +233,12 @@ def _bend(vertices: Any, faces: Any, face: int, spot: Any) -> None:
     spot[6] = across * tx + up * (ny * tz - nz * ty) + out * nx
     spot[7] = across * ty + up * (nz * tx - nx * tz) + out * ny
     spot[8] = across * tz + up * (nx * ty - ny * tx) + out * nz
-    _shorten_normal(spot)
+    _normalize(spot)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _shorten_normal(spot: Any) -> None:
+def _normalize(spot: Any) -> None:
+    """Scale the normal of a surface point (see `shading.SPOT`) to unit length."""
     scale = 1.0 / np.sqrt(spot[6] * spot[6] + spot[7] * spot[7] + spot[8] * spot[8])
     for i in range(6, 9):
         spot[i] *= scale

@@ -1,4 +1,4 @@
-"""What is drawn of a hand or a thing: its surface for depth and ids, and what colors it."""
+"""Hands and rigid bodies as surfaces with ids and materials."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _BALL_LEVEL: Final = 2
-_BODY_BALLS: Final = 0.0032  # [m] radius of the markers of things, the paper's 6.4 mm across
+_BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
 
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
-    """How one hand looks."""
+    """Appearance of one hand."""
 
     skin: SkinLook
     forearm: Forearm
     glove: GloveLook | None
-    """The marker glove that it wears, with its markers; None for the bare hand."""
+    """The marker glove on it, drawn with its markers; None for a bare hand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class Drawn:
     """Factors on the material's color, linear."""
     uv: Float32[np.ndarray, "V 2"] | None
     material: Callable[[], Material]
-    """The same every time; whoever wants no colors needs none."""
+    """Returns the same material every time; only called for colors, because textures take time."""
 
 
 def sample_people(
@@ -67,10 +67,10 @@ def sample_people(
     """Hands of one person: both have the same skin and the same sleeves.
 
     Args:
-        count: How many hands.
-        glove: Whether they wear the marker glove.
-        tones: Between which typology angles the skin is drawn, see `render.skin.look`.
-        rng: Where the choices come from.
+        count: Number of hands.
+        glove: Whether the hands wear marker gloves.
+        tones: Range of typology angles of the skin [deg]; see `render.skin.look`.
+        rng: Source of the random choices.
     """
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
     cloth = sample_glove_look(rng=rng) if glove else None
@@ -78,12 +78,12 @@ def sample_people(
 
 
 class HandFigure:
-    """One hand as it is drawn; its texture is painted once.
+    """One hand to draw; its texture is painted once.
 
     Args:
         fit: The hand in its glove.
-        look: How it looks.
-        first_marker: Markers of the hands before it.
+        look: Appearance of the hand.
+        first_marker: Number of markers of the hands before it.
     """
 
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
@@ -98,7 +98,7 @@ class HandFigure:
 
         Args:
             qpos: The pose.
-            number: The hand's place among those in the picture.
+            number: Index of the hand among those in the picture.
         """
         skin, first_part = self._skin.posed(qpos), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
@@ -139,11 +139,11 @@ class HandFigure:
 
 
 class BodyFigure:
-    """One rigid thing as it is drawn.
+    """One rigid body to draw.
 
     Args:
-        body: Which.
-        color: Of its surface, sRGB in [0, 1].
+        body: The body.
+        color: Color of its surface, sRGB in [0, 1].
     """
 
     def __init__(self, body: ShownBody, color: tuple[float, float, float]) -> None:
@@ -153,17 +153,22 @@ class BodyFigure:
             self._normals = vertex_normals(body.thing.vertices, body.thing.faces)
 
     def drawn(self, T_world_body: Float[np.ndarray, "4 4"], instance: int) -> list[Drawn]:
-        """Its surface, where that is known, and its markers."""
-        rotation, place, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
+        """Its surface, where that is known, and its markers.
+
+        Args:
+            T_world_body: Pose of the body [m].
+            instance: Number of the body among the instances of the picture.
+        """
+        rotation, position, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
         thing = self.body.thing
         if thing is not None:
             ids = [np.full(len(thing.faces), number, dtype=np.uint8) for number in (0, instance, 0)]
-            vertices = thing.vertices @ rotation.T + place
+            vertices = thing.vertices @ rotation.T + position
             triangles = Triangles(vertices, thing.faces, self._normals @ rotation.T, *ids)
             white = np.ones((len(vertices), 4), dtype=np.float32)
             drawn.append(Drawn(triangles, white, None, self._material))
         if len(self.body.markers):
-            balls = sphere_surface(self.body.markers @ rotation.T + place, _BODY_BALLS, level=_BALL_LEVEL)
+            balls = sphere_surface(self.body.markers @ rotation.T + position, _BODY_BALLS, level=_BALL_LEVEL)
             zeros = np.zeros(len(balls.faces), dtype=np.uint8)
             drawn.append(_drawn_balls(balls, zeros, zeros + np.uint8(instance), zeros))
         return drawn
@@ -184,6 +189,6 @@ def _drawn_balls(
 def digit_of_part(parts: UInt8[np.ndarray, "*shape"], number: int) -> NDArray[np.int64]:
     """Digit of each pixel that is hand `number`'s; -1 for its palm and forearm, -2 for all else."""
     digits = np.array([bone.digit for bone in BONES] + [-1] * (PARTS_A_HAND - NUM_BONES))
-    place = parts.astype(np.int64) - 1 - PARTS_A_HAND * number
-    mine = (place >= 0) & (place < PARTS_A_HAND)
-    return np.where(mine, digits[np.clip(place, 0, PARTS_A_HAND - 1)], -2)
+    index = parts.astype(np.int64) - 1 - PARTS_A_HAND * number
+    mine = (index >= 0) & (index < PARTS_A_HAND)
+    return np.where(mine, digits[np.clip(index, 0, PARTS_A_HAND - 1)], -2)

@@ -1,4 +1,4 @@
-"""The one door to OpenGL: chooses EGL before pyrender is imported, and keeps one renderer a process."""
+"""Import of pyrender with EGL, and one off-screen renderer per process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def load_pyrender() -> Any:
         raise HandSimError(
             f"drawing needs pyrender, and {error}; run `pip install pyrender-maintained`"
         ) from error
-    except Exception as error:  # PyOpenGL raises whatever it stumbles over
+    except Exception as error:  # PyOpenGL raises errors of many types
         raise _no_driver(error) from error
     if pyrender.__version__ == _BROKEN_PYRENDER:
         raise HandSimError(
@@ -36,12 +36,12 @@ def load_pyrender() -> Any:
 
 
 def offscreen_renderer(width: int, height: int) -> Any:
-    """This process's renderer, set to a picture size [pixels].
+    """This process's renderer, set to a picture size [px].
 
     EGL contexts fail when they are made again and again, so there is one, kept until the process ends.
 
     Raises:
-        HandSimError: There is no OpenGL driver, or the size is no picture's.
+        HandSimError: There is no OpenGL driver, or the size is out of range.
     """
     if not (1 <= width <= 8192 and 1 <= height <= 8192):
         raise HandSimError(f"picture size is {width} x {height}, expected 1 to 8192 pixels each way")
@@ -55,7 +55,7 @@ def _renderer_of(_process: int) -> Any:
     pyrender = load_pyrender()
     try:
         return pyrender.OffscreenRenderer(64, 64)
-    except Exception as error:  # PyOpenGL raises whatever it stumbles over
+    except Exception as error:  # PyOpenGL raises errors of many types
         raise _no_driver(error) from error
 
 

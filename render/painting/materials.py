@@ -1,4 +1,4 @@
-"""What surfaces look like: skin, glove and markers. Colors are sRGB in [0, 1]."""
+"""`Material`, how a surface reflects light, and the materials of skin, markers and rigid bodies."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from render.skin.texture import SkinTexture
 
 MARKER_COLOR: Final = (0.98, 0.98, 1.0)
-_FOLDS: Final = 0.85  # a lamp that shines into a fold lights it up in part
+_FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light folds in part
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Material:
-    """How a surface sends back light: the microfacet model of glTF 2.0, without metals."""
+    """How a surface reflects light: the microfacet model of glTF 2.0, without metals."""
 
     color: Float[np.ndarray, "3"]
     """Linear light."""
     roughness: float
-    """0 a mirror, 1 chalk."""
+    """From 0 (mirror) to 1 (chalk)."""
     glow: float = 0.0
-    """Share of its color that it sends out by itself."""
+    """Emitted light, as a share of its color."""
     texels: UInt8[np.ndarray, "H W 8"] | None = None
     """Factors on the above, the top row first: sRGB, roughness (255 for 1), normals over the surface's own
     (0 for -1, 255 for 1) in the axes along u and normal x that, and nothing."""
@@ -40,13 +40,13 @@ def linear(color: Float[np.ndarray, "*batch 3"] | tuple[float, float, float]) ->
 
 
 def plain_material(color: tuple[float, float, float]) -> Material:
-    """A thing of one color, such as plastic."""
+    """A surface of one color, such as plastic."""
     return Material(linear(color), 0.5)
 
 
 @functools.cache
 def ball_material() -> Material:
-    """Markers, colored by vertex; they glow a little, so that no shadow swallows them."""
+    """Markers, colored by vertex; they glow a little, to stay visible in shadows."""
     return Material(np.ones(3), 0.45, glow=0.2)
 
 
@@ -58,7 +58,7 @@ def skin_material(texture: SkinTexture) -> Material:
 
 
 def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:
-    """Vertex colors for `DrawnSkin.shade`: red light finds its way through flesh into the folds."""
+    """Vertex colors for `DrawnSkin.shade`: red light passes through flesh into the folds."""
     colors = np.ones((len(shade), 4), dtype=np.float32)
     colors[:, :3] = (1.0 - _FOLDS * (1.0 - shade))[:, None] ** np.array([0.8, 1.0, 1.05], dtype=np.float32)
     return colors

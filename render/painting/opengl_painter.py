@@ -1,4 +1,4 @@
-"""Colors by OpenGL through pyrender: quick where there is a graphics card."""
+"""Colors by OpenGL through pyrender: fast where there is a graphics card."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> 
     """See `render.painting.painter.paint`.
 
     Raises:
-        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+        HandSimError: Drawing is impossible on this machine; the message says what to install.
     """
     pyrender = load_pyrender()
     renderer = offscreen_renderer(*camera.size)
@@ -54,17 +54,17 @@ def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> 
 
 @functools.lru_cache(maxsize=16)
 def pyrender_material(material: Material) -> Any:
-    """A material for pyrender; kept, so that textures go to the card once.
+    """A material for pyrender; cached, so that textures are uploaded once.
 
     Raises:
-        HandSimError: Drawing is impossible on this machine; the sentence says what to install.
+        HandSimError: Drawing is impossible on this machine; the message says what to install.
     """
     pyrender, textures = load_pyrender(), {}
     if material.texels is not None:
         # No smaller copies of the texture: they would mix tiles that are no neighbors on the hand.
         sampler = pyrender.Sampler(magFilter=_GL_LINEAR, minFilter=_GL_LINEAR)
         rough = np.zeros((*material.texels.shape[:2], 3), dtype=np.uint8)
-        rough[..., 0] = material.texels[..., 3]  # its shader looks for roughness in red and metal in green
+        rough[..., 0] = material.texels[..., 3]  # its shader reads roughness from red and metal from green
         sources = {
             "baseColorTexture": np.ascontiguousarray(material.texels[..., :3]),
             "normalTexture": np.ascontiguousarray(material.texels[..., 4:7]),

@@ -1,4 +1,4 @@
-"""Colors of what is in a picture, with how much of each pixel it covers."""
+"""Colors and coverage of surfaces by either painter, and pictures over backgrounds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Painter = Literal["compiled", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
 _WHITE: Final = 255.0
-_STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL begin anew
+_STEP: Final = 64  # [px] that windows grow by: every new size makes OpenGL reallocate its buffers
 
 
 def choose_painter(choice: PainterChoice) -> Painter:
@@ -36,16 +36,16 @@ def choose_painter(choice: PainterChoice) -> Painter:
 def paint(
     camera: Camera, drawn: Sequence[Drawn], lighting: Lighting, painter: Painter = "compiled"
 ) -> UInt8[np.ndarray, "H W 4"]:
-    """Colors before black, sRGB, and in the fourth channel how much of each pixel is covered.
+    """Colors over black (sRGB), and in the fourth channel the covered share of each pixel.
 
     Args:
         camera: A pinhole camera.
-        drawn: What there is to see.
-        lighting: In the camera's axes.
-        painter: Who paints; both give nearly the same picture.
+        drawn: The surfaces.
+        lighting: Light in the camera's axes.
+        painter: What paints; both give nearly the same picture.
 
     Raises:
-        HandSimError: OpenGL is wanted and missing on this machine; the sentence says what to install.
+        HandSimError: OpenGL is requested and missing on this machine; the message says what to install.
     """
     every = {"compiled": paint_compiled, "opengl": paint_opengl}[painter]
     width, height = camera.size
@@ -60,7 +60,7 @@ def paint(
 
 
 def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom of where there is anything to see: what is empty costs time too."""
+    """Left, top, right, bottom [px] of the part with surfaces: empty parts cost time too."""
     width, height = camera.size
     if not drawn:
         return 0, 0, 0, 0
@@ -79,7 +79,7 @@ def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]
 def put_before(
     painted: UInt8[np.ndarray, "H W 4"], background: Float32[np.ndarray, "H W 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """What was painted before black, put before something else.
+    """A picture of `paint` over a background.
 
     Args:
         painted: See `paint`.
@@ -92,6 +92,13 @@ def put_before(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _mix(painted: Any, background: Any, mixed: Any) -> None:
+    """See `put_before`.
+
+    Args:
+        painted: Colors and coverage (P, 4).
+        background: sRGB from 0 to 255 (P, 3).
+        mixed: Written (P, 3).
+    """
     for pixel in range(len(mixed)):
         clear = 1.0 - painted[pixel, 3] / _WHITE
         for channel in range(3):

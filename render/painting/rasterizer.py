@@ -1,7 +1,7 @@
-"""Depth, normals and ids of triangles, drawn by a z-buffer of our own, compiled.
+"""Depth, normals and ids of triangles, by a compiled z-buffer.
 
-Every pixel takes what lies behind its center, so that depth, normals and ids belong together and are the same
-bytes on every machine; OpenGL draws the colors only (docs/decisions.md says why).
+Every pixel shows the surface behind its center, so that depth, normals and ids belong together and have the
+same bytes on every machine (see docs/decisions.md).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, Int32, UInt8
 
 NEAR: Final = 0.01
-"""Triangles that come nearer to the camera's plane are not drawn [m]."""
+"""Triangles nearer to the camera's plane are not drawn [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +55,12 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     """Depth, normals, parts, instances and markers as a pinhole camera sees them.
 
     Args:
-        camera: The camera; whoever wants another lens draws pinhole pictures first (`render.cameras.warp`).
-        surface: What there is to see, closed; the backs of its faces are not drawn.
-        with_normals: Whether they are wanted.
+        camera: A pinhole camera; for other lenses see `render.cameras.warp`.
+        surface: A closed surface; the backs of its faces are not drawn.
+        with_normals: Whether to compute normals.
 
     Raises:
-        ArgumentError: The camera's lens is no pinhole.
+        ArgumentError: The camera's lens is not a pinhole.
     """
     if camera.lens.kind != "pinhole":
         raise ArgumentError(f"camera '{camera.name}' has a lens '{camera.lens.kind}', expected a pinhole")
@@ -75,8 +75,8 @@ def rasterize(camera: Camera, surface: Triangles, *, with_normals: bool = True) 
     labels = np.stack([surface.parts, surface.instances, surface.markers], axis=1)
     _write(inverse, first, labels, depth, parts, instances, markers)
     if normals is not None:
-        turned = surface.normals @ camera.T_world_camera[:3, :3]
-        _interpolate(faces, turned, corners, first, normals)
+        local_normals = surface.normals @ camera.T_world_camera[:3, :3]
+        _interpolate(faces, local_normals, corners, first, normals)
     return Pictures(depth=depth, normals=normals, parts=parts, instances=instances, markers=markers)
 
 
@@ -104,7 +104,12 @@ def nearest_faces(
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def project(local: Any, K: Any) -> Any:
-    """Pixels and one over the depth (V, 3) of points (V, 3) in a pinhole camera's axes; NaN before `NEAR`."""
+    """Pixels [px] and one over the depth [1/m] (V, 3) of points; NaN for those nearer than `NEAR`.
+
+    Args:
+        local: Points (V, 3) in the camera's axes [m].
+        K: Camera matrix (3, 3) [px].
+    """
     corners = np.full_like(local, np.nan)
     for vertex in range(len(local)):
         depth = local[vertex, 2]
@@ -117,6 +122,14 @@ def project(local: Any, K: Any) -> Any:
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
+    """Draw faces into a z-buffer; see `nearest_faces`.
+
+    Args:
+        corners: Pixels and nearness (V, 3) of the vertices.
+        faces: Triangles (F, 3).
+        nearness: The z-buffer (H, W), written.
+        first: Numbers of the nearest faces (H, W), written.
+    """
     height, width = nearness.shape
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
@@ -125,7 +138,7 @@ def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
         cx, cy, cz = corners[c, 0] - ax, corners[c, 1] - ay, corners[c, 2] - az
         area = bx * cy - by * cx
         if not area < 0.0:
-            continue  # the back of a face, or none
+            continue  # the back of a face, or a face without area
         low_x, high_x = min(0.0, bx, cx) + ax, max(0.0, bx, cx) + ax
         low_y, high_y = min(0.0, by, cy) + ay, max(0.0, by, cy) + ay
         if high_x < 0.0 or high_y < 0.0 or low_x > width or low_y > height:
@@ -152,7 +165,17 @@ def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
 def _write(
     inverse: Any, first: Any, labels: Any, depth: Any, parts: Any, instances: Any, markers: Any
 ) -> None:
-    """What the nearest faces have to say."""
+    """Write depth and ids of the nearest faces.
+
+    Args:
+        inverse: One over the depth (H, W) [1/m].
+        first: Nearest faces (H, W), -1 for none.
+        labels: Part, instance and marker of each face (F, 3).
+        depth: Written (H, W) [m].
+        parts: Written (H, W).
+        instances: Written (H, W).
+        markers: Written (H, W).
+    """
     height, width = first.shape
     for row in range(height):
         for column in range(width):
@@ -166,7 +189,15 @@ def _write(
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _interpolate(faces: Any, normals: Any, corners: Any, first: Any, picture: Any) -> None:
-    """Unit normals behind the centers of all pixels that show something."""
+    """Write the unit normals behind the centers of all pixels with a face.
+
+    Args:
+        faces: Triangles (F, 3).
+        normals: Unit normals of the vertices (V, 3) in the camera's axes.
+        corners: Pixels and one over the depth (V, 3) of the vertices.
+        first: Nearest faces (H, W), -1 for none.
+        picture: Written (H, W, 3).
+    """
     height, width = first.shape
     for row in range(height):
         for column in range(width):

@@ -1,7 +1,7 @@
-"""The light that a place on a surface sends to the eye, by its texture and glTF 2.0's microfacet model.
+"""Shading of a surface point by its texture and glTF 2.0's microfacet model.
 
 Lambert's diffuse light under Schlick's Fresnel term, GGX with Smith's occlusion in Schlick's form (Khronos
-glTF 2.0 specification, appendix B), as pyrender's shader has them, so that both painters agree.
+glTF 2.0 specification, appendix B), as in pyrender's shader, so that both painters agree.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from render.painting.shadow_map import lit_share
 
 GAMMA: Final = 2.2
-_FACING: Final = 0.04  # what a surface that is no metal mirrors when one looks straight at it
-_LIFT: Final = 1.7  # slanting surfaces are read this much above themselves, lest they shade themselves [bias]
+_FACING: Final = 0.04  # specular reflectance of dielectrics at normal incidence
+_LIFT: Final = 1.7  # offset of shadow look-ups from slanted surfaces, against self-shadowing [bias]
 _LEVELS: Final = 2048
 _BYTES = np.arange(256) / 255.0
 TO_LINEAR: Final = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
@@ -24,15 +24,15 @@ TO_DISPLAY: Final = np.linspace(0.0, 1.0, _LEVELS) ** (2.0 / GAMMA)
 """Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
 
 SPOT: Final = 21
-"""How many numbers a spot of a surface takes on its way to the eye.
+"""Length of the row of numbers that describes a surface point (a spot).
 
-Pixel and nearness (3), place (3) and unit normal (3) in the camera's axes, tint (3), place in the texture
-(2), linear color (3), roughness, the texture's normal (3)."""
+Pixel and one over the depth (3), position [m] (3) and unit normal (3) in the camera's axes, tint (3), texture
+coordinates (2), linear color (3), roughness, the texture's normal (3)."""
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def display(light: float, table: Any) -> float:
-    """The display value of linear light, cut to [0, 1]; `table` is `TO_DISPLAY`."""
+    """The display value of linear light, clipped to [0, 1]; `table` is `TO_DISPLAY` (2048,)."""
     root = np.sqrt(min(max(light, 0.0), 1.0)) * (_LEVELS - 1)
     low = min(int(root), _LEVELS - 2)
     value: float = table[low] + (root - low) * (table[low + 1] - table[low])
@@ -41,11 +41,11 @@ def display(light: float, table: Any) -> float:
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def read_texels(texels: Any, table: Any, spot: Any) -> None:
-    """Multiply a spot's color and roughness by the texture's, and write its normal; straight between texels.
+    """Multiply a surface point's color and roughness by the texture's, and write its normal; bilinear.
 
     Args:
-        texels: See `Material.texels`.
-        table: `TO_LINEAR`.
+        texels: Texture (h, w, 8); see `Material.texels`.
+        table: `TO_LINEAR` (256,).
         spot: See `SPOT`.
     """
     rows, columns = texels.shape[:2]
@@ -72,19 +72,19 @@ def read_texels(texels: Any, table: Any, spot: Any) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def light_up(
+def shade(
     spot: Any, glow: float, lamps: Any, ambient: Any, to_map: Any, nearest: Any, bias: float, light: Any
 ) -> None:
-    """Write the linear light (red, green, blue) that goes from a spot to the eye in the frame's origin.
+    """Write the linear light (red, green, blue) that a surface point sends to the camera in the origin.
 
     Args:
         spot: See `SPOT`.
         glow: See `Material.glow`.
-        lamps: Rows (9): unit vector to the lamp, and its light with and without shadows.
-        ambient: Light from everywhere by the normal (9, 3), see `surroundings.irradiance`.
-        to_map: The first lamp's `ShadowMap`, as the next two.
-        nearest: The same.
-        bias: The same.
+        lamps: Rows (L, 9): unit vector to the lamp, its light with shadows, and its light without.
+        ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
+        to_map: `ShadowMap.to_map` (3, 4) of the first lamp.
+        nearest: `ShadowMap.nearest` (N, N) of the first lamp [m].
+        bias: `ShadowMap.bias` of the first lamp [m].
         light: Three numbers, written.
     """
     px, py, pz, nx, ny, nz = spot[3], spot[4], spot[5], spot[6], spot[7], spot[8]
@@ -101,8 +101,8 @@ def light_up(
         light[i] = spot[14 + i] * (max(around, 0.0) + glow)
     for lamp in range(len(lamps)):
         lx, ly, lz = lamps[lamp, 0], lamps[lamp, 1], lamps[lamp, 2]
-        slope = nx * lx + ny * ly + nz * lz
-        if slope <= 0.0:
+        cosine = nx * lx + ny * ly + nz * lz
+        if cosine <= 0.0:
             continue
         hx, hy, hz = lx + vx, ly + vy, lz + vz
         length = np.sqrt(max(hx * hx + hy * hy + hz * hz, 1e-12))
@@ -110,12 +110,12 @@ def light_up(
         grazing = 1.0 - 0.5 * length  # the half vector's length is twice its cosine with either
         fresnel = _FACING + (1.0 - _FACING) * grazing**5
         peak = half * half * (square - 1.0) + 1.0
-        occlusion = 4.0 * (facing * (1.0 - k) + k) * (slope * (1.0 - k) + k)
-        mirrored = slope * fresnel * square / (np.pi * peak * peak * occlusion)
-        scattered = slope * (1.0 - fresnel) * (1.0 - _FACING) / np.pi
+        occlusion = 4.0 * (facing * (1.0 - k) + k) * (cosine * (1.0 - k) + k)
+        mirrored = cosine * fresnel * square / (np.pi * peak * peak * occlusion)
+        scattered = cosine * (1.0 - fresnel) * (1.0 - _FACING) / np.pi
         lit = 1.0
         if lamp == 0:
-            lift = _LIFT * bias * np.sqrt(1.0 - min(slope, 1.0) ** 2)
+            lift = _LIFT * bias * np.sqrt(1.0 - min(cosine, 1.0) ** 2)
             lit = lit_share(to_map, nearest, bias, px + lift * nx, py + lift * ny, pz + lift * nz)
         light[0] += (scattered * red + mirrored) * (lit * lamps[lamp, 3] + lamps[lamp, 6])
         light[1] += (scattered * green + mirrored) * (lit * lamps[lamp, 4] + lamps[lamp, 7])

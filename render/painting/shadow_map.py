@@ -1,4 +1,4 @@
-"""Which places a far lamp does not reach: the lamp's own z-buffer of what stands in its light."""
+"""Shadows of a far lamp, by the lamp's own z-buffer."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _MARGIN: Final = 3.0  # [texels] that reads of neighbors may go beyond what is d
 
 
 class ShadowMap(NamedTuple):
-    """How near the nearest surface is to a far lamp."""
+    """Nearness of the nearest surface to a far lamp."""
 
     to_map: Float[np.ndarray, "3 4"]
-    """Takes places to columns and rows [texels] and nearness to the lamp [m]."""
+    """Maps positions [m] to columns and rows [texels] and nearness to the lamp [m]."""
     nearest: Float32[np.ndarray, "N N"]
     """Nearness [m], minus infinity where nothing is."""
     bias: float
-    """How much nearer something must be to cast a shadow [m]: about a texel."""
+    """How much nearer a surface must be to cast a shadow [m]: about a texel."""
 
 
 def shadow_map(
@@ -42,20 +42,29 @@ def shadow_map(
     aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
     rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
-    turned = points @ rotation.T
-    low, high = turned[:, :2].min(axis=0), turned[:, :2].max(axis=0)
+    rotated = points @ rotation.T
+    low, high = rotated[:, :2].min(axis=0), rotated[:, :2].max(axis=0)
     scale = (_TEXELS - 2.0 * _MARGIN) / max(float((high - low).max()), 1e-6)
     to_map = np.column_stack([rotation, np.zeros(3)])
     to_map[:2] *= scale
     to_map[:2, 3] = _MARGIN - scale * low
-    corners = turned * [scale, scale, 1.0] + to_map[:, 3]
+    corners = rotated * [scale, scale, 1.0] + to_map[:, 3]
     nearest, _ = nearest_faces(corners, faces, (_TEXELS, _TEXELS), farthest=-np.inf)
     return ShadowMap(to_map, nearest, 1.5 / scale)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def lit_share(to_map: Any, nearest: Any, bias: float, x: float, y: float, z: float) -> float:
-    """Share of the lamp that is seen from a place: the mean over a square of three texels around it."""
+    """Visible share of the lamp at a position: the mean over a square of three texels around it.
+
+    Args:
+        to_map: `ShadowMap.to_map` (3, 4).
+        nearest: `ShadowMap.nearest` (N, N) [m].
+        bias: `ShadowMap.bias` [m].
+        x: Position in the frame of the map's points [m], as `y` and `z`.
+        y: See `x`.
+        z: See `x`.
+    """
     across = to_map[0, 0] * x + to_map[0, 1] * y + to_map[0, 2] * z + to_map[0, 3] - 0.5
     down = to_map[1, 0] * x + to_map[1, 1] * y + to_map[1, 2] * z + to_map[1, 3] - 0.5
     near = to_map[2, 0] * x + to_map[2, 1] * y + to_map[2, 2] * z + to_map[2, 3] + bias

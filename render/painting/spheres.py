@@ -1,4 +1,4 @@
-"""Many balls of one radius as one surface: a mesh a ball would cost a draw call each."""
+"""Many balls of one radius as one surface, because a mesh per ball would cost a draw call each."""
 
 from __future__ import annotations
 

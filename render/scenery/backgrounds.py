@@ -1,4 +1,4 @@
-"""What stands behind the hands: plain walls, gradients, noise, clutter, rooms, or a user's own photographs.
+"""Backgrounds: plain, gradient, noise, clutter, room, photograph.
 
 Nothing here looks like a hand. A background is a few plain values and a seed; drawing it again gives the same
 picture.
@@ -31,7 +31,7 @@ class BackgroundConfig:
     """Which backgrounds to draw, and how often each: shares, of any sum.
 
     Raises:
-        HandSimError: A share is negative, none is positive, or photographs are wanted without a folder.
+        HandSimError: A share is negative, none is positive, or photographs are requested without a folder.
     """
 
     plain: float = 0.1
@@ -61,10 +61,10 @@ class Background:
 
     kind: BackgroundKind
     colors: tuple[tuple[float, float, float], tuple[float, float, float]]
-    """Linear light; rooms and photographs take none of it."""
+    """Linear colors; not used by rooms and photographs."""
     seed: int
     blur: float = 0.0
-    """How far out of focus it is: spread of its blur, in picture heights."""
+    """Standard deviation of its blur, in picture heights."""
     photo: str | None = None
     """The photograph's file."""
 
@@ -73,7 +73,7 @@ def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> 
     """A random background.
 
     Raises:
-        HandSimError: Photographs are wanted, and the folder holds none that can be read.
+        HandSimError: Photographs are requested, and the folder holds none that can be read.
     """
     shares = np.array(config.shares())
     kind = KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
@@ -126,9 +126,9 @@ def _color(rng: np.random.Generator) -> tuple[float, float, float]:
 def _gradient(
     first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    turn = rng.uniform(0.0, 2.0 * np.pi)
-    x = np.linspace(-1.0, 1.0, size[0], dtype=np.float32) * np.float32(np.cos(turn))
-    y = np.linspace(-1.0, 1.0, size[1], dtype=np.float32) * np.float32(np.sin(turn))
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    x = np.linspace(-1.0, 1.0, size[0], dtype=np.float32) * np.float32(np.cos(angle))
+    y = np.linspace(-1.0, 1.0, size[1], dtype=np.float32) * np.float32(np.sin(angle))
     share = (x[None, :] + y[:, None])[..., None]
     share = 0.5 + 0.5 * share / np.abs(share).max()
     blend: NDArray[np.float32] = first + share * (second - first)
@@ -165,26 +165,28 @@ def _noise(
 def _clutter(
     first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Things on a table: boxes, discs and cloths of all colors in a heap, each with its own light."""
+    """Objects on a table: boxes, discs and cloths of all colors in a heap, each with its own light."""
     picture = _noise(first, 0.6 * first + 0.4 * second, size, rng)
     height = size[1]
     for _ in range(int(rng.integers(8, 30))):
         color = np.array(_color(rng), dtype=np.float32)
         center = rng.uniform(0.0, 1.0, 2) * size
-        reach = height * rng.uniform(0.05, 0.28)
+        radius = height * rng.uniform(0.05, 0.28)
         corners = 24 if rng.random() < 0.25 else 4
         stretch = rng.uniform(0.45, 1.0) if corners == 4 else rng.uniform(0.8, 1.0)
-        turn = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(corners) / corners
-        outline = np.stack([np.cos(turn), stretch * np.sin(turn)], axis=1) * reach
-        lean = rng.uniform(0.0, 2.0 * np.pi)
-        axes = np.array([[np.cos(lean), np.sin(lean)], [-np.sin(lean), np.cos(lean)]])
+        angles = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(corners) / corners
+        outline = np.stack([np.cos(angles), stretch * np.sin(angles)], axis=1) * radius
+        tilt = rng.uniform(0.0, 2.0 * np.pi)
+        axes = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
         light = np.float32(rng.uniform(0.8, 1.15))
-        _lay_down(picture, outline @ axes + center, light * color)
+        _paint_object(picture, outline @ axes + center, light * color)
     return picture * (1.0 + 0.06 * _octaves(size, 1, 0.8, rng))
 
 
-def _lay_down(picture: NDArray[np.float32], outline: NDArray[np.float64], color: NDArray[np.float32]) -> None:
-    """Paint a thing over a picture, with its shadow to the right and below."""
+def _paint_object(
+    picture: NDArray[np.float32], outline: NDArray[np.float64], color: NDArray[np.float32]
+) -> None:
+    """Paint an object over a picture, with its shadow to the right and below."""
     height, width = picture.shape[:2]
     offset = 0.02 * height
     low = np.clip(np.floor(outline.min(axis=0)).astype(int) - 8, 0, (width, height))

@@ -1,4 +1,4 @@
-"""The light in a picture: one lamp that casts shadows, a few that do not, and light from everywhere.
+"""The light in a picture: one lamp that casts shadows, a few that do not, and ambient light.
 
 Directions are in the camera's axes (x right, y down, z ahead)
 and point from the hand to the lamp, so that the same lighting suits every view.
@@ -25,11 +25,11 @@ class Lamp:
     """A far lamp."""
 
     direction: tuple[float, float, float]
-    """Towards the lamp in the camera's axes; of any length."""
+    """Direction towards the lamp in the camera's axes; of any length."""
     strength: float
-    """What a white surface that faces the lamp sends back, 1 for the picture's full white."""
+    """Light that a white surface facing the lamp reflects, 1 for the picture's full white."""
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Linear light, about 1 in the mean."""
+    """Linear color, about 1 in the mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +37,15 @@ class Lighting:
     """All light of one picture.
 
     Raises:
-        HandSimError: There are more than five lamps, or the surroundings have not nine rows.
+        HandSimError: There are more than five lamps, or the surroundings do not have nine rows.
     """
 
     lamps: tuple[Lamp, ...]
     """The first casts shadows."""
     ambient: tuple[float, float, float]
-    """What a white surface sends back of the light from everywhere, linear."""
+    """Ambient light that a white surface reflects, linear."""
     surroundings: tuple[tuple[float, float, float], ...] = ()
-    """The same by the surface's normal, see `surroundings.irradiance`; OpenGL takes `ambient` for all."""
+    """Ambient light by the surface's normal, see `surroundings.irradiance`; OpenGL uses `ambient` instead."""
 
     def __post_init__(self) -> None:
         if len(self.lamps) > _MOST_LAMPS:
@@ -73,7 +73,7 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
     # From above more than from below, and seldom from behind the hand.
     key = np.array([rng.normal(0.0, 0.75), rng.normal(-0.65, 0.5), rng.normal(-0.9, 0.45)])
     fill = np.array([-np.sign(key[0]) * rng.uniform(0.4, 1.2), rng.normal(-0.2, 0.4), rng.uniform(-1.1, 0.1)])
-    places = (
+    directions = (
         key,
         fill,
         np.array([rng.normal(0.0, 0.3), -1.0, rng.normal(0.1, 0.4)]),
@@ -87,9 +87,9 @@ def sample_lighting(*, rng: np.random.Generator) -> Lighting:
         rest * rng.uniform(0.05, 0.4),
     )
     lamps = []
-    for number, (place, share) in enumerate(zip(places, shares, strict=True)):
+    for number, (direction, share) in enumerate(zip(directions, shares, strict=True)):
         own = rng.normal(0.0, 0.03 if number == 0 else 0.08)
-        lamps.append(Lamp(_triple(place), float(exposure * share), _tint(warmth + own, rng)))
+        lamps.append(Lamp(_triple(direction), float(exposure * share), _tint(warmth + own, rng)))
     # Lamps in rooms are wide and their shadows faint: part of the key light comes without any.
     hard, key_lamp = rng.uniform(0.25, 0.75), lamps[0]
     lamps[0] = dataclasses.replace(key_lamp, strength=hard * key_lamp.strength)

@@ -21,7 +21,7 @@ _GAMMA: Final = 2.2
 
 @functools.lru_cache(maxsize=2)
 def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
-    """Photographs in a folder and its subfolders: those that are some by their first bytes, and the others.
+    """Photographs in a folder and its subfolders: those with the first bytes of a picture, and the others.
 
     Raises:
         HandSimError: There is no such folder, or none in it is readable.
@@ -38,9 +38,9 @@ def photo_files(folder: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
 def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
     """A random photograph that can be read whole."""
     files, _ = photo_files(folder)
-    for place in rng.permutation(len(files))[:_TRIES]:
-        if _read(files[place]) is not None:
-            readable: Path = files[place]
+    for index in rng.permutation(len(files))[:_TRIES]:
+        if _read(files[index]) is not None:
+            readable: Path = files[index]
             return readable
     raise _no_photo(folder)
 

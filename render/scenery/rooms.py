@@ -1,4 +1,4 @@
-"""Pictures of made-up rooms: walls, floor and ceiling with patterns, and boxes for furniture, ray by ray.
+"""Ray-cast pictures of random rooms: walls, floor and ceiling with patterns, and boxes for furniture.
 
 Half of the picture's resolution is enough: a background is out of focus.
 """
@@ -50,17 +50,17 @@ class _Boxes(NamedTuple):
 
 
 def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.ndarray, "H W 3"]:
-    """A random room from a random place, linear light.
+    """A random room from a random position, linear light.
 
     Args:
         size: Width and height [pixels].
-        rng: Where the choices come from.
+        rng: Source of the random choices.
     """
     width, height = (max(1, length // _REDUCED) for length in size)
     room = rng.uniform((2.5, 2.5, 2.3), (7.0, 7.0, 3.2))  # [m], corner at the origin, z up
     eye = room * rng.uniform((0.25, 0.05, 0.35), (0.75, 0.3, 0.75))
     rays = _rays(width, height, rng)
-    # Lamps and windows leave some places darker than others.
+    # Lamps and windows leave some parts darker than others.
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
     light = np.empty((height * width, 3), dtype=np.float32)
     _cast(rays, eye, room, *_paint_walls(room, rng), *_place_boxes(room, eye, rng), lamp, strength, light)
@@ -75,12 +75,10 @@ def _rays(width: int, height: int, rng: np.random.Generator) -> NDArray[np.float
     """Directions (H W, 3) of a camera that looks into the room, a little up or down and askew."""
     focal = height * rng.uniform(0.8, 1.5)
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    turn, tip, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
+    yaw, pitch, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
     x, y = np.cos(roll) * x - np.sin(roll) * y, np.sin(roll) * x + np.cos(roll) * y
-    ahead, up = focal * np.cos(tip) + y * np.sin(tip), focal * np.sin(tip) - y * np.cos(tip)
-    along = np.stack(
-        [np.cos(turn) * x - np.sin(turn) * ahead, np.sin(turn) * x + np.cos(turn) * ahead, up], -1
-    )
+    ahead, up = focal * np.cos(pitch) + y * np.sin(pitch), focal * np.sin(pitch) - y * np.cos(pitch)
+    along = np.stack([np.cos(yaw) * x - np.sin(yaw) * ahead, np.sin(yaw) * x + np.cos(yaw) * ahead, up], -1)
     along = along.reshape(-1, 3)
     along[np.abs(along) < 1e-6] = 1e-6
     rays: NDArray[np.float32] = (along / np.linalg.norm(along, axis=1, keepdims=True)).astype(np.float32)
@@ -141,24 +139,24 @@ def _cast(
     picture: Any,
 ) -> None:
     """Light (N, 3) that comes along each ray."""
-    place, color = np.empty(3), np.empty(3)
+    position, color = np.empty(3), np.empty(3)
     for ray in range(len(rays)):
-        reach, wall = np.inf, 0
+        distance, wall = np.inf, 0
         for axis in range(3):
             far = rays[ray, axis] > 0.0
             way = ((room[axis] if far else 0.0) - eye[axis]) / rays[ray, axis]
-            if way < reach:
-                reach, wall = way, 2 * axis + int(far)
-        box, side, reach = _nearest_box(rays, ray, eye, corners, reach)
+            if way < distance:
+                distance, wall = way, 2 * axis + int(far)
+        box, side, distance = _nearest_box(rays, ray, eye, corners, distance)
         light = 0.35
         for axis in range(3):
-            place[axis] = eye[axis] + reach * rays[ray, axis]
-            light += 0.09 * (place[axis] - lamp[axis]) ** 2
+            position[axis] = eye[axis] + distance * rays[ray, axis]
+            light += 0.09 * (position[axis] - lamp[axis]) ** 2
         light = strength / light
         if box < 0:
-            _wall_color(place, wall, patterns, pitches, colors, boards, frames, color)
+            _wall_color(position, wall, patterns, pitches, colors, boards, frames, color)
         else:
-            height = 0.999 * (place[2] - corners[box, 0, 2]) / (corners[box, 1, 2] - corners[box, 0, 2])
+            height = 0.999 * (position[2] - corners[box, 0, 2]) / (corners[box, 1, 2] - corners[box, 0, 2])
             second = int(bands[box, 0] > 0.0 and (height * bands[box, 0]) % 1.0 < bands[box, 1])
             light *= shades[box, side]
             for channel in range(3):
@@ -168,8 +166,16 @@ def _cast(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _nearest_box(rays: Any, ray: int, eye: Any, corners: Any, reach: float) -> Any:
-    """The first box along a ray within a reach, the axis of its face, and how far it is; -1 for none."""
+def _nearest_box(rays: Any, ray: int, eye: Any, corners: Any, distance: float) -> Any:
+    """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none.
+
+    Args:
+        rays: Unit directions (R, 3).
+        ray: Index of the ray.
+        eye: Origin of the rays (3,) [m].
+        corners: Low and high corners of boxes (B, 2, 3) [m].
+        distance: Largest distance [m].
+    """
     nearest, face = -1, 0
     for box in range(len(corners)):
         enter, leave, side = -np.inf, np.inf, 0
@@ -179,18 +185,18 @@ def _nearest_box(rays: Any, ray: int, eye: Any, corners: Any, reach: float) -> A
             if min(low, high) > enter:
                 enter, side = min(low, high), axis
             leave = min(leave, max(low, high))
-        if 0.05 < enter < leave and enter < reach:
-            nearest, face, reach = box, side, enter
-    return nearest, face, reach
+        if 0.05 < enter < leave and enter < distance:
+            nearest, face, distance = box, side, enter
+    return nearest, face, distance
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _wall_color(
-    place: Any, wall: int, patterns: Any, pitches: Any, colors: Any, boards: Any, frames: Any, color: Any
+    position: Any, wall: int, patterns: Any, pitches: Any, colors: Any, boards: Any, frames: Any, color: Any
 ) -> None:
-    """Write what is painted at a place of a wall: plain, stripes, tiles or boards, pictures and windows."""
+    """Write the color of a wall at a position: plain, stripes, tiles or boards, pictures and windows."""
     axis = wall // 2
-    first, second = place[1 if axis == 0 else 0], place[1 if axis == 2 else 2]
+    first, second = position[1 if axis == 0 else 0], position[1 if axis == 2 else 2]
     pitch, pattern, share = pitches[wall], patterns[wall], 0.0
     across, up = int(np.floor(first / pitch)), int(np.floor(second / pitch))
     if pattern == _STRIPES:

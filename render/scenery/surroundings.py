@@ -90,8 +90,8 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
     height, width = picture.shape[:2]
     away = np.arccos(np.abs(directions[:, 2])) / (np.pi / 2)
     aside = directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1, keepdims=True), 1e-9)
-    places = 0.5 + 0.5 * away[:, None] * aside
-    columns, rows = np.minimum((places * (width, height)).astype(int), (width - 1, height - 1)).T
+    points = 0.5 + 0.5 * away[:, None] * aside
+    columns, rows = np.minimum((points * (width, height)).astype(int), (width - 1, height - 1)).T
     light = picture[rows, columns].astype(np.float64)
     projected = functions.T @ light * (4.0 * np.pi / len(directions))
     coefficients: NDArray[np.float64] = (_MATT / _SQUARES)[:, None] * projected
@@ -103,7 +103,7 @@ def _sphere() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Directions (D, 3) all around, evenly, and the nine functions there (D, 9)."""
     number = np.arange(_DIRECTIONS)
     z = 1.0 - (2.0 * number + 1.0) / _DIRECTIONS
-    turn = np.pi * (3.0 - np.sqrt(5.0)) * number
-    x, y = np.sqrt(1.0 - z * z) * np.cos(turn), np.sqrt(1.0 - z * z) * np.sin(turn)
+    azimuth = np.pi * (3.0 - np.sqrt(5.0)) * number
+    x, y = np.sqrt(1.0 - z * z) * np.cos(azimuth), np.sqrt(1.0 - z * z) * np.sin(azimuth)
     functions = [np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3.0 * z * z - 1.0]
     return np.stack([x, y, z], axis=1), np.stack(functions, axis=1)

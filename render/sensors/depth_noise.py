@@ -1,4 +1,4 @@
-"""What a depth sensor makes of perfect depth."""
+"""Noise of depth sensors on perfect depth, by name of the sensor."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ SENSORS: Final = tuple(_SENSORS)
 
 @dataclass(frozen=True, slots=True)
 class DepthNoiseConfig:
-    """Which depth sensors there are, and how far copies of one differ."""
+    """Depth sensors to choose from, and the spread of copies of one."""
 
     sensors: tuple[str, ...] = ("kinect2",)
     """One of them is drawn, see `SENSORS`; none: depth stays perfect."""
@@ -64,7 +64,7 @@ def named_sensor(name: str) -> DepthNoise:
     """A depth sensor as it was published.
 
     Raises:
-        ArgumentError: There is no sensor of that name.
+        ArgumentError: The sensor is unknown.
     """
     if name not in _SENSORS:
         raise ArgumentError(choices(name, _SENSORS, noun="depth sensor"))
@@ -75,7 +75,7 @@ def sample_depth_noise(config: DepthNoiseConfig, *, rng: np.random.Generator) ->
     """One copy of one of the sensors; None if there are none.
 
     Raises:
-        ArgumentError: There is no sensor of some name.
+        ArgumentError: A sensor is unknown.
     """
     sensors = [named_sensor(name) for name in config.sensors]
     if not sensors:
@@ -149,7 +149,7 @@ def _back(
 
 
 def reflectance_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """Share of infrared light that surfaces send back, guessed from how bright they look in sRGB."""
+    """Infrared reflectance of surfaces, estimated from their brightness in sRGB."""
     light: NDArray[np.float32] = cv2.LUT(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), _luminance())
     return light
 

@@ -1,7 +1,7 @@
-"""What a color sensor makes of light: exposure, noise, white balance, vignetting, the sRGB curve, JPEG.
+"""Noise of color sensors: exposure, shot and read noise, white balance, vignetting, sRGB curve, JPEG.
 
 The noise is EMVA 1288's (release 4.0) linear camera: shot noise of the electrons and the noise of reading
-them out, here as one normal number a pixel and channel with the variance of both.
+them out, here as one normal number per pixel and channel with the variance of both.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ _BAND: Final = 32  # rows done at a time, so that they stay in the processor's c
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """How one picture was taken. The defaults change nothing."""
+    """Exposure of one picture. The defaults change nothing."""
 
     stops: float = 0.0
-    """How much longer it was exposed than the light was meant for, as a power of two."""
+    """Exposure over the nominal exposure, as a power of two."""
     balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """What red, green and blue are multiplied by after the sensor."""
+    """Factors on red, green and blue after the sensor."""
     white_electrons: float = 0.0
     """Electrons in a pixel that is just white: full well over the sensor's gain; 0: no noise at all."""
     read_noise: float = 0.0
@@ -39,27 +39,27 @@ class Exposure:
     vignetting: float = 0.0
     """Share of the light that is missing in the corners."""
     jpeg_quality: int | None = None
-    """Of a JPEG file that the picture has been through, 1 to 100; None: it has not."""
+    """Quality of JPEG compression, 1 to 100; None without it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ExposureConfig:
-    """Within what limits pictures are taken; drawn evenly but for what is said."""
+    """Ranges of exposures; drawn uniformly unless stated."""
 
     stops: tuple[float, float] = (-0.5, 0.4)
     balance: float = 0.05
     """Standard deviation of the logarithms of the factors of red and blue."""
     white_electrons: tuple[float, float] = (1000.0, 10000.0)
-    """Drawn evenly on a logarithmic scale."""
+    """Drawn uniformly on a logarithmic scale."""
     read_noise: tuple[float, float] = (1.5, 6.0)
     vignetting: tuple[float, float] = (0.0, 0.3)
     jpeg_share: float = 0.5
-    """Of pictures that go through a JPEG file."""
+    """Share of pictures with JPEG compression."""
     jpeg_quality: tuple[int, int] = (70, 98)
 
 
 def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Exposure:
-    """How a picture is taken."""
+    """A random exposure."""
     red, blue = np.exp(config.balance * rng.standard_normal(2))
     least, most = np.log(config.white_electrons)
     goes = bool(rng.random() < config.jpeg_share)
@@ -91,7 +91,7 @@ def expose(
         rng: Randomness.
 
     Raises:
-        ArgumentError: The light is no picture of three colors.
+        ArgumentError: The light is not a picture of three colors.
     """
     if linear.ndim != 3 or linear.shape[2] != 3:
         raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
@@ -119,7 +119,7 @@ def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]
 
 
 def _gain(rows: slice, shape: tuple[int, int], exposure: Exposure) -> NDArray[np.float32]:
-    """Factor of each pixel, three times a pixel: less towards the corners with the square of the distance."""
+    """Factor of each pixel, repeated for the channels; falls with the squared distance from the center."""
     gain = 2.0**exposure.stops
     if exposure.vignetting == 0.0:
         return np.full((1, 1), gain, np.float32)

@@ -1,4 +1,4 @@
-"""Normal numbers for whole pictures, several times as fast as a generator's own.
+"""Normal random numbers for whole pictures, several times as fast as those of a generator.
 
 Sixteen random bits pick one of 65,536 quantiles: tails end at 4.2 standard deviations.
 """
@@ -26,7 +26,7 @@ def quantiles() -> Float32[np.ndarray, "65536"]:
 
 
 def random_words(shape: tuple[int, ...], *, rng: np.random.Generator) -> UInt16[np.ndarray, "..."]:
-    """Random sixteen-bit numbers, places in the tables of `quantiles`' kind."""
+    """Random sixteen-bit numbers, indices of tables like `quantiles`."""
     count = math.prod(shape)
     words = rng.integers(0, 2**64, (count + 3) // 4, dtype=np.uint64)
     return words.astype("<u8", copy=False).view("<u2")[:count].reshape(shape)

@@ -1,7 +1,7 @@
 """Motion blur and rolling shutter, from pictures of moments that the caller draws.
 
 A row of a picture is open for `exposure` seconds; the rows open one after the other, `readout` seconds from
-the first to the last. Time 0 is the middle of the middle row's exposure: what a frame's truth is about.
+the first to the last. Time 0 is the middle of the middle row's exposure: the time of a frame's ground truth.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Shutter:
-    """When a picture's rows are open."""
+    """Exposure times of a picture's rows."""
 
     exposure: float = 0.0
-    """Of each row [s]."""
+    """Exposure time of each row [s]."""
     readout: float = 0.0
-    """From the first row's opening to the last one's [s]; 0: a global shutter."""
+    """Time from the first row's opening to the last row's [s]; 0 for a global shutter."""
     sub_frames: int = 1
-    """Moments that are drawn."""
+    """Number of instants that are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class ShutterConfig:
-    """Within what limits shutters are; drawn evenly but for what is said."""
+    """Ranges of shutters; drawn uniformly unless stated."""
 
     exposure: tuple[float, float] = (0.001, 0.016)
-    """Drawn evenly on a logarithmic scale [s]."""
+    """Drawn uniformly on a logarithmic scale [s]."""
     readout: tuple[float, float] = (0.005, 0.025)
-    """Of a rolling shutter [s]."""
+    """Readout time of a rolling shutter [s]."""
     rolling_share: float = 0.5
-    """Of shutters that roll."""
+    """Share of rolling shutters."""
     sub_frames: int = 8
 
 
 def sample_shutter(config: ShutterConfig, *, rng: np.random.Generator) -> Shutter:
-    """One shutter."""
+    """A random shutter."""
     exposure = float(np.exp(rng.uniform(*np.log(config.exposure))))
     rolls, readout = bool(rng.random() < config.rolling_share), float(rng.uniform(*config.readout))
     return Shutter(exposure, readout if rolls else 0.0, config.sub_frames)

@@ -26,7 +26,7 @@ _SHADOW_SLACK: Final = 2.0  # [px] of disparity that a surface may differ from i
 
 @dataclass(frozen=True, slots=True)
 class StructuredLight:
-    """What a disparity sensor does to depth; see `docs/sensors.md` for where the numbers come from."""
+    """Noise of a disparity sensor; see `docs/sensors.md` for the sources of the numbers."""
 
     sensor: str = "kinect1"
     baseline: float = 0.075
@@ -99,12 +99,12 @@ def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     height, width = disparity.shape
     most = int(np.ceil(disparity.max(initial=0.0))) + 1
     columns = np.arange(width, dtype=np.float32) - disparity + np.float32(most)
-    place = np.rint(columns).astype(np.intp)
-    place += np.arange(height)[:, None] * (width + most)
+    cells = np.rint(columns).astype(np.intp)
+    cells += np.arange(height)[:, None] * (width + most)
     first = np.zeros((height, width + most), np.float32)
-    np.maximum.at(first.ravel(), place.ravel(), disparity.ravel())
+    np.maximum.at(first.ravel(), cells.ravel(), disparity.ravel())
     first = cv2.dilate(first, np.ones((1, 3), np.uint8))  # close what rounding left open
-    hidden: NDArray[np.bool_] = first.ravel().take(place) > disparity + np.float32(_SHADOW_SLACK)
+    hidden: NDArray[np.bool_] = first.ravel().take(cells) > disparity + np.float32(_SHADOW_SLACK)
     return hidden
 
 

@@ -27,7 +27,7 @@ _NOTHING: Final = np.float32(1e6)
 
 @dataclass(frozen=True, slots=True)
 class TimeOfFlight:
-    """What a time-of-flight sensor does to depth; see `docs/sensors.md` for where the numbers come from."""
+    """Noise of a time-of-flight sensor; see `docs/sensors.md` for the sources of the numbers."""
 
     sensor: str = "kinect2"
     sigma: tuple[float, float, float] = (1.5e-3, -0.5e-3, 0.3e-3)
@@ -94,16 +94,16 @@ def _mixed(
     far = cv2.dilate(depth, around)
     near = cv2.erode(np.where(depth > 0.0, depth, _NOTHING), around)
     bare = cv2.erode(depth, around) <= 0.0
-    places = np.flatnonzero((depth > 0.0) & (bare | (far - near > np.float32(noise.edge) * depth)))
-    here, near, far = depth.ravel()[places], near.ravel()[places], far.ravel()[places]
-    fate, share = rng.random((2, len(places)), dtype=np.float32)
+    pixels = np.flatnonzero((depth > 0.0) & (bare | (far - near > np.float32(noise.edge) * depth)))
+    here, near, far = depth.ravel()[pixels], near.ravel()[pixels], far.ravel()[pixels]
+    fate, share = rng.random((2, len(pixels)), dtype=np.float32)
     other = np.where(here - near < far - here, far, near)
     # Light goes with the squared distance, and the phase follows the brighter part.
     mine, theirs = (1.0 - share) / here**2, share / other**2
     flown = (mine * here + theirs * other) / (mine + theirs)
     flies = (fate < noise.flying) & (far - near > noise.edge * here)
     value = np.where(flies, flown, here)
-    mixed.ravel()[places] = np.where(fate >= 1.0 - noise.dropped, np.float32(0.0), value)
+    mixed.ravel()[pixels] = np.where(fate >= 1.0 - noise.dropped, np.float32(0.0), value)
     return mixed
 
 

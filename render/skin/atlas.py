@@ -36,13 +36,13 @@ class Atlas(NamedTuple):
     used: NDArray[np.int64]
     """Vertices (U,) of the base surface that are drawn: those from the wrist's ring on."""
     wrist: NDArray[np.int64]
-    """The wrist's ring (R,), places in the drawn vertices, from the index side over the back."""
+    """The wrist's ring (R,), indices of the drawn vertices, from the index side over the back."""
     faces: NDArray[np.int64]
     """Triangles (F, 3) of the drawn vertices, closed, counter-clockwise from outside on a right hand."""
     corners: NDArray[np.int64]
     """Drawn vertex of each corner (D,): a vertex on tiles' borders has one for each tile."""
     corner_faces: NDArray[np.int64]
-    """The same triangles (F, 3) in places of `corners`."""
+    """The same triangles (F, 3) as indices of `corners`."""
     uv: NDArray[np.float32]
     """Texture coordinates (D, 2), the origin at the bottom left."""
     tiles: NDArray[np.int64]
@@ -63,38 +63,42 @@ class Atlas(NamedTuple):
 
 @functools.cache
 def skin_atlas() -> Atlas:
-    """The one atlas."""
+    """The atlas; cached."""
     topology = cage_topology()
     quads, count = topology.quads, topology.num_vertices
     loop = topology.palm[WRIST]
-    places = np.broadcast_to(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (len(quads), 4, 2))
+    coordinates = np.broadcast_to(
+        np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (len(quads), 4, 2)
+    )
     for _ in range(_LEVELS):
         loop = subdivided_loop(loop, quads, count)
         step, quads = catmull_clark(quads, count)
         count = step.shape[0]
-        places = _child_places(places)
+        coordinates = _child_coordinates(coordinates)
     # The stump behind the wrist goes: its strip of the palm and the faces that close it.
     behind = np.isin(topology.quads, topology.palm[:WRIST]).any(axis=1)
     kept = np.flatnonzero(~behind)
-    grids = _grids(quads, places, len(topology.quads))[kept]
+    grids = _grids(quads, coordinates, len(topology.quads))[kept]
     used = np.unique(grids)
     tiles = np.searchsorted(used, grids)
     wrist = np.searchsorted(used, loop)
     return _assemble(used, tiles, wrist)
 
 
-def _child_places(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places (4 Q, 4, 2) within their tile of the four children's corners, in `catmull_clark`'s order."""
-    following, before = np.roll(places, -1, axis=1), np.roll(places, 1, axis=1)
-    middle = np.broadcast_to(places.mean(axis=1, keepdims=True), places.shape)
-    children = np.stack([places, (places + following) / 2, middle, (places + before) / 2], axis=2)
+def _child_coordinates(coordinates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coordinates (4 Q, 4, 2) in their tile of the four children's corners, in `catmull_clark`'s order."""
+    following, before = np.roll(coordinates, -1, axis=1), np.roll(coordinates, 1, axis=1)
+    middle = np.broadcast_to(coordinates.mean(axis=1, keepdims=True), coordinates.shape)
+    children = np.stack(
+        [coordinates, (coordinates + following) / 2, middle, (coordinates + before) / 2], axis=2
+    )
     return children.reshape(-1, 4, 2)
 
 
-def _grids(quads: NDArray[np.int64], places: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+def _grids(quads: NDArray[np.int64], coordinates: NDArray[np.float64], count: int) -> NDArray[np.int64]:
     """Vertices (K, 5, 5) of each cage face's grid: rows go along its second axis."""
     grids = np.zeros((count, _SIDE + 1, _SIDE + 1), dtype=np.int64)
-    column, row = np.rint(places * _SIDE).astype(int).transpose(2, 0, 1)
+    column, row = np.rint(coordinates * _SIDE).astype(int).transpose(2, 0, 1)
     owner = np.repeat(np.arange(count), len(quads) // count)[:, None]
     grids[np.broadcast_to(owner, row.shape), row, column] = quads
     return grids

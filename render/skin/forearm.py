@@ -1,4 +1,4 @@
-"""The arm behind the hand: what a picture shows beyond the wrist, though no bone of ours moves it.
+"""`Forearm`, the arm behind the hand, which no bone of the hand model moves.
 
 Girths are shares of the hand's breadth: ANSUR II (2012) has wrists of 176 and 154 mm and flexed forearms of
 309 and 263 mm around for hands of 88.3 and 78.2 mm (men's and women's means); a forearm at rest is about a
@@ -26,9 +26,9 @@ FOREARM: Final = NUM_BONES
 _LONGEST: Final = 0.5  # [m]
 _WRIST_GIRTH: Final = 1.92  # [hand breadths]
 _ARM_GIRTH: Final = 3.0
-_WIDEST: Final = 1.05  # how far behind the wrist the arm is widest [hand lengths]
-_BLEND: Final = 0.22  # over which the hand's own section becomes the arm's [hand lengths]
-_BEND: Final = 0.20  # over which the wrist bends [hand lengths]
+_WIDEST: Final = 1.05  # position of the largest girth behind the wrist [hand lengths]
+_BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
+_BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,15 +40,15 @@ class Forearm:
     """
 
     length: float = 0.22
-    """Behind the wrist [m]."""
+    """Length behind the wrist [m]."""
     flexion: float = 0.0
-    """Of the wrist, towards the palm [rad]."""
+    """Flexion of the wrist towards the palm [rad]."""
     deviation: float = 0.0
-    """Of the wrist, towards the thumb [rad]."""
+    """Deviation of the wrist towards the thumb [rad]."""
     girth: float = 1.0
-    """Over the girth that goes with the hand's breadth."""
+    """Factor on the mean girth for the hand's breadth."""
     sleeve: float = 1.0
-    """Where a sleeve begins, behind the wrist [m]; beyond `length` where the arm is bare."""
+    """Start of a sleeve, behind the wrist [m]; beyond `length` for a bare arm."""
     sleeve_color: tuple[float, float, float] = (0.2, 0.25, 0.35)
     """sRGB in [0, 1]."""
 
@@ -62,7 +62,7 @@ class Forearm:
 def sample_forearm(*, rng: np.random.Generator) -> Forearm:
     """A random forearm: wrists within half their range, a sleeve on one in three.
 
-    It is straight and longer than an arm is to the elbow, so that it leaves the picture as arms do.
+    It is straight and longer than an arm is to the elbow, so that it extends beyond the picture.
     """
     length = rng.uniform(0.38, 0.48)
     flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
@@ -85,35 +85,35 @@ def forearm_rings(
     """Rings of skin behind the wrist's own, outwards from the hand, in the wrist's frame [m].
 
     Args:
-        shape: Whose arm.
-        forearm: How it is.
-        wrist: The ring that the arm joins.
-        rings: How many to make.
+        shape: Shape of the hand.
+        forearm: The forearm.
+        wrist: The wrist's ring, which the arm continues [m].
+        rings: Number of rings.
     """
     mirror = MIRROR if shape.side == "left" else np.eye(3)
     right = wrist @ mirror
     center = right.mean(axis=0)
     section = (right - center)[:, 1:]
-    lean = right[:, 0] - center[0]  # the wrist's ring is not quite plane
+    lean = right[:, 0] - center[0]  # the wrist's ring is not quite planar
     # Rings lie closer together near the wrist, where all the bending is.
-    reach = forearm.length * np.linspace(0.0, 1.0, rings + 1)[1:] ** 1.35
-    width, depth = _half_axes(shape, forearm, reach)
+    behind = forearm.length * np.linspace(0.0, 1.0, rings + 1)[1:] ** 1.35
+    width, depth = _half_axes(shape, forearm, behind)
     extent = np.abs(section).max(axis=0)
     angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
     round_section = np.stack([width[:, None] * np.cos(angle), depth[:, None] * np.sin(angle)], axis=-1)
-    share = _smooth(reach / (_BLEND * shape.length))[:, None, None]
+    share = _smooth(behind / (_BLEND * shape.length))[:, None, None]
     sections = (1.0 - share) * section + share * round_section
-    axes, middles = _course(shape, forearm, reach)
+    axes, middles = _course(shape, forearm, behind)
     local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
     points: NDArray[np.float64] = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
     return points @ mirror
 
 
 def _half_axes(
-    shape: HandShape, forearm: Forearm, reach: NDArray[np.float64]
+    shape: HandShape, forearm: Forearm, behind: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
-    share = _smooth(np.clip(reach / (_WIDEST * shape.length), 0.0, 1.0)) ** 0.9
+    share = _smooth(np.clip(behind / (_WIDEST * shape.length), 0.0, 1.0)) ** 0.9
     girth = forearm.girth * shape.breadth * (_WRIST_GIRTH + (_ARM_GIRTH - _WRIST_GIRTH) * share)
     flatness = 0.70 + 0.18 * share
     # Ramanujan's ellipse: its girth over its half width
@@ -123,17 +123,17 @@ def _half_axes(
 
 
 def _course(
-    shape: HandShape, forearm: Forearm, reach: NDArray[np.float64]
+    shape: HandShape, forearm: Forearm, behind: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Axes (K, 3, 3) and middles (K, 3) of the sections of an arm that bends at the wrist alone."""
-    fine = np.linspace(0.0, reach[-1], 200)
+    fine = np.linspace(0.0, behind[-1], 200)
     share = _smooth(fine / (_BEND * shape.length))
     # A hand that bends towards its palm (-z) or thumb (y) has its arm go there too, seen from the hand.
     up, aside = forearm.flexion * share, forearm.deviation * share
     ahead = np.stack([np.cos(up) * np.cos(aside), -np.sin(aside), np.sin(up) * np.cos(aside)], axis=-1)
     way = np.concatenate([np.zeros((1, 3)), np.cumsum(-ahead[:-1] * np.diff(fine)[:, None], axis=0)])
-    middles = np.stack([np.interp(reach, fine, way[:, i]) for i in range(3)], axis=-1)
-    x = np.stack([np.interp(reach, fine, ahead[:, i]) for i in range(3)], axis=-1)
+    middles = np.stack([np.interp(behind, fine, way[:, i]) for i in range(3)], axis=-1)
+    x = np.stack([np.interp(behind, fine, ahead[:, i]) for i in range(3)], axis=-1)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     z = np.array([0.0, 0.0, 1.0]) - x[:, 2:] * x
     z /= np.linalg.norm(z, axis=1, keepdims=True)
@@ -141,7 +141,7 @@ def _course(
 
 
 def _smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From 0 to 1 with level ends."""
+    """Smoothstep from 0 to 1."""
     inside = np.clip(share, 0.0, 1.0)
     result: NDArray[np.float64] = inside * inside * (3.0 - 2.0 * inside)
     return result

@@ -28,16 +28,16 @@ class GloveLook:
     """A glove's cloth in plain values.
 
     Raises:
-        HandSimError: The cuff does not reach behind the wrist.
+        HandSimError: The cuff does not extend behind the wrist.
     """
 
     color: tuple[float, float, float] = GLOVE_COLOR
     """sRGB in [0, 1]."""
     cuff: float = 0.04
-    """Where it ends, behind the wrist [m]."""
+    """End of the cuff, behind the wrist [m]."""
     roughness: float = 0.85
     wear: float = 1.0
-    """How uneven the cloth is, 1 for a used glove."""
+    """Unevenness of the cloth, 1 for a used glove."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -61,24 +61,24 @@ def sample_glove_look(*, rng: np.random.Generator) -> GloveLook:
 def glove_texture(
     look: GloveLook, skin: SkinTexture, forearm: Forearm | None = None, *, side: Side = "right"
 ) -> SkinTexture:
-    """Pull a glove over painted skin, of which nothing but the forearm behind the cuff stays to be seen.
+    """The texture of a glove over painted skin; only the forearm behind the cuff stays visible.
 
     Args:
         look: The glove.
-        skin: What is under it.
-        forearm: Whose skin it is; the cuff is placed by its length.
+        skin: The texture of the skin under it.
+        forearm: The forearm of the skin; its length scales the cuff.
         side: Of the hand.
     """
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     width, rows = skin_atlas().size
     length = REFERENCE.length if forearm is None else forearm.length
-    reach = -texels.places[:, 0] * length / REFERENCE.length
+    behind = -texels.positions[:, 0] * length / REFERENCE.length
     lab = cv2.cvtColor(np.array([[look.color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
-    cloth = noise(texels.places, (0.02, 0.006, 0.0025), rng=rng)
-    hem = bump(reach - look.cuff + 0.004, 0.0015)
+    cloth = noise(texels.positions, (0.02, 0.006, 0.0025), rng=rng)
+    hem = bump(behind - look.cuff + 0.004, 0.0015)
     painted = lab + (look.wear * 2.0 * cloth - 5.0 * hem)[:, None] * [1.0, 0.0, 0.0]
     height = look.wear * 1.2e-4 * cloth - 4e-4 * hem
-    covered = (reach < look.cuff).reshape(rows, width, 1)
+    covered = (behind < look.cuff).reshape(rows, width, 1)
     rough = np.uint8(round(255.0 * look.roughness))
     return SkinTexture(
         np.where(covered, lab_to_srgb(painted.reshape(rows, width, 3)), skin.color),

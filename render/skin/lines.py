@@ -26,10 +26,10 @@ _WRIST_LINES: Final = (-0.001, -0.009)  # across the palm's side of the wrist [m
 
 @functools.cache
 def _palm_distances() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Texels of the palm, and how far each of the palm's lines is from them [m]."""
+    """Texels of the palm (K,), and the distance of each palm line from them (3, K) [m]."""
     texels = skin_texels()
-    near = np.flatnonzero((texels.dorsal < 0.1) & (texels.places[:, 0] > -0.02))
-    points = texels.places[near, :2]
+    near = np.flatnonzero((texels.dorsal < 0.1) & (texels.positions[:, 0] > -0.02))
+    points = texels.positions[near, :2]
     distances = np.full((len(_PALM_LINES), len(near)), np.inf)
     for number, line in enumerate(_PALM_LINES):
         knots = 1e-3 * np.array(line)
@@ -45,7 +45,7 @@ def _palm_distances() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
 
 
 def line_depth(rng: np.random.Generator) -> NDArray[np.float64]:
-    """How deep in a line of the palm, a crease of a finger or a wrinkle of a knuckle each texel lies."""
+    """Depth of each texel (N,) in a palm line, finger crease or knuckle wrinkle; 1 for a deep line."""
     texels = skin_texels()
     back = texels.back
     depth = np.zeros(len(back))
@@ -56,27 +56,29 @@ def line_depth(rng: np.random.Generator) -> NDArray[np.float64]:
     for distance in distances:
         wobble = rng.uniform(0.8, 1.2)
         depth[near] = np.maximum(depth[near], wobble * on_palm * bump(distance, 0.0011))
-    x = texels.places[:, 0]
-    for place in _WRIST_LINES:
-        depth = np.maximum(depth, 0.35 * bump(x - place, 0.0009) * (1.0 - back))
+    x = texels.positions[:, 0]
+    for position in _WRIST_LINES:
+        depth = np.maximum(depth, 0.35 * bump(x - position, 0.0009) * (1.0 - back))
     for number, digit in enumerate(texels.digits):
         mine, joints = digit.texels, np.cumsum(digit.lengths)[:2]
         pad = 1.0 - back[mine]
-        waves = 0.0006 * np.sin(3.0 * digit.turn + rng.uniform(0.0, 6.0))
+        waves = 0.0006 * np.sin(3.0 * digit.angle + rng.uniform(0.0, 6.0))
         # Palmar creases lie off the joints: Bugbee and Botte 1993, Clin. Orthop. Relat. Res. 296:122.
         creases = [(joints[0] - 0.0025, 1.0), (joints[0] + 0.0004, 0.5)]
         if number:
             creases += [(joints[1] - 0.0075, 0.9), (0.017, 0.9)]
-        for place, strength in creases:
-            here = strength * pad * digit.share * bump(digit.along - place - waves, 0.0009)
+        for position, strength in creases:
+            here = strength * pad * digit.share * bump(digit.along - position - waves, 0.0009)
             depth[mine] = np.maximum(depth[mine], here)
         for joint, count, spacing in ((joints[0], 5, 0.0020), (joints[1], 4, 0.0014)):
-            places = joint + spacing * (np.arange(count) - (count - 1) / 2) + rng.normal(0.0, 0.0003, count)
-            arch = 0.0015 * np.cos(digit.turn)  # wrinkles bow
-            for number_here, place in enumerate(places):
+            positions = (
+                joint + spacing * (np.arange(count) - (count - 1) / 2) + rng.normal(0.0, 0.0003, count)
+            )
+            arch = 0.0015 * np.cos(digit.angle)  # wrinkles are curved
+            for number_here, position in enumerate(positions):
                 bow = arch * (number_here - (count - 1) / 2) / count * 2.0
-                here = 0.55 * back[mine] * digit.share * bump(digit.along - place - bow, 0.0006)
-                depth[mine] = np.maximum(depth[mine], here * smooth(np.cos(digit.turn), -0.1, 0.6))
+                here = 0.55 * back[mine] * digit.share * bump(digit.along - position - bow, 0.0006)
+                depth[mine] = np.maximum(depth[mine], here * smooth(np.cos(digit.angle), -0.1, 0.6))
     return depth
 
 

@@ -1,8 +1,8 @@
-"""What somebody's skin looks like, in plain values, and how such people are drawn.
+"""`SkinLook`, a person's skin in plain values, and its distribution.
 
 Tones go by the individual typology angle, arctan((L* - 50) / b*) in degrees, and its six classes (Chardon,
 Cretois and Hourseau 1991, Int. J. Cosmet. Sci. 13:191). Redness and yellowness over that angle are our own
-choice: chroma is highest in the middle and falls towards both ends. Palms hold little pigment in everybody,
+choice: chroma is highest in the middle and falls towards both ends. All palms hold little pigment,
 so that dark hands have palms much lighter than their backs.
 """
 
@@ -23,7 +23,7 @@ TONES: Final[dict[str, tuple[float, float]]] = {
     "brown": (-30.0, 10.0),
     "dark": (-52.0, -30.0),
 }
-"""Individual typology angles [deg] of the classes; the outer two end where measured skin does."""
+"""Individual typology angles [deg] of the classes; the outer two end at the limits of measured skin."""
 ALL_TONES: Final = (TONES["dark"][0], TONES["very light"][1])
 _ANGLES: Final = (-52.0, -30.0, 0.0, 20.0, 35.0, 50.0, 64.0)
 _YELLOWNESS: Final = (12.0, 15.5, 18.5, 18.5, 17.5, 15.5, 12.5)  # CIELAB b* of the back of the hand
@@ -35,7 +35,7 @@ class SkinLook:
     """One person's skin. Colors are CIELAB (D65); strengths are factors, 1 for an average adult.
 
     Raises:
-        HandSimError: The lightness is none of CIELAB's, or the roughness not within 0 and 1.
+        HandSimError: The lightness is not within 0 and 100, or the roughness not within 0 and 1.
     """
 
     lightness: float = 62.0
@@ -47,15 +47,15 @@ class SkinLook:
     palm_lightness: float = 66.0
     """L* of the palm."""
     flush: float = 1.0
-    """How much redder finger tips, knuckles and the balls of the hand are."""
+    """Redness of finger tips, knuckles and the balls of the hand."""
     blotches: float = 1.0
-    """How uneven the color is."""
+    """Unevenness of the color."""
     creases: float = 1.0
-    """How dark lines of the palm and wrinkles of the knuckles are."""
+    """Darkness of palm lines and knuckle wrinkles."""
     veins: float = 1.0
-    """How well veins show through the back."""
+    """Visibility of veins on the back."""
     relief: float = 1.0
-    """How far tendons, knuckles and the skin's grain stand out."""
+    """Height of tendons, knuckles and the skin's grain."""
     nail: tuple[float, float, float] = (4.0, 5.0, -3.0)
     """L*, a*, b* of the nails above the skin's."""
     polish: float = 0.0
@@ -63,9 +63,9 @@ class SkinLook:
     polish_color: tuple[float, float, float] = (40.0, 50.0, 20.0)
     """CIELAB."""
     roughness: float = 0.55
-    """Of the microfacet model: 0 a mirror, 1 chalk."""
+    """Roughness of the microfacet model, from 0 (mirror) to 1 (chalk)."""
     seed: int = 0
-    """Where blotches, veins and the course of lines are."""
+    """Seed of blotches, veins and lines."""
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.lightness <= 100.0 and 0.0 <= self.palm_lightness <= 100.0):
@@ -95,8 +95,8 @@ def sample_skin_look(tones: tuple[float, float] = ALL_TONES, *, rng: np.random.G
     """A random person's skin.
 
     Args:
-        tones: Between which typology angles [deg] to draw evenly; see `TONES`.
-        rng: Where the choices come from.
+        tones: Range of typology angles [deg], drawn uniformly; see `TONES`.
+        rng: Source of the random choices.
     """
     angle = rng.uniform(*tones)
     yellowness = float(np.interp(angle, _ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))

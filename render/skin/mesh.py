@@ -1,7 +1,7 @@
-"""The skin as it is drawn: the hand's own surface on a forearm, with normals, shade, parts and texture.
+"""The drawn skin: the hand's surface on a forearm, with normals, shade, parts and texture coordinates.
 
-The hand's vertices are `HandModel.skin`'s, so that pictures show what occlusion was computed from; from the
-wrist's ring on, the short stump that closes that surface gives way to the forearm.
+The hand's vertices are `HandModel.skin`'s, so that pictures show the surface behind all occlusion;
+the forearm replaces the short stump behind the wrist.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, UInt8
     from numpy.typing import NDArray
 
-_DARKEST: Final = 0.12  # no skin lies so deep that no light gets there
+_DARKEST: Final = 0.12  # even the deepest folds receive some light
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnSkin:
-    """One hand in one pose, ready for the triangles of OpenGL."""
+    """One hand in one pose, with the vertices that OpenGL needs."""
 
     vertices: Float32[np.ndarray, "D 3"]
-    """In the world [m]; those on the borders of texture tiles come once for each tile."""
+    """In the world [m]; vertices on borders of texture tiles are repeated for each tile."""
     normals: Float32[np.ndarray, "D 3"]
     """Outward unit normals."""
     uv: Float32[np.ndarray, "D 2"]
-    """Places in the texture, the origin at its bottom left."""
+    """Texture coordinates, the origin at the bottom left."""
     shade: Float32[np.ndarray, "D"]
-    """Share of the light from all around that gets there past the hand itself, 0 to 1."""
+    """Share of the ambient light that the hand itself does not block, 0 to 1."""
     faces: Int[np.ndarray, "F 3"]
     """Triangles, counter-clockwise from outside."""
     parts: UInt8[np.ndarray, "F"]
-    """Bone of each triangle, a place in `topology.BONES` or `FOREARM`."""
+    """Bone of each triangle, an index of `topology.BONES` or `FOREARM`."""
 
 
 class SkinMesh:
@@ -50,7 +50,7 @@ class SkinMesh:
 
     Args:
         model: The hand.
-        forearm: What it sits on.
+        forearm: The forearm behind it.
     """
 
     def __init__(self, model: HandModel, forearm: Forearm | None = None) -> None:
@@ -72,7 +72,7 @@ class SkinMesh:
         self._corner_faces = np.ascontiguousarray(
             atlas.corner_faces[:, ::-1] if mirrored else atlas.corner_faces
         )
-        self._rest_shade = self._open_sky(model.rest_transforms[None], self.rest, self.faces)
+        self._rest_occluded = self._rest_occlusion(model.rest_transforms[None], self.rest, self.faces)
 
     def posed(self, qpos: Float[np.ndarray, "27"]) -> DrawnSkin:
         """The skin in one pose.
@@ -84,8 +84,8 @@ class SkinMesh:
         transforms = self.model.forward_kinematics(qpos[None])
         points = self.merged(transforms)
         normals = vertex_normals(points, self.faces)
-        hidden = self._hidden(transforms, points, normals)
-        shade = np.clip(1.0 - np.maximum(hidden - self._rest_shade, 0.0), _DARKEST, 1.0)
+        occluded = self._occluded(transforms, points, normals)
+        shade = np.clip(1.0 - np.maximum(occluded - self._rest_occluded, 0.0), _DARKEST, 1.0)
         corners = atlas.corners
         return DrawnSkin(
             points[corners].astype(np.float32),
@@ -103,20 +103,20 @@ class SkinMesh:
         )[0]
         return points
 
-    def _open_sky(
+    def _rest_occlusion(
         self, transforms: NDArray[np.float64], points: NDArray[np.float64], faces: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """What neighboring capsules hide in the flat hand, where they are the same flesh."""
-        return self._hidden(transforms, points, vertex_normals(points, faces))
+        """Occlusion by neighboring capsules in the flat hand, where they are the same flesh."""
+        return self._occluded(transforms, points, vertex_normals(points, faces))
 
-    def _hidden(
+    def _occluded(
         self, transforms: NDArray[np.float64], points: NDArray[np.float64], normals: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         capsules = self.model.capsules
-        hidden: NDArray[np.float64] = _hidden_share(
+        occluded: NDArray[np.float64] = _occluded_share(
             points, normals, capsules.posed(transforms)[0], capsules.radii * 1.2
         )
-        return hidden
+        return occluded
 
 
 @functools.cache
@@ -133,9 +133,16 @@ def face_parts() -> UInt8[np.ndarray, "F"]:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _hidden_share(points: Any, normals: Any, segments: Any, radii: Any) -> Any:
-    """Share of each point's sky behind capsules, each taken for the ball that is nearest in it."""
-    hidden = np.empty(len(points))
+def _occluded_share(points: Any, normals: Any, segments: Any, radii: Any) -> Any:
+    """Share (V,) of each point's hemisphere behind capsules, each replaced by its nearest ball.
+
+    Args:
+        points: Positions (V, 3) [m].
+        normals: Unit normals (V, 3).
+        segments: Ends of the capsules (K, 2, 3) [m].
+        radii: Radii of the capsules (K,) [m].
+    """
+    occluded = np.empty(len(points))
     axes = segments[:, 1] - segments[:, 0]
     for v in range(len(points)):
         free = 1.0
@@ -153,5 +160,5 @@ def _hidden_share(points: Any, normals: Any, segments: Any, radii: Any) -> Any:
             if facing > 0.0:
                 ratio = radii[k] * radii[k] / max(distance, radii[k] * radii[k])
                 free *= 1.0 - 0.85 * ratio * min(facing / np.sqrt(distance), 1.0)
-        hidden[v] = 1.0 - free
-    return hidden
+        occluded[v] = 1.0 - free
+    return occluded

@@ -1,6 +1,6 @@
 """Fine relief of the skin as a normal map: nails, tendons, knuckles, creases and grain, under a millimeter.
 
-The drawn mesh stays as it is, and so do depth and silhouettes; light alone tells of the relief.
+The drawn mesh stays as it is, and so do depth and silhouettes; only shading shows the relief.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ if TYPE_CHECKING:
 
     from handsim.hand.topology import Side
 
-_STEEPEST: Final = 0.9  # slope
+_STEEPEST: Final = 0.9  # height over distance
 
 
-class _Slopes(NamedTuple):
-    """How differences between neighboring texels become slopes along the tangents (N,) [1/m]."""
+class _TangentScales(NamedTuple):
+    """Scales (N,) from height differences of neighboring texels to gradients along the tangents [1/m]."""
 
     across: NDArray[np.float64]
-    """Of the difference along the row, for the first tangent."""
+    """Scale of the difference along the row, for the first tangent."""
     skew: NDArray[np.float64]
-    """Of the first slope, for the second tangent: tiles are no rectangles."""
+    """Share of the first gradient in the second tangent: tiles are not rectangles."""
     down: NDArray[np.float64]
-    """Of the difference along the column, for the second tangent."""
+    """Scale of the difference along the column, for the second tangent."""
 
 
 def normal_map(height: NDArray[np.float64], side: Side) -> UInt8[np.ndarray, "H W 3"]:
-    """Normals over the skin's own, in the axes that pyrender's shader finds: along u, and normal x that.
+    """Normal map in the tangent frame of pyrender's shader: along u, and normal x that.
 
     Args:
-        height: Of the relief at each texel [m] (N,).
-        side: A left hand's second axis runs the other way.
+        height: Height of the relief at each texel (N,) [m].
+        side: A left hand's second axis has the other sign.
     """
     width, rows = skin_atlas().size
     across, down = _differences(height.reshape(rows, width, 1))
-    slopes = _slopes()
-    first = slopes.across * across.ravel()
-    second = slopes.down * down.ravel() - slopes.skew * first
+    scales = _tangent_scales()
+    first = scales.across * across.ravel()
+    second = scales.down * down.ravel() - scales.skew * first
     if side == "left":
         second = -second
     tilt = np.stack([-first, -second], axis=1)
@@ -73,36 +73,38 @@ def _differences(grid: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 @functools.cache
 def relief() -> NDArray[np.float64]:
-    """Height [m] of what every hand has: tendons to the four fingers, knuckles, and hollows between them."""
+    """Height (N,) [m] of the relief of every hand: tendons, knuckles, and hollows between them."""
     texels, shape = skin_texels(), named_shape("M")
-    back = smooth(texels.dorsal, -0.25, 0.35)  # of each digit, the thumb's turned aside
-    places = texels.places[:, :2]
-    height = np.zeros(len(places))
+    back = smooth(texels.dorsal, -0.25, 0.35)  # of each digit; the thumb's faces sideways
+    positions = texels.positions[:, :2]
+    height = np.zeros(len(positions))
     knuckles = shape.knuckles[1:, :2]
     for knuckle in knuckles:
         root = np.array([0.1, 0.35]) * knuckle  # tendons meet at the wrist
-        along = np.clip((places - root) @ (knuckle - root) / ((knuckle - root) @ (knuckle - root)), 0.0, 1.0)
-        aside = np.linalg.norm(places - root - along[:, None] * (knuckle - root), axis=1)
+        along = np.clip(
+            (positions - root) @ (knuckle - root) / ((knuckle - root) @ (knuckle - root)), 0.0, 1.0
+        )
+        aside = np.linalg.norm(positions - root - along[:, None] * (knuckle - root), axis=1)
         height += 0.00025 * smooth(along, 0.2, 0.8) * bump(aside, 0.0032)
-        height += 0.0005 * bump(np.linalg.norm(places - knuckle, axis=1), 0.0065)
+        height += 0.0005 * bump(np.linalg.norm(positions - knuckle, axis=1), 0.0065)
     for hollow in 0.5 * (knuckles[:-1] + knuckles[1:]) + [0.004, 0.0]:
-        height -= 0.0004 * bump(np.linalg.norm(places - hollow, axis=1), 0.0055)
+        height -= 0.0004 * bump(np.linalg.norm(positions - hollow, axis=1), 0.0055)
     height *= back * texels.palm
     for digit in texels.digits:
         for joint, high, wide in zip(
             np.cumsum(digit.lengths)[:2], (0.0005, 0.0003), (0.006, 0.0045), strict=True
         ):
-            knob = high * bump(digit.along - joint, wide) * bump(digit.turn, 1.0)
+            knob = high * bump(digit.along - joint, wide) * bump(digit.angle, 1.0)
             height[digit.texels] += knob * back[digit.texels] * digit.share
     return height
 
 
 @functools.cache
-def _slopes() -> _Slopes:
+def _tangent_scales() -> _TangentScales:
     width, rows = skin_atlas().size
     texels = skin_texels()
     along_row, along_column = (
-        difference.reshape(-1, 3) for difference in _differences(texels.places.reshape(rows, width, 3))
+        difference.reshape(-1, 3) for difference in _differences(texels.positions.reshape(rows, width, 3))
     )
     normals = texels.normals
     first = along_row - (along_row * normals).sum(axis=1, keepdims=True) * normals
@@ -111,4 +113,4 @@ def _slopes() -> _Slopes:
     second = np.cross(normals, first)
     aside, ahead = (along_column * first).sum(axis=1), (along_column * second).sum(axis=1)
     ahead = np.where(np.abs(ahead) < 2e-5, np.copysign(2e-5, ahead), ahead)
-    return _Slopes(1.0 / length, aside / ahead, 1.0 / ahead)
+    return _TangentScales(1.0 / length, aside / ahead, 1.0 / ahead)

@@ -1,6 +1,6 @@
-"""Where on the hand each texel lies: the anatomy that colors are painted by, measured on one reference hand.
+"""The anatomy at each texel: position, normal, side of the hand and digit, on one reference hand.
 
-All of it is computed once a process, on a right hand of size M with its fingers straight.
+It is computed once per process, on a right hand of size M with its fingers straight.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ class DigitTexels(NamedTuple):
     """The texels (K,) of one digit."""
 
     texels: NDArray[np.int64]
-    """Places in the texture's N texels."""
+    """Indices (K,) of the texture's N texels."""
     along: NDArray[np.float64]
     """Distance from the digit's first joint [m]."""
-    turn: NDArray[np.float64]
-    """Angle about the digit from the middle of its back [rad], to the thumb's side positive."""
+    angle: NDArray[np.float64]
+    """Angle about the digit from the middle of its back [rad], positive towards the thumb's side."""
     share: NDArray[np.float64]
-    """How much of the skin there moves with the digit."""
+    """Share of the skin that moves with the digit."""
     lengths: NDArray[np.float64]
-    """The three bones [m]."""
+    """Lengths of the three bones [m]."""
     radius: float
     """Of the skin behind the tip [m]."""
 
@@ -45,7 +45,7 @@ class DigitTexels(NamedTuple):
 class Texels(NamedTuple):
     """All N = width x height texels, row by row from the texture's top; unused ones repeat a used one."""
 
-    places: NDArray[np.float64]
+    positions: NDArray[np.float64]
     """On the reference hand's skin, in the wrist's frame [m] (N, 3)."""
     normals: NDArray[np.float64]
     """Outward unit normals (N, 3)."""
@@ -60,7 +60,7 @@ class Texels(NamedTuple):
 
 @functools.cache
 def skin_texels() -> Texels:
-    """The one map of texels."""
+    """The texels; cached."""
     model, atlas = HandModel.named("M"), skin_atlas()
     mesh = SkinMesh(model, REFERENCE)
     normals = vertex_normals(mesh.rest, mesh.faces)
@@ -74,16 +74,16 @@ def skin_texels() -> Texels:
     # The thumb's metacarpal is flesh of the palm: its skin is colored as the palm's
     values = np.concatenate([mesh.rest, normals, dorsal[:, None], weights], axis=1)
     grid = _spread(values)
-    places, normals, dorsal, weights = grid[:, :3], grid[:, 3:6], grid[:, 6], grid[:, 7:]
+    positions, normals, dorsal, weights = grid[:, :3], grid[:, 3:6], grid[:, 6], grid[:, 7:]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    digits = tuple(_digit_texels(model, digit, places, weights) for digit in range(len(DIGITS)))
-    # The thumb's own back is turned aside, but what of it is seen from the hand's back is no palm's skin.
+    digits = tuple(_digit_texels(model, digit, positions, weights) for digit in range(len(DIGITS)))
+    # The thumb's back faces sideways, but the part of it on the hand's back does not have the palm's skin.
     back = smooth(np.maximum(dorsal, normals[:, 2]), -0.25, 0.35)
-    return Texels(places, normals, dorsal, back, weights[:, 0], digits)
+    return Texels(positions, normals, dorsal, back, weights[:, 0], digits)
 
 
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Values (U, C) of the drawn vertices at every texel (N, C), straight between the vertices."""
+    """Values (U, C) of the drawn vertices at every texel (N, C), interpolated linearly."""
     atlas = skin_atlas()
     width, height = atlas.size
     nodes = atlas.tiles.shape[1]
@@ -103,23 +103,23 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _between(nodes: int, texels: int) -> NDArray[np.float64]:
-    """Matrix (texels, nodes) of straight lines between nodes, the outer texels on the outer nodes."""
-    place = np.linspace(0.0, nodes - 1.0, texels)
-    low = np.minimum(place.astype(int), nodes - 2)
+    """Matrix (texels, nodes) of linear interpolation between nodes, the outer texels on the outer nodes."""
+    position = np.linspace(0.0, nodes - 1.0, texels)
+    low = np.minimum(position.astype(int), nodes - 2)
     matrix = np.zeros((texels, nodes))
-    matrix[np.arange(texels), low] = 1.0 - (place - low)
-    matrix[np.arange(texels), low + 1] = place - low
+    matrix[np.arange(texels), low] = 1.0 - (position - low)
+    matrix[np.arange(texels), low + 1] = position - low
     return matrix
 
 
 def _digit_texels(
-    model: HandModel, digit: int, places: NDArray[np.float64], weights: NDArray[np.float64]
+    model: HandModel, digit: int, positions: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> DigitTexels:
     first = 1 + 3 * digit
     share = weights[:, first : first + 3].sum(axis=1)
     texels = np.flatnonzero(share > 0.02)
     frame = model.rest_transforms[first]
-    local = (places[texels] - frame[:3, 3]) @ frame[:3, :3]
-    turn = np.arctan2(local[:, 1], local[:, 2])
+    local = (positions[texels] - frame[:3, 3]) @ frame[:3, :3]
+    angle = np.arctan2(local[:, 1], local[:, 2])
     lengths = model.shape.bone_lengths[digit]
-    return DigitTexels(texels, local[:, 0], turn, share[texels], lengths, float(model.shape.radii[digit, 3]))
+    return DigitTexels(texels, local[:, 0], angle, share[texels], lengths, float(model.shape.radii[digit, 3]))

@@ -31,32 +31,32 @@ class SkinTexture(NamedTuple):
     roughness: UInt8[np.ndarray, "H W"]
     """Roughness of the microfacet model, 255 for 1."""
     normals: UInt8[np.ndarray, "H W 3"]
-    """Relief over the drawn normals, see `skin_relief.normal_map`."""
+    """Relief over the drawn normals, see `render.skin.relief.normal_map`."""
 
 
 class _Paint(NamedTuple):
-    """What is painted, texel by texel; all three are written to."""
+    """Color, roughness and height of each texel; all three are written."""
 
     lab: NDArray[np.float64]
     """CIELAB."""
     roughness: NDArray[np.float64]
     height: NDArray[np.float64]
-    """Of the relief [m]."""
+    """Height of the relief (N,) [m]."""
 
 
 def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side = "right") -> SkinTexture:
-    """Paint a skin; the same look gives the same texels.
+    """Paint a skin; equal looks give equal texels.
 
     Args:
         look: The skin.
-        forearm: Its sleeve is painted too.
-        side: Of the hand; colors are the same on both.
+        forearm: Forearm whose sleeve is painted too.
+        side: Side of the hand; colors are equal on both.
     """
     color, roughness, height = _painted(look, forearm)
     return SkinTexture(color, roughness, normal_map(height, side))
 
 
-@functools.lru_cache(maxsize=2)  # both hands of a person have the same
+@functools.lru_cache(maxsize=2)  # both hands of a person share it
 def _painted(
     look: SkinLook, forearm: Forearm | None
 ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], NDArray[np.float64]]:
@@ -65,19 +65,19 @@ def _painted(
     back = texels.back
     lab = np.empty((len(back), 3))
     lab[:, 0] = look.palm_lightness + back * (look.lightness - look.palm_lightness)
-    # The palm of a dark hand is no redder or yellower than other palms: chroma goes with the pigment.
+    # The palm of a dark hand is not redder or yellower than other palms: chroma depends on the pigment.
     lab[:, 1] = 15.0 + back * (look.redness - 15.0)
     lab[:, 2] = 16.0 + back * (look.yellowness - 16.0)
     _flush(lab, look)
     veins = _veins(rng)
     lab += look.veins * veins[:, None] * [-1.6, -1.6, -2.2]
-    blotches = noise(texels.places, (0.05, 0.018, 0.007, 0.003), rng=rng)
+    blotches = noise(texels.positions, (0.05, 0.018, 0.007, 0.003), rng=rng)
     lab += look.blotches * blotches[:, None] * [1.0, -0.6, 0.2]
     lines = np.clip(line_depth(rng), 0.0, 1.0)
-    # Pigment gathers in the lines; how dark they are goes with the contrast that the skin has room for.
+    # Pigment collects in the lines; their darkness depends on the contrast that the skin allows.
     lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
     height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins
-    height += look.relief * 2e-5 * noise(texels.places, (0.0035, 0.0018), rng=rng)
+    height += look.relief * 2e-5 * noise(texels.positions, (0.0035, 0.0018), rng=rng)
     paint = _Paint(lab, np.minimum(look.roughness + 0.1 * (1.0 - back), 1.0), height)
     _nails(paint, look)
     if forearm is not None and forearm.sleeve < forearm.length:
@@ -88,7 +88,7 @@ def _painted(
 
 
 def lab_to_srgb(lab: NDArray[np.float64]) -> UInt8[np.ndarray, "H W 3"]:
-    """SRGB of CIELAB colors (D65), cut to what sRGB holds."""
+    """SRGB of CIELAB colors (D65), clipped to the gamut of sRGB."""
     rgb = cv2.cvtColor(lab.astype(np.float32), cv2.COLOR_Lab2RGB)
     color: NDArray[np.uint8] = np.rint(255.0 * np.clip(rgb, 0.0, 1.0)).astype(np.uint8)
     return color
@@ -106,10 +106,10 @@ def _flush(lab: NDArray[np.float64], look: SkinLook) -> None:
         for joint, width in ((0.0, 0.010), (first, 0.0075), (middle, 0.006)):
             if number == 0 and joint == 0.0:
                 continue  # the thumb's first joint lies deep under the skin
-            knuckle = bump(digit.along - joint, width) * back[mine] * np.abs(np.cos(digit.turn / 2))
+            knuckle = bump(digit.along - joint, width) * back[mine] * np.abs(np.cos(digit.angle / 2))
             darker = -1.5 - 0.06 * max(0.0, 60.0 - look.lightness)
             lab[mine] += look.flush * knuckle[:, None] * [darker, 1.8, 0.3]
-    x, y = 1e3 * texels.places[:, 0], 1e3 * texels.places[:, 1]
+    x, y = 1e3 * texels.positions[:, 0], 1e3 * texels.positions[:, 1]
     palm = 1.0 - back
     hollow = np.exp(-(((x - 50.0) / 22.0) ** 2) - (((y + 2.0) / 14.0) ** 2)) * palm
     lab += look.flush * hollow[:, None] * [1.0, -3.0, 0.8]
@@ -119,10 +119,10 @@ def _flush(lab: NDArray[np.float64], look: SkinLook) -> None:
 
 
 def _veins(rng: np.random.Generator) -> NDArray[np.float64]:
-    """How much of a vein shows at each texel: three of them wind along the back of hand and forearm."""
+    """Visibility of veins at each texel (N,): three of them wind along the back of hand and forearm."""
     texels = skin_texels()
     back = texels.back
-    x, y = texels.places[:, 0], texels.places[:, 1]
+    x, y = texels.positions[:, 0], texels.positions[:, 1]
     near = np.flatnonzero((back > 0.5) & (x > -0.16) & (x < 0.085))
     x, y = x[near], y[near]
     veins = np.zeros(len(back))
@@ -142,7 +142,7 @@ def _nails(paint: _Paint, look: SkinLook) -> None:
         middle, half = 0.5 * (start + end), 0.5 * (end - start)
         wide = 1.0 if number else 1.12
         a = (digit.along - middle) / half
-        b = digit.turn / wide
+        b = digit.angle / wide
         where = np.abs(b) < 1.6
         shape = (np.abs(a) ** 3.2 + np.abs(b) ** 3.2) ** (1 / 3.2)
         plate = (1.0 - smooth(shape, 0.93, 1.03)) * where
@@ -163,12 +163,12 @@ def _nails(paint: _Paint, look: SkinLook) -> None:
 
 def _sleeve(paint: _Paint, forearm: Forearm, rng: np.random.Generator) -> None:
     """Cloth from some way behind the wrist on, with folds as darker and lighter bands."""
-    places = skin_texels().places
-    reach = -places[:, 0] * forearm.length / REFERENCE.length
-    cloth = smooth(reach, forearm.sleeve - 0.0015, forearm.sleeve + 0.0015)
+    positions = skin_texels().positions
+    behind = -positions[:, 0] * forearm.length / REFERENCE.length
+    cloth = smooth(behind, forearm.sleeve - 0.0015, forearm.sleeve + 0.0015)
     color = cv2.cvtColor(np.array([[forearm.sleeve_color]], dtype=np.float32), cv2.COLOR_RGB2Lab)[0, 0]
-    folds = noise(places * [0.5, 1.0, 1.0], (0.03, 0.012), rng=rng)
-    hem = bump(reach - forearm.sleeve, 0.0025)
+    folds = noise(positions * [0.5, 1.0, 1.0], (0.03, 0.012), rng=rng)
+    hem = bump(behind - forearm.sleeve, 0.0025)
     painted = color + (4.0 * folds - 9.0 * hem)[:, None] * [1.0, 0.0, 0.0]
     paint.lab[:] += cloth[:, None] * (painted - paint.lab)
     paint.roughness[:] += cloth * (0.9 - paint.roughness)

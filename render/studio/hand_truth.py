@@ -1,4 +1,4 @@
-"""What is known of a hand in a picture: its keypoints, which of them are seen, and its box."""
+"""Ground truth of a hand in a picture: its keypoints, their visibility, and its box."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _FIRST_JOINTS: Final = np.arange(NUM_KEYPOINTS) % 4 == 1
-_DEEP: Final = 0.03  # [m] that a keypoint may lie under its own skin; deeper it is another fold of it
+_DEEP: Final = 0.03  # [m] that a keypoint may lie under its own skin; deeper, it is behind another fold
 
 
 def hand_truth(
     figure: HandFigure, qpos: Float[np.ndarray, "27"], number: int, camera: Camera, pictures: Pictures
 ) -> HandTruth:
-    """All that is known of one hand.
+    """Ground truth of one hand.
 
     Args:
         figure: The hand.
-        qpos: Its pose.
-        number: Its place among those in the picture.
-        camera: Who looks.
-        pictures: Depth and parts as that camera has them.
+        qpos: Pose of the hand.
+        number: Index of the hand among those in the picture.
+        camera: The camera.
+        pictures: Depth and parts of that camera.
     """
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
@@ -73,7 +73,7 @@ def _visible(
 
 
 def _box(parts: UInt8[np.ndarray, "H W"], number: int) -> Float[np.ndarray, "4"]:
-    """Left, top, width, height of what is seen of a hand without its forearm."""
+    """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     first = 1 + PARTS_A_HAND * number
     mine = (parts >= first) & (parts < first + FOREARM)
     columns, rows = np.flatnonzero(mine.any(axis=0)), np.flatnonzero(mine.any(axis=1))

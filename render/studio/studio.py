@@ -1,4 +1,4 @@
-"""One frame of a take as one camera sees it: pictures, and the truth about all that is in them."""
+"""`Studio`, which draws single frames of a take for one camera, with their ground truth."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class FrameChoices:
-    """Everything about a picture that is chosen, beside the people and the camera."""
+    """Random choices of one picture, apart from people and camera."""
 
     lighting: Lighting
     background: Background
@@ -46,18 +46,18 @@ class FrameChoices:
     depth_noise: DepthNoise | None
     """None for a perfect depth sensor."""
     seed: int
-    """Of the sensors' noise."""
+    """Seed of the sensors' noise."""
 
 
 class Studio:
     """Draws frames of one take with the same people.
 
     Args:
-        take: What happens.
-        people: How each of its hands looks.
-        body_colors: Of each of its things, sRGB in [0, 1].
+        take: The take.
+        people: Appearance of each of its hands.
+        body_colors: Color of each of its rigid bodies, sRGB in [0, 1].
         passes: Some of `PASSES`.
-        painter: Who paints colors.
+        painter: What paints colors.
     """
 
     def __init__(
@@ -82,9 +82,9 @@ class Studio:
         """Draw one frame.
 
         Args:
-            frame: Its number in the take.
-            camera: Who looks.
-            choices: What else is to be decided.
+            frame: Number of the frame in the take.
+            camera: The camera.
+            choices: All other choices.
 
         Raises:
             HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
@@ -105,31 +105,31 @@ class Studio:
                 truth.depth, truth.normals, sensor, camera=camera, reflectance=light, rng=rng
             )
         hands = tuple(
-            hand_truth(self._hands[number], self.take.hands[number].qpos[frame], place, camera, truth)
-            for place, number in enumerate(present)
+            hand_truth(self._hands[number], self.take.hands[number].qpos[frame], index, camera, truth)
+            for index, number in enumerate(present)
         )
         bodies = tuple(
             BodyTruth(body.name, body.T_world_body[frame])
             for body in self.take.bodies
             if np.isfinite(body.T_world_body[frame]).all()
         )
-        there = np.isfinite(self.take.points[frame, :, 0])
+        known = np.isfinite(self.take.points[frame, :, 0])
         return RenderedFrame(
             number=frame,
             time=float(self.take.times[frame]),
             camera=camera,
             hands=hands,
             bodies=bodies,
-            ideal=self._asked_for(truth, rgb),
+            ideal=self._requested(truth, rgb),
             noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
-            points=self.take.points[frame, there],
-            labels=self.take.labels[frame, there],
+            points=self.take.points[frame, known],
+            labels=self.take.labels[frame, known],
             label_names=self.take.label_names,
             choices=self._record(choices),
         )
 
     def _pose(self, hand: GlovedHand, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
-        """Pose of a hand some time after a frame [s]; None where there is none."""
+        """Qpos (27,) of a hand `shift` seconds after a frame; None where known is none."""
         pose = _between(hand.qpos, frame, shift * self.take.rate)
         if pose is None:
             return None
@@ -145,16 +145,16 @@ class Studio:
                 drawn += figure.drawn(pose, number)
                 number += 1
         for body in self._bodies:
-            place = _between(body.body.T_world_body, frame, shift * self.take.rate)
-            if place is not None:
+            index = _between(body.body.T_world_body, frame, shift * self.take.rate)
+            if index is not None:
                 number += 1
-                left, _, right = np.linalg.svd(place[:3, :3])
-                place[:3, :3] = left @ right
-                drawn += body.drawn(place, number)
+                left, _, right = np.linalg.svd(index[:3, :3])
+                index[:3, :3] = left @ right
+                drawn += body.drawn(index, number)
         return drawn
 
     def _geometry(self, camera: Camera, drawn: Sequence[Drawn], *, with_normals: bool) -> Pictures:
-        """Depth, normals and ids, through whatever lens."""
+        """Depth, normals and ids through the camera's lens."""
         surface = join([one.triangles for one in drawn]) if drawn else None
         width, height = camera.size
         if surface is None:
@@ -179,13 +179,13 @@ class Studio:
     def _infrared(
         self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]
     ) -> Float32[np.ndarray, "H W"]:
-        """What surfaces send back to a depth sensor; bare skin does not go by its colors."""
+        """Infrared reflectance of each pixel, from its color; bare skin has its own."""
         assert truth.instances is not None
         shape = truth.instances.shape
         infrared = np.ones(shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
-        for place, number in enumerate(present):
+        for index, number in enumerate(present):
             if self._people[number].glove is None:
-                infrared[truth.instances == place + 1] = self._people[number].skin.infrared
+                infrared[truth.instances == index + 1] = self._people[number].skin.infrared
         return infrared
 
     def _colors_of(
@@ -204,7 +204,7 @@ class Studio:
         choices: FrameChoices,
         rng: np.random.Generator,
     ) -> UInt8[np.ndarray, "H W 3"] | None:
-        """What shutter and sensor make of it; None when they change nothing."""
+        """The color picture of shutter and sensor; None when they change nothing."""
         if choices.exposure is None and choices.shutter is None:
             return None
         if choices.shutter is None:
@@ -216,7 +216,7 @@ class Studio:
             light = combine(moments, weights)
         return expose(light, choices.exposure or Exposure(), rng=rng)
 
-    def _asked_for(self, truth: Pictures, rgb: NDArray[np.uint8] | None) -> Pictures:
+    def _requested(self, truth: Pictures, rgb: NDArray[np.uint8] | None) -> Pictures:
         ids = "ids" in self.passes
         return Pictures(
             rgb,
@@ -235,12 +235,12 @@ class Studio:
 
 
 def _between(rows: Float[np.ndarray, "T ..."], frame: int, shift: float) -> NDArray[np.float64] | None:
-    """A row some part of a frame later, straight between two; None where there is none."""
+    """The row `shift` frames after a frame, interpolated linearly; None where the frame has none."""
     if not np.isfinite(rows[frame]).all():
         return None
     step = int(np.floor(shift))
-    places = np.clip([frame + step, frame + step + 1], 0, len(rows) - 1)
-    before, after = (rows[place] if np.isfinite(rows[place]).all() else rows[frame] for place in places)
+    indices = np.clip([frame + step, frame + step + 1], 0, len(rows) - 1)
+    before, after = (rows[index] if np.isfinite(rows[index]).all() else rows[frame] for index in indices)
     if before.shape == (27,) and before[3:7] @ after[3:7] < 0.0:
         after = np.concatenate([after[:3], -after[3:7], after[7:]])
     mixed: NDArray[np.float64] = before + (shift - step) * (after - before)
@@ -254,7 +254,7 @@ def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
         if nearest < 2.0 * NEAR:
             raise HandSimError(
                 f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or thing in frame {frame}, "
-                f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
+                f"expected {2e3 * NEAR:.0f} mm or more; index it elsewhere"
             )
 
 

@@ -1,4 +1,4 @@
-"""COCO keypoints: `annotations.json` for pycocotools, mmpose, detectron2 and whoever else reads COCO.
+"""COCO keypoints: `annotations.json` for pycocotools, mmpose, detectron2 and other readers of COCO.
 
 Keypoints count pixels from the first one's center, boxes from the picture's corner: this is how COCO's own
 files and their readers have it. Beyond COCO's fields an image has its camera (`K` for such pixels, the lens,

@@ -1,7 +1,7 @@
 """What the annotation formats share: masks, run lengths, JSON, and where pixels are counted from.
 
 We count pixels from the picture's corner, so that the first center is at 0.5. OpenCV, and with it FreiHAND,
-InterHand2.6M, UmeTrack and COCO's keypoints, count from the first center: `CENTER` is what goes off for them.
+InterHand2.6M, UmeTrack and COCO's keypoints, count from the first center: `CENTER` is subtracted for them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def centered_K(camera: Camera) -> NDArray[np.float64]:
     """Camera matrix for pixels that are counted from the first one's center.
 
     Raises:
-        HandSimError: The camera's lens is no pinhole, so that no matrix says where points come to lie.
+        HandSimError: The camera's lens is not a pinhole, so that no matrix projects points.
     """
     if camera.lens.kind != "pinhole":
         raise HandSimError(
@@ -64,7 +64,7 @@ def is_seen(hand: HandTruth) -> bool:
 
 
 def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None:
-    """Where one hand of a frame is seen, its markers too but not its forearm; None without an id picture."""
+    """Mask of one hand of a frame with its markers, without its forearm; None without an id picture."""
     parts, instances = frame.ideal.parts, frame.ideal.instances
     first = 1 + PARTS_A_HAND * hand
     if instances is not None:
@@ -76,7 +76,7 @@ def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None
 
 
 def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
-    """COCO's uncompressed run lengths: of zeros and ones in turn, zeros first, column by column."""
+    """COCO's uncompressed run lengths: of alternating zeros and ones, zeros first, column by column."""
     flat = mask.ravel(order="F")
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     ends = np.concatenate([[0], changes, [flat.size]])
@@ -100,7 +100,7 @@ def by_side(frame: RenderedFrame) -> dict[Side, HandTruth]:
 
 
 def without_colors(name: str) -> HandSimError:
-    """What to say where a format is asked for that is nothing without color pictures."""
+    """The error for a format that needs color pictures."""
     return HandSimError(f"the format {name} needs color pictures; add rgb to the passes")
 
 

@@ -20,14 +20,14 @@ LISTS: Final = ("K", "xyz", "scale", "mano", "info")
 
 
 def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dict[str, Any]]]:
-    """The hands that are seen: their places in the frame, and what goes into each of the lists.
+    """The visible hands: their indices in the frame, and their entries in each of the lists.
 
     Args:
         frame: Of a pinhole camera.
         vertices: Whether to add the skin, some 150 kB a hand.
 
     Raises:
-        HandSimError: The camera's lens is no pinhole.
+        HandSimError: The camera's lens is not a pinhole.
     """
     K = centered_K(frame.camera).tolist()
     entries = []

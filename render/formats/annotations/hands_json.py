@@ -1,4 +1,4 @@
-"""JSON of webdataset clips as UmeTrack and HOT3D have them, and all that we know of a frame in our own terms.
+"""JSON of webdataset clips as UmeTrack and HOT3D have them, and the ground truth of a frame in ours.
 
 A clip's sample is one time, seen by one or more cameras ("streams"). What their tools read counts pixels from
 the first one's center, boxes from the picture's corner. `frame_record`, for formats of our own, counts all
@@ -44,7 +44,7 @@ def camera_record(camera: Camera) -> dict[str, Any]:
     focal_center = [K[0, 0], K[1, 1], K[0, 2] - CENTER, K[1, 2] - CENTER]
     return {
         "calibration": {
-            "label": f"rgb-{camera.name}",  # readers tell color from gray by these letters
+            "label": f"rgb-{camera.name}",  # readers distinguish color from gray by these letters
             "stream_id": camera.name,
             "serial_number": camera.name,
             "image_width": camera.size[0],
@@ -87,7 +87,7 @@ def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
 
 
 def hand_shapes_record(shape: HandShape) -> dict[str, Any]:
-    """`__hand_shapes.json__`, which both hands of a clip share; of MANO it says nothing."""
+    """`__hand_shapes.json__`, shared by both hands of a clip; without MANO parameters."""
     return {"mano": [], "umetrack": umetrack_hand(shape)}
 
 
@@ -118,7 +118,7 @@ def markers_record(frame: RenderedFrame) -> dict[str, Any]:
 
 
 def frame_record(frame: RenderedFrame) -> dict[str, Any]:
-    """All that is known of a frame but its skin: meters, world axes, pixels from the corner."""
+    """The ground truth of a frame without its skin: meters, world axes, pixels from the corner."""
     return {
         "number": frame.number,
         "time": frame.time,

@@ -2,7 +2,7 @@
 
 Its 42 joints are 21 of the right hand and 21 of the left, tip first and wrist last. Projections count pixels
 from the first one's center, boxes from the picture's corner. A dataset is one capture, "0"; its file has one
-pose a camera, so a camera that moves becomes many: `vga`, `vga_1`, `vga_2`...
+pose per camera, so a camera that moves becomes many: `vga`, `vga_1`, `vga_2`...
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
     """The picture, its camera and its joints, still without numbers.
 
     Raises:
-        HandSimError: The camera's lens is no pinhole, or two hands are of the same side.
+        HandSimError: The camera's lens is not a pinhole, or two hands are of the same side.
     """
     hands = by_side(frame)
     seen = [hand.box for hand in frame.hands if is_seen(hand)]
@@ -129,16 +129,16 @@ def frames_once(records: Iterable[dict[str, Any]]) -> Iterator[tuple[int, dict[s
 
 
 def skeleton_lines() -> str:
-    """`skeleton.txt`: name, place and parent's place of the 42 joints."""
+    """`skeleton.txt`: name, index and parent's index of the 42 joints."""
     lines = ["# joint_name joint_id joint_parent_id"]
     for side_number, side in enumerate(_ORDER):
         first, letter = NUM_KEYPOINTS * side_number, side[0]
         for digit_number, digit in enumerate(DIGITS):
             name = "pinky" if digit == "little" else digit
             for step in range(4):
-                place = first + 4 * digit_number + step
-                parent = place + 1 if step < 3 else first + NUM_KEYPOINTS - 1
-                lines.append(f"{letter}_{name}{4 - step} {place} {parent}")
+                index = first + 4 * digit_number + step
+                parent = index + 1 if step < 3 else first + NUM_KEYPOINTS - 1
+                lines.append(f"{letter}_{name}{4 - step} {index} {parent}")
         lines.append(f"{letter}_wrist {first + NUM_KEYPOINTS - 1} -1")
     return "\n".join(lines) + "\n"
 

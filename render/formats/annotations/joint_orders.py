@@ -1,14 +1,14 @@
 """Joint orders of other data sets, as indices of our 21 (`render.frames.keypoints`), and conversions.
 
-One table, because a wrong permutation looks almost right. A place of `ABSENT` is a joint that we do not have.
+One table, because a wrong permutation looks almost right. The index `ABSENT` marks a joint that we lack.
 
 - FreiHAND, MediaPipe and COCO-WholeBody: wrist, then thumb to little, base to tip. This is ours.
 - MANO with its tips appended, as in HO-3D and H2O-3D: wrist, three joints each of index, middle, little, ring
   and thumb, then the tips from thumb to little.
 - InterHand2.6M: thumb to little, tip to base, then the wrist; its files have 42, a right hand and a left one.
-- HANDS17 and BigHand2.2M: wrist, five first joints, then the other three a digit.
-- OpenXR: palm, wrist, four of the thumb, five a finger from its metacarpal on; WebXR has no palm.
-- UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints a finger; with 21 landmarks the
+- HANDS17 and BigHand2.2M: wrist, five first joints, then the other three per digit.
+- OpenXR: palm, wrist, four of the thumb, five per finger from its metacarpal on; WebXR has no palm.
+- UmeTrack and HOT3D: five tips, wrist, thumb without its base, three joints per finger; with 21 landmarks the
   palm's center comes last.
 """
 
@@ -61,14 +61,14 @@ JOINT_ORDERS: Final[dict[str, tuple[int, ...]]] = {
     "hot3d": _UMETRACK,
     "umetrack21": (*_UMETRACK, ABSENT),
 }
-"""Place in `KEYPOINT_NAMES` of every joint of an order."""
+"""Index in `KEYPOINT_NAMES` of every joint of an order."""
 
 
 def joint_order(name: str) -> tuple[int, ...]:
     """One of `JOINT_ORDERS`.
 
     Raises:
-        ArgumentError: There is no order of that name.
+        ArgumentError: The order is unknown.
     """
     if name not in JOINT_ORDERS:
         raise ArgumentError(choices(name, JOINT_ORDERS, noun="joint order"))
@@ -76,7 +76,7 @@ def joint_order(name: str) -> tuple[int, ...]:
 
 
 def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.ndarray, "*batch n k"]:
-    """Our keypoints, or anything that there is one of a keypoint, in another order.
+    """Our keypoints, or other rows with one per keypoint, in another order.
 
     Args:
         points: In the order of `KEYPOINT_NAMES`.
@@ -86,7 +86,7 @@ def to_order(points: Float[np.ndarray, "*batch 21 k"], name: str) -> Float[np.nd
         As many as that order has; NaN for those that we do not have.
 
     Raises:
-        ArgumentError: There is no order of that name, or there are not 21 points.
+        ArgumentError: The order is unknown, or there are not 21 points.
     """
     order, points = list(joint_order(name)), _rows(points, NUM_KEYPOINTS, "our keypoints")
     nowhere = np.full_like(points[..., :1, :], np.nan)
@@ -98,7 +98,7 @@ def from_order(points: Float[np.ndarray, "*batch n k"], name: str) -> Float[np.n
     """The inverse of `to_order`: NaN for those of ours that the other order has not.
 
     Raises:
-        ArgumentError: There is no order of that name, or it has another number of points.
+        ArgumentError: The order is unknown, or it has another number of points.
     """
     order = np.array(joint_order(name))
     points = _rows(points, len(order), f"joints in the order '{name}'")

@@ -1,8 +1,8 @@
 """Our hand as a UmeTrack hand model: the JSON that UmeTrack's and HOT3D's tools pose, skin and draw.
 
 UmeTrack describes left hands and mirrors them in its x axis for right ones; ours are mirrored in y. Its wrist
-frame is therefore ours turned by a quarter about z. Like ours it has four hinges a digit and equal angles for
-mirrored poses, so that our angles are its angles.
+frame is therefore ours rotated by 90 degrees about z. Like ours it has four joint angles per
+digit and equal angles for mirrored poses, so that our angles are its angles.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 # Our wrist frame seen from UmeTrack's.
-_TURN: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-_HINGES_A_DIGIT: Final = 4
+_UMETRACK_FROM_OURS: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_JOINTS_PER_DIGIT: Final = 4
 _ROOT_FRAMES: Final = 1  # a root that moves with the wrist comes before our bones
 
 
 def umetrack_wrist(T_world_wrist: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """`T_world_from_wrist` of a hand whose wrist is there."""
     pose: NDArray[np.float64] = np.array(T_world_wrist, dtype=np.float64)
-    pose[:3, :3] = pose[:3, :3] @ _TURN.T
+    pose[:3, :3] = pose[:3, :3] @ _UMETRACK_FROM_OURS.T
     return pose
 
 
@@ -41,9 +41,9 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
     bones = [joint.bone for joint in JOINTS]
     rest = model.rest_transforms[bones]
     axes = np.einsum("jab,jb->ja", rest[:, :3, :3], model.skeleton.axes)
-    place = np.arange(NUM_JOINTS) % _HINGES_A_DIGIT
+    step = np.arange(NUM_JOINTS) % _JOINTS_PER_DIGIT
     numbers = np.arange(NUM_JOINTS)
-    next_digit = numbers + _HINGES_A_DIGIT
+    next_digit = numbers + _JOINTS_PER_DIGIT
     surface = model.surface
     weights = np.zeros((len(surface.vertices), _ROOT_FRAMES + NUM_BONES))
     np.add.at(
@@ -51,16 +51,16 @@ def umetrack_hand(shape: HandShape) -> dict[str, Any]:
     )
     landmarks = to_order(hand_keypoints(model, join_qpos(np.zeros((1, NUM_JOINTS))))[0], "umetrack")
     return {
-        "joint_rotation_axes": rounded(axes @ _TURN.T, 8),
-        "joint_rest_positions": rounded(1e3 * rest[:, :3, 3] @ _TURN.T, 5),
+        "joint_rotation_axes": rounded(axes @ _UMETRACK_FROM_OURS.T, 8),
+        "joint_rest_positions": rounded(1e3 * rest[:, :3, 3] @ _UMETRACK_FROM_OURS.T, 5),
         "joint_frame_index": [_ROOT_FRAMES + bone for bone in bones],
-        "joint_parent": np.where(place == 0, -1, numbers - 1).tolist(),
-        "joint_first_child": np.where(place == _HINGES_A_DIGIT - 1, -1, numbers + 1).tolist(),
-        "joint_next_sibling": np.where((place == 0) & (next_digit < NUM_JOINTS), next_digit, -1).tolist(),
-        "landmark_rest_positions": rounded(1e3 * landmarks @ _TURN.T, 5),
+        "joint_parent": np.where(step == 0, -1, numbers - 1).tolist(),
+        "joint_first_child": np.where(step == _JOINTS_PER_DIGIT - 1, -1, numbers + 1).tolist(),
+        "joint_next_sibling": np.where((step == 0) & (next_digit < NUM_JOINTS), next_digit, -1).tolist(),
+        "landmark_rest_positions": rounded(1e3 * landmarks @ _UMETRACK_FROM_OURS.T, 5),
         "landmark_rest_bone_weights": [[1.0]] * len(landmarks),
         "landmark_rest_bone_indices": [[_ROOT_FRAMES + _bone(joint)] for joint in joint_order("umetrack")],
-        "mesh_vertices": rounded(1e3 * surface.vertices @ _TURN.T, 4),
+        "mesh_vertices": rounded(1e3 * surface.vertices @ _UMETRACK_FROM_OURS.T, 4),
         "mesh_triangles": surface.faces.tolist(),
         "dense_bone_weights": rounded(weights, 6),
         "joint_limits": rounded(model.skeleton.ranges, 6),

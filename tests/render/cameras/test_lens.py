@@ -23,10 +23,10 @@ FISHEYE = ((0.02, -0.006, 0.0, 0.0), (-0.013, 0.021, -0.02, 0.005))
 
 
 def directions(lens: Lens, count: int, *, most: float) -> np.ndarray:
-    """Rays at most so far from the axis [rad], and within the lens's reach."""
+    """Rays at most so far from the axis [rad], and before the lens's fold."""
     rng = np.random.default_rng(0)
-    reach = np.arctan(lens._reach()) if lens.kind == "brown" else lens._reach()
-    theta = rng.uniform(0.0, min(most, 0.97 * reach), count)
+    limit = np.arctan(lens._fold_radius()) if lens.kind == "brown" else lens._fold_radius()
+    theta = rng.uniform(0.0, min(most, 0.97 * limit), count)
     phi = rng.uniform(-np.pi, np.pi, count)
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=-1)
 
@@ -66,7 +66,7 @@ tiny = st.floats(-0.01, 0.01)
 @given(st.tuples(small, small, tiny, tiny, small), st.floats(0.0, 0.9), st.floats(-np.pi, np.pi))
 def test_brown_round_trip(coefficients, share, phi):
     lens = Lens("brown", coefficients)
-    slope = share * min(lens._reach(), 2.0)
+    slope = share * min(lens._fold_radius(), 2.0)
     rays = np.array([[slope * np.cos(phi), slope * np.sin(phi), 1.0]])
     places = lens.distort(rays)
     back = lens.undistort(places)
@@ -80,7 +80,7 @@ def test_brown_round_trip(coefficients, share, phi):
 @given(st.tuples(small, tiny, tiny, tiny), st.floats(0.0, 0.99), st.floats(-np.pi, np.pi))
 def test_fisheye_round_trip(coefficients, share, phi):
     lens = Lens("fisheye", coefficients)
-    theta = share * lens._reach()
+    theta = share * lens._fold_radius()
     ray = np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
     np.testing.assert_allclose(lens.undistort(lens.distort(ray)), ray, atol=1e-7)
 
@@ -94,7 +94,7 @@ def test_a_fisheye_sees_behind_itself():
 
 def test_nothing_is_seen_beyond_a_fold():
     lens = Lens("brown", (-0.3, 0.0, 0.0, 0.0, 0.0))  # r (1 - 0.3 r^2) turns at r = 1.054
-    assert lens._reach() == pytest.approx(np.sqrt(1.0 / 0.9))
+    assert lens._fold_radius() == pytest.approx(np.sqrt(1.0 / 0.9))
     assert np.isnan(lens.distort(np.array([1.1, 0.0, 1.0]))).all()
     assert np.isfinite(lens.distort(np.array([1.05, 0.0, 1.0]))).all()
     assert np.isnan(lens.undistort(np.array([0.71, 0.0]))).all()  # the fold itself is at 0.703

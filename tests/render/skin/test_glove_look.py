@@ -15,7 +15,7 @@ def test_a_glove_covers_the_hand_up_to_its_cuff() -> None:
     forearm = Forearm(length=0.2)
     skin, look = skin_texture(SkinLook(), forearm), GloveLook(cuff=0.05)
     gloved = glove_texture(look, skin, forearm)
-    reach = -skin_texels().places[:, 0] * 0.2 / REFERENCE.length
+    reach = -skin_texels().positions[:, 0] * 0.2 / REFERENCE.length
     assert gloved.color.reshape(-1, 3)[reach < 0.04].max() < 120
     behind = reach > 0.06
     for ours, theirs in zip(gloved, skin, strict=True):

@@ -26,7 +26,7 @@ def lab_of(texture: SkinTexture, texels: np.ndarray) -> np.ndarray:
 def places() -> dict[str, np.ndarray]:
     """Texels of the back and the palm of the hand."""
     texels = skin_texels()
-    x = texels.places[:, 0]
+    x = texels.positions[:, 0]
     flat = (texels.palm > 0.95) & (x > 0.01) & (x < 0.07)
     return {
         "back": np.flatnonzero(flat & (texels.dorsal > 0.8)),
@@ -97,7 +97,7 @@ def test_nails_are_smooth_and_pale_on_dark_hands() -> None:
     for digit in skin_texels().digits:
         joint, tip = np.cumsum(digit.lengths)[1:]
         middle = joint + 0.68 * (tip - joint)
-        nail = digit.texels[(np.abs(digit.along - middle) < 0.002) & (np.abs(digit.turn) < 0.4)]
+        nail = digit.texels[(np.abs(digit.along - middle) < 0.002) & (np.abs(digit.angle) < 0.4)]
         assert len(nail) > 4
         assert lab_of(texture, nail)[0] > look.lightness + 10.0
         assert texture.roughness.ravel()[nail].mean() < 255 * 0.35
@@ -105,7 +105,7 @@ def test_nails_are_smooth_and_pale_on_dark_hands() -> None:
 
 def test_sleeves_begin_where_they_are_told(rng: np.random.Generator) -> None:
     forearm = Forearm(length=0.2, sleeve=0.08, sleeve_color=(0.1, 0.1, 0.6))
-    texture, x = skin_texture(SkinLook(), forearm), skin_texels().places[:, 0]
+    texture, x = skin_texture(SkinLook(), forearm), skin_texels().positions[:, 0]
     reach = -x * 0.2 / Forearm().length
     assert lab_of(texture, np.flatnonzero(reach > 0.1))[2] < -20.0
     assert lab_of(texture, np.flatnonzero((reach > 0.02) & (reach < 0.07)))[2] > 10.0

@@ -39,7 +39,7 @@ def test_relief_stays_under_a_millimeter_and_off_the_palm() -> None:
     # tendons and knuckles stand above what lies between the fingers
     knuckles = HandModel.named("M").shape.knuckles[1:, :2]
     top = [
-        height[(np.linalg.norm(texels.places[:, :2] - at, axis=1) < 0.004) & (back > 0.7)].max()
+        height[(np.linalg.norm(texels.positions[:, :2] - at, axis=1) < 0.004) & (back > 0.7)].max()
         for at in knuckles
     ]
     assert min(top) > 3e-4
@@ -53,7 +53,7 @@ def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> No
     pyrender, model = load_pyrender(), HandModel.named("M", side=side)
     texels, (width, rows) = skin_texels(), skin_atlas().size
     where = (0.05, 0.0)[axis]
-    height = 0.0015 * np.exp(-(((texels.places[:, axis] - where) / 0.004) ** 2)) * (texels.dorsal > 0.0)
+    height = 0.0015 * np.exp(-(((texels.positions[:, axis] - where) / 0.004) ** 2)) * (texels.dorsal > 0.0)
     gray = np.full((rows, width, 3), 150, dtype=np.uint8)
     texture = SkinTexture(gray, np.full((rows, width), 255, dtype=np.uint8), normal_map(height, side))
     plain = texture._replace(normals=normal_map(0.0 * height, side))
