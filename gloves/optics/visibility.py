@@ -93,7 +93,12 @@ def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndar
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _free(markers: Any, cameras: Any, segments: Any, radii: Any) -> Any:
+def _free(
+    markers: Float[np.ndarray, "T M 3"],
+    cameras: Float[np.ndarray, "C 3"],
+    segments: Float[np.ndarray, "T K 2 3"],
+    radii: Float[np.ndarray, "K"],
+) -> Any:
     """Which lines (T, M, C) meet no capsule; arguments as for `free_rays`."""
     frames, count = markers.shape[:2]
     free = np.ones((frames, count, len(cameras)), dtype=np.bool_)

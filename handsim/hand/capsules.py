@@ -66,7 +66,12 @@ def _touching_pairs(bones: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _posed(transforms: Any, bones: Any, starts: Any, ends: Any) -> Any:
+def _posed(
+    transforms: Float[np.ndarray, "T L 4 4"],
+    bones: Int[np.ndarray, "K"],
+    starts: Float[np.ndarray, "K 3"],
+    ends: Float[np.ndarray, "K 3"],
+) -> Any:
     """Ends of the capsules' axes (T, K, 2, 3) [m], in the world.
 
     Args:
@@ -87,7 +92,12 @@ def _posed(transforms: Any, bones: Any, starts: Any, ends: Any) -> Any:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def bounding_spheres(segments: Any, radii: Any, centers: Any, sizes: Any) -> None:
+def bounding_spheres(
+    segments: Float[np.ndarray, "K 2 3"],
+    radii: Float[np.ndarray, "K"],
+    centers: Float[np.ndarray, "K 3"],
+    sizes: Float[np.ndarray, "K"],
+) -> None:
     """Write the bounding spheres of one frame's capsules.
 
     Args:

@@ -11,7 +11,7 @@ from handsim.hand.capsules import Capsules, bounding_spheres
 from handsim.kernels.segments import segment_distance_squared
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
 
@@ -39,7 +39,9 @@ def overlap_between(
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
+def _deepest(
+    segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
+) -> Any:
     """Deepest overlap (T,) [m] of the capsules of one hand; 0 where nothing touches.
 
     Args:
@@ -67,14 +69,19 @@ def _deepest(segments: Any, radii: Any, pairs: Any) -> Any:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _overlap(first: Any, first_radii: Any, second: Any, second_radii: Any) -> Any:
+def _overlap(
+    first: Float[np.ndarray, "T K 2 3"],
+    first_radii: Float[np.ndarray, "K"],
+    second: Float[np.ndarray, "T N 2 3"],
+    second_radii: Float[np.ndarray, "N"],
+) -> Any:
     """Deepest overlap (T,) [m] of capsules of two hands; minus the gap where nothing touches.
 
     Args:
         first: Both ends of every axis of one hand (T, K, 2, 3) [m].
         first_radii: Its capsule radii (K,) [m].
-        second: The same of the other hand (T, K, 2, 3) [m].
-        second_radii: Its capsule radii (K,) [m].
+        second: The same of the other hand (T, N, 2, 3) [m].
+        second_radii: Its capsule radii (N,) [m].
     """
     overlap = np.full(len(first), -np.inf)
     for frame in range(len(first)):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 
 @numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
-def segment_distance_squared(p: Any, q: Any, a: Any, b: Any) -> float:
+def segment_distance_squared(
+    p: Float[np.ndarray, "3"], q: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
+) -> float:
     """Squared distance [m^2] between the segments p-q and a-b, each point (3,) [m].
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9; degenerate segments are points.
@@ -37,7 +42,7 @@ def segment_distance_squared(p: Any, q: Any, a: Any, b: Any) -> float:
 
 
 def segment_distance(
-    p: np.ndarray[Any, Any], q: np.ndarray[Any, Any], a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]
+    p: Float[np.ndarray, "3"], q: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
 ) -> float:
     """Distance [m] between the segments p-q and a-b, each point an array (3,) [m]."""
     return float(np.sqrt(segment_distance_squared(p, q, a, b)))

@@ -11,6 +11,7 @@ from handsim.kernels.chain import pose_digit_axes
 from handsim.kernels.segments import segment_distance_squared
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
     from numpy.typing import NDArray
 
 FARTHEST: Final = 0.4
@@ -71,7 +72,13 @@ class Obstacles(NamedTuple):
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def search_contact(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
+def search_contact(
+    moving: Float[np.ndarray, "T K 2 3"],
+    moving_radii: Float[np.ndarray, "K"],
+    still: Float[np.ndarray, "T L 2 3"],
+    still_radii: Float[np.ndarray, "L"],
+    axis: Float[np.ndarray, "T 3"],
+) -> Any:
     """Distance (T,) [m] along the axis at which capsules first touch others, by conservative advancement.
 
     Args:
@@ -127,7 +134,7 @@ def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def search_closing(paths: Any, parts: Any, obstacles: Any) -> Any:
+def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any:
     """Share (T,) of its path that a digit can follow before it meets something.
 
     Args:

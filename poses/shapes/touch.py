@@ -25,7 +25,7 @@ from poses.shapes.library import gesture
 from poses.shapes.validity import MAX_PENETRATION, is_valid, make_valid
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
     from numpy.typing import NDArray
 
 FINGERS: Final = DIGITS[1:]
@@ -223,7 +223,9 @@ def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _overlaps(segments: Any, radii: Any, pairs: Any) -> Any:
+def _overlaps(
+    segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
+) -> Any:
     """Overlaps (T, P) [m] of pairs of capsules; minus the gap where they are apart.
 
     Args:

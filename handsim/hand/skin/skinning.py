@@ -37,7 +37,12 @@ def skin_frames(
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _skin(points: Any, bones: Any, weights: Any, motion: Any) -> Any:
+def _skin(
+    points: Float[np.ndarray, "V 3"],
+    bones: Int[np.ndarray, "V 4"],
+    weights: Float[np.ndarray, "V 4"],
+    motion: Float[np.ndarray, "T L 3 4"],
+) -> Any:
     """Skinned positions (T, V, 3) [m].
 
     Args:
