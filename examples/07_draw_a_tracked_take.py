@@ -15,9 +15,8 @@ import numpy as np
 
 from gloves.captures.capture import Capture
 from gloves.fit import nominal_fit
-from gloves.takes.tracked_take import save_tracked_take
 from handsim.hand.model import HandModel
-from render.cameras.camera import Camera, preset
+from handsim.space.camera import Camera, preset
 from render.cameras.viewpoints import ViewConfig
 from render.formats.png_depth import read_depth
 from render.frames.keypoints import hand_keypoints
@@ -37,7 +36,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         tracked = track_capture(capture, Tracker(hands, load_labeler("dense19")))
-        save_tracked_take(folder / "tracked.npz", tracked)
+        tracked.save(folder / "tracked.npz")
         count = render_take(folder / "tracked.npz", folder / "pictures", ["coco"], config, workers=1)
         coco = json.loads((folder / "pictures" / "annotations.json").read_text())
         print(f"{count} pictures, {len(coco['annotations'])} hands")

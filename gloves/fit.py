@@ -10,14 +10,16 @@ import numpy as np
 
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout
+from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_QPOS, Side
+from handsim.space.cameras import CameraRig
 from handsim.space.transforms import MIRROR
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Bool, Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +66,17 @@ class GloveFit:
             ArgumentError: `qpos` is not (T, 27) or not finite.
         """
         return self.attachment.markers(self.model, self.model.forward_kinematics(qpos))
+
+    def visible(self, qpos: Float[np.ndarray, "T 27"], rig: CameraRig) -> Bool[np.ndarray, "T M C"]:
+        """Which cameras see each marker: in view, facing, and not occluded by the hand itself.
+
+        Args:
+            qpos: Poses of this hand, wrist position [m] in the world of the rig.
+            rig: The cameras.
+        """
+        bones, capsules = self.model.forward_kinematics(qpos), self.model.capsules
+        markers, normals = self.attachment.markers(self.model, bones)
+        return visible_cameras(markers, normals, rig, capsules.posed(bones), capsules.radii)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

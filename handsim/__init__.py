@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from handsim.hand.model import HandModel, join_qpos
     from handsim.hand.motion import HandMotion
     from handsim.hand.shape import HandShape, sample_shape
+    from handsim.space.camera import Camera
     from handsim.space.cameras import CameraRig, load_rig
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "Camera": "handsim.space.camera",
         "CameraRig": "handsim.space.cameras",
         "HandModel": "handsim.hand.model",
         "HandMotion": "handsim.hand.motion",
@@ -32,6 +34,7 @@ __getattr__, __dir__ = lazy_exports(
 )
 
 __all__ = [
+    "Camera",
     "CameraRig",
     "HandModel",
     "HandMotion",

@@ -10,6 +10,7 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from render.cameras.viewpoints import ViewConfig
     from render.config import RenderConfig
     from render.frames.frame import RenderedFrame
     from render.session import draw_frames, render_take
@@ -21,9 +22,18 @@ __getattr__, __dir__ = lazy_exports(
         "RenderConfig": "render.config",
         "RenderedFrame": "render.frames.frame",
         "SkinLook": "render.skin.look",
+        "ViewConfig": "render.cameras.viewpoints",
         "draw_frames": "render.session",
         "render_take": "render.session",
     },
 )
 
-__all__ = ["RenderConfig", "RenderedFrame", "SkinLook", "__version__", "draw_frames", "render_take"]
+__all__ = [
+    "RenderConfig",
+    "RenderedFrame",
+    "SkinLook",
+    "ViewConfig",
+    "__version__",
+    "draw_frames",
+    "render_take",
+]

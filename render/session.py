@@ -12,6 +12,8 @@ from typing import Final
 import cv2
 import numpy as np
 
+from gloves.takes.take import Take
+from gloves.takes.tracked_take import TrackedTake
 from handsim.app.workers import in_processes
 from handsim.errors import HandSimError, choices
 from handsim.files.json_files import claim
@@ -29,7 +31,7 @@ from render.scenery.surroundings import sample_surroundings
 from render.sensors.depth_noise import sample_depth_noise
 from render.sensors.exposure import sample_exposure
 from render.sensors.shutter import sample_shutter
-from render.shown_take import ShownTake, load_shown_take
+from render.shown_take import ShownTake, load_shown_take, show_take
 from render.skin.look import SkinLook
 from render.studio.studio import FrameChoices, Studio
 
@@ -143,17 +145,18 @@ def _render_shard(path: Path, out: Path, formats: tuple[str, ...], config: Rende
 
 
 def draw_frames(
-    take: ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
+    take: Take | TrackedTake | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
 ) -> Iterator[RenderedFrame]:
     """Some frames of a take, seen by all its cameras.
 
     Args:
-        take: The take.
+        take: A simulated take, whose truth is drawn, or a tracked one.
         config: What to draw.
         frames: Numbers of frames in the take.
         shard: Number of the shard; people change with it, as does all else that does not vary by frame.
     """
-    return draw_shard(take, _viewpoints(take, config), config, shard, frames)
+    shown = take if isinstance(take, ShownTake) else show_take(take)
+    return draw_shard(shown, _viewpoints(shown, config), config, shard, frames)
 
 
 def draw_shard(

@@ -66,17 +66,18 @@ def load_shown_take(path: Path) -> ShownTake:
     Raises:
         CaptureError: The file is missing, of another kind or schema, damaged, or without any pose.
     """
-    shown = (
-        show_simulated(load_take(path))
-        if archive_kind(path) == KIND
-        else show_tracked(load_tracked_take(path))
-    )
+    shown = show_take(load_take(path) if archive_kind(path) == KIND else load_tracked_take(path))
     if not np.isfinite(shown.wrists()[..., 0]).any():
         raise CaptureError(f"{path}: there is no hand in any frame, expected one to draw")
     return shown
 
 
-def show_simulated(take: Take) -> ShownTake:
+def show_take(take: Take | TrackedTake) -> ShownTake:
+    """The truth of a simulated take, or the motion of a tracked one."""
+    return _show_simulated(take) if isinstance(take, Take) else _show_tracked(take)
+
+
+def _show_simulated(take: Take) -> ShownTake:
     """The truth of a simulated take."""
     names = [f"{hand.side}:{name}" for hand in take.hands for name in hand.fit.layout.names]
     bodies: tuple[ShownBody, ...] = ()
@@ -88,7 +89,7 @@ def show_simulated(take: Take) -> ShownTake:
     return ShownTake(take.rate, times, take.hands, bodies, take.points, labels, tuple(names))
 
 
-def show_tracked(take: TrackedTake) -> ShownTake:
+def _show_tracked(take: TrackedTake) -> ShownTake:
     """The result of a tracker."""
     hands = tuple(
         GlovedHand(

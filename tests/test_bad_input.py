@@ -16,7 +16,6 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.layout import load_layout, save_layout
 from gloves.takes.archives import write_archive
-from gloves.takes.take import save_take
 from handsim.app.cli import main
 from train.simulation.takes import TakeConfig, simulate_take
 
@@ -78,7 +77,7 @@ def folder(tmp_path, monkeypatch):
     write_archive(tmp_path / "tracked.npz", "tracked take", 1, {}, {})
     write_archive(tmp_path / "newer.npz", "tracked take", 99, {}, {})
     take = simulate_take(TakeConfig(num_frames=2))
-    save_take(tmp_path / "good.truth.npz", take)
+    take.save(tmp_path / "good.truth.npz")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "broken.jpg").write_text("no picture")
     save_layout(tmp_path / "copy.toml", load_layout("dense19"))

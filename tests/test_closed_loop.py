@@ -7,7 +7,7 @@ import pytest
 
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
-from gloves.takes.tracked_take import load_tracked_take, save_tracked_take
+from gloves.takes.tracked_take import load_tracked_take
 from handsim.hand.model import HandModel
 from render.cameras.viewpoints import ViewConfig
 from render.frames.keypoints import hand_keypoints
@@ -38,7 +38,7 @@ def tracked(truth):
     take, folder = truth
     capture = read_capture(folder / "take.c3d")
     result = track_capture(capture, Tracker(true_users(take), load_labeler("dense19")))
-    save_tracked_take(folder / "tracked.npz", result)
+    result.save(folder / "tracked.npz")
     return load_tracked_take(folder / "tracked.npz"), folder
 
 

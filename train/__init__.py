@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from train.config import TrainConfig
     from train.data.augmentation import Corruption, corrupt
     from train.data.shards import Dataset
-    from train.evaluation.labeler_evaluation import evaluate_labeler
+    from train.evaluation.labeler_evaluation import evaluate_labeler, evaluate_takes
     from train.labelers.protocol import Labeler
     from train.labelers.storage import load_labeler
     from train.loop import train_labeler
@@ -33,6 +33,7 @@ __getattr__, __dir__ = lazy_exports(
         "TrainConfig": "train.config",
         "corrupt": "train.data.augmentation",
         "evaluate_labeler": "train.evaluation.labeler_evaluation",
+        "evaluate_takes": "train.evaluation.labeler_evaluation",
         "generate_dataset": "train.simulation.generation",
         "load_labeler": "train.labelers.storage",
         "simulate_take": "train.simulation.takes",
@@ -50,6 +51,7 @@ __all__ = [
     "__version__",
     "corrupt",
     "evaluate_labeler",
+    "evaluate_takes",
     "generate_dataset",
     "load_labeler",
     "simulate_take",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from gloves.captures.capture import Capture
 from gloves.fit import GlovedHand, attach
 from gloves.layout import stored_layout
 from gloves.takes.archives import check_shapes, read_archive, write_archive
@@ -97,26 +98,30 @@ class Take:
         present: np.ndarray = np.isfinite(np.concatenate(observed, axis=1)[..., 0])
         return present
 
+    def capture(self) -> Capture:
+        """The points without labels, as an optical system exports them: one trajectory per column."""
+        names = tuple(f"*{column}" for column in range(self.points.shape[1]))
+        return Capture(names, self.points, self.rate)
 
-def save_take(path: Path, take: Take) -> None:
-    """Write a take's `.truth.npz`, whole or not at all."""
-    body = take.body
-    header = {
-        "units": "metres, radians, world frame",
-        "rate": take.rate,
-        "layouts": [dataclasses.asdict(hand.fit.layout) for hand in take.hands],
-        "body": None if body is None else {"name": body.name, "marker_names": body.marker_names},
-        "settings": take.settings,
-    }
-    arrays = {
-        "points": take.points,
-        "ids": take.ids.astype(np.int32),
-        "labels": take.labels.astype(np.int16),
-        "hands": np.array([pack_hand(hand.fit.shape) for hand in take.hands], dtype=HAND_DTYPE),
-        "qpos": np.stack([hand.qpos for hand in take.hands]),
-        "T_world_body": np.zeros((0, 4, 4)) if body is None else body.T_world_body,
-    }
-    write_archive(path, KIND, SCHEMA, header, arrays)
+    def save(self, path: Path) -> None:
+        """Write a `.truth.npz`, whole or not at all; `load_take` reads it."""
+        body = self.body
+        header = {
+            "units": "metres, radians, world frame",
+            "rate": self.rate,
+            "layouts": [dataclasses.asdict(hand.fit.layout) for hand in self.hands],
+            "body": None if body is None else {"name": body.name, "marker_names": body.marker_names},
+            "settings": self.settings,
+        }
+        arrays = {
+            "points": self.points,
+            "ids": self.ids.astype(np.int32),
+            "labels": self.labels.astype(np.int16),
+            "hands": np.array([pack_hand(hand.fit.shape) for hand in self.hands], dtype=HAND_DTYPE),
+            "qpos": np.stack([hand.qpos for hand in self.hands]),
+            "T_world_body": np.zeros((0, 4, 4)) if body is None else body.T_world_body,
+        }
+        write_archive(path, KIND, SCHEMA, header, arrays)
 
 
 def load_take(path: Path) -> Take:

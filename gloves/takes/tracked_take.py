@@ -144,27 +144,26 @@ class TrackedTake:
             raise ArgumentError(f"the {side} hand has no pose in any frame")
         return bridge_gaps(self.times, qpos, self.rate)
 
-
-def save_tracked_take(path: Path, take: TrackedTake) -> None:
-    """Write a tracked take, whole or not at all; `load_tracked_take` gives the same numbers again."""
-    header = {
-        "units": "metres, radians, seconds, wxyz, world frame",
-        "rate": take.rate,
-        "layouts": [dataclasses.asdict(hand.layout) for hand in take.hands],
-        "statuses": STATUSES,
-        "bodies": [{"name": body.name, "marker_names": body.marker_names} for body in take.bodies],
-        "settings": take.settings,
-    }
-    arrays = {name: np.asarray(getattr(take, name), dtype) for name, dtype in _ARRAYS.items()}
-    arrays["hands"] = np.array([pack_hand(hand.shape) for hand in take.hands], dtype=HAND_DTYPE)
-    for name in _ATTACHMENT:
-        arrays[f"attachment_{name}"] = np.stack([getattr(hand.attachment, name) for hand in take.hands])
-    arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.positions for body in take.bodies)])
-    write_archive(path, KIND, SCHEMA, header, arrays)
+    def save(self, path: Path) -> None:
+        """Write the take (.npz), whole or not at all; `load_tracked_take` gives the same numbers again."""
+        header = {
+            "units": "metres, radians, seconds, wxyz, world frame",
+            "rate": self.rate,
+            "layouts": [dataclasses.asdict(hand.layout) for hand in self.hands],
+            "statuses": STATUSES,
+            "bodies": [{"name": body.name, "marker_names": body.marker_names} for body in self.bodies],
+            "settings": self.settings,
+        }
+        arrays = {name: np.asarray(getattr(self, name), dtype) for name, dtype in _ARRAYS.items()}
+        arrays["hands"] = np.array([pack_hand(hand.shape) for hand in self.hands], dtype=HAND_DTYPE)
+        for name in _ATTACHMENT:
+            arrays[f"attachment_{name}"] = np.stack([getattr(hand.attachment, name) for hand in self.hands])
+        arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.positions for body in self.bodies)])
+        write_archive(path, KIND, SCHEMA, header, arrays)
 
 
 def load_tracked_take(path: Path) -> TrackedTake:
-    """Read what `save_tracked_take` wrote.
+    """Read what `TrackedTake.save` wrote.
 
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.

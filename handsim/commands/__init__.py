@@ -1,6 +1,5 @@
 """The commands of `handsim` that need no other package, one per file.
 
 - demo: the whole chain on a built-in example
-- hand: a hand as a MuJoCo model and as a mesh
 - doctor: what is missing on this machine
 """

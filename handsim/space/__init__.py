@@ -1,6 +1,8 @@
 """Space around the hand: frames, cameras and objects.
 
 - transforms: rotations and rigid transforms on numpy arrays
+- lens: lens models (pinhole, Brown-Conrady, Kannala-Brandt) and their inverses
+- camera: `Camera`, one calibrated camera with its pose, and the presets
 - cameras: `CameraRig`, shipped rigs and rigs from files
 - rig_file: the TOML form of a rig
 - solids: the simple solids that objects are made of

@@ -1,7 +1,5 @@
-"""The cameras of pictures: what they are, where they stand, and how their lenses distort.
+"""The cameras of pictures: where they stand, and what their lenses do to a picture.
 
-- lens: lens models (pinhole, Brown-Conrady, Kannala-Brandt) and their inverses.
-- camera: `Camera`, a calibrated camera with its pose, and the presets.
 - viewpoints: the cameras of each frame of a take (still, orbit, head, anywhere, rig).
 - warp: pictures through a lens, resampled from pinhole pictures.
 """

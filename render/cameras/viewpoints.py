@@ -13,9 +13,9 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from handsim.errors import ArgumentError, choices
+from handsim.space.camera import Camera, preset
 from handsim.space.cameras import load_rig, look_at
 from handsim.space.transforms import quaternion_matrix
-from render.cameras.camera import Camera, preset
 from render.shown_take import ShownTake
 
 if TYPE_CHECKING:

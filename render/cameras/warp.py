@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from handsim.errors import ArgumentError
-from render.cameras.camera import Camera
-from render.cameras.lens import Lens
+from handsim.space.camera import Camera
+from handsim.space.lens import Lens
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float32

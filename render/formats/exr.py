@@ -23,7 +23,7 @@ import numpy as np
 
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.atomic import atomic_write
-from render.cameras.camera import Camera, camera_from_record
+from handsim.space.camera import Camera, camera_from_record
 from render.frames.frame import Pictures, RenderedFrame
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from handsim.hand.shape import HandShape
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Int, UInt8

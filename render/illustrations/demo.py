@@ -21,7 +21,6 @@ from render.illustrations.contact_sheet import contact_sheet
 from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
 from render.illustrations.scene import PosedHand
 from render.session import draw_frames
-from render.shown_take import show_tracked
 
 GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")
 """Drawn in a row; the last one is the thumb's opposition to the little finger."""
@@ -110,7 +109,7 @@ def draw_labeled_frame(run: DemoRun) -> Section:
 def draw_tracked_take(run: DemoRun) -> Section:
     """Pictures of the tracked take."""
     run.report("drawing pictures")
-    take = show_tracked(load_tracked_take(run.tracked_take))
+    take = load_tracked_take(run.tracked_take)
     frames = np.linspace(0, take.num_frames - 1, _PICTURES).astype(int).tolist()
     config = RenderConfig(seed=run.seed, vary="frame")
     write_png(run.out / "pictures.png", contact_sheet(list(draw_frames(take, config, frames))))

@@ -13,7 +13,7 @@ from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import NUM_QPOS
-from render.cameras.camera import Camera, pinhole
+from handsim.space.camera import Camera, pinhole
 from render.illustrations.palette import BACKGROUND, Covering, covering_material, skin_tint
 from render.painting.figures import Drawn
 from render.painting.materials import MARKER_COLOR, Material, ball_material, linear

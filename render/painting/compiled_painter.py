@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numba
 import numpy as np
 
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.rasterizer import nearest_faces, project
 from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, read_texels, shade

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import Material

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numba
 import numpy as np
 
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.painting.compiled_painter import paint_compiled
 from render.painting.figures import Drawn
 from render.painting.hardware import opengl_has_hardware

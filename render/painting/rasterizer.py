@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from handsim.errors import ArgumentError
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.frames.frame import Pictures
 
 if TYPE_CHECKING:

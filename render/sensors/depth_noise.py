@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from handsim.errors import ArgumentError, choices
-from render.cameras.camera import Camera
-from render.cameras.lens import Lens
+from handsim.space.camera import Camera
+from handsim.space.lens import Lens
 from render.sensors import structured_light, time_of_flight
 from render.sensors.structured_light import StructuredLight
 from render.sensors.time_of_flight import TimeOfFlight

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures
 from render.frames.keypoints import KEYPOINT_DIGITS, NUM_KEYPOINTS, hand_keypoints
 from render.painting.figures import HandFigure, digit_of_part

@@ -13,7 +13,7 @@ import numpy as np
 
 from gloves.fit import GlovedHand
 from handsim.errors import HandSimError
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
 from render.frames.frame import PASSES, BodyTruth, Pictures, RenderedFrame
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure

@@ -12,7 +12,6 @@ import sys
 import numpy as np
 import pytest
 
-from gloves.takes.take import save_take
 from handsim.errors import CaptureError, HandSimError
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig
@@ -29,7 +28,7 @@ from train.simulation.takes import TakeConfig, simulate_take
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     file = tmp_path_factory.mktemp("take") / "take.truth.npz"
-    save_take(file, simulate_take(TakeConfig(kind="hand-controller", num_frames=48)))
+    simulate_take(TakeConfig(kind="hand-controller", num_frames=48)).save(file)
     return file
 
 

@@ -18,7 +18,6 @@ from gloves.takes.tracked_take import (
     TRACKED,
     TrackedTake,
     load_tracked_take,
-    save_tracked_take,
 )
 from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
@@ -84,7 +83,7 @@ def test_a_capture_is_tracked_as_its_truth_says(tracked, truth, user, tmp_path):
         assert np.nanmax(np.abs(seen - wanted)[there & np.isfinite(wanted[..., 0])]) < 1e-9
         assert tracked.hands[hand].attachment is user[hand].attachment
     path = tmp_path / "take.npz"
-    save_tracked_take(path, tracked)
+    tracked.save(path)
     again = load_tracked_take(path)
     np.testing.assert_array_equal(again.markers, tracked.markers)
     assert again.settings["tracker"] == dataclasses.asdict(TrackerConfig())

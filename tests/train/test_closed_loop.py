@@ -10,8 +10,6 @@ import torch
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
-from gloves.takes.take import save_take
-from gloves.takes.tracked_take import save_tracked_take
 from handsim.app.cli import main
 from render.cameras.viewpoints import ViewConfig
 from render.frames.keypoints import hand_keypoints
@@ -103,11 +101,11 @@ def test_empty_frames_are_labeled_as_empty(run):
 
 def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
     truth = simulate_take(TakeConfig(num_frames=240))
-    save_take(run / "one.truth.npz", truth)
+    truth.save(run / "one.truth.npz")
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)
     tracker = Tracker(true_users(truth), load_labeler(run / "run"))
-    save_tracked_take(run / "tracked.npz", track_capture(capture, tracker))
+    track_capture(capture, tracker).save(run / "tracked.npz")
     shown, true = load_shown_take(run / "tracked.npz"), load_shown_take(run / "one.truth.npz").hands[0]
     mine = shown.hands[0].qpos
     there = np.isfinite(mine[:, 0])

@@ -18,7 +18,7 @@ from gloves.captures.formats import WRITABLE, check_suffix, read_capture, write_
 from gloves.captures.markers import labeled_capture
 from gloves.fit import GloveFit
 from gloves.takes.take import SUFFIX
-from gloves.takes.tracked_take import TrackedTake, save_tracked_take
+from gloves.takes.tracked_take import TrackedTake
 from handsim.app.interrupts import interrupt_told
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError, CaptureError
@@ -91,7 +91,7 @@ def track(
         "labeler": labeler or glove,
     }
     take = dataclasses.replace(take, settings={**take.settings, **settings})
-    save_tracked_take(out, take)
+    take.save(out)
     if labeled is not None:
         write_capture(labeled, labeled_points(take))
     print_line(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")

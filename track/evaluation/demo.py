@@ -6,8 +6,6 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures.capture import Capture
-from gloves.takes.tracked_take import save_tracked_take
 from handsim.app.demo import GLOVE, DemoRun
 from handsim.app.page import Section
 from track.capture_tracking import track_capture
@@ -23,11 +21,8 @@ def track_take(run: DemoRun) -> Section:
     """Track a simulated capture and say how far its joints are off."""
     run.report("tracking a simulated capture")
     take = simulate_take(TakeConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
-    names = tuple(f"*{number}" for number in range(take.points.shape[1]))
-    tracked = track_capture(
-        Capture(names, take.points, take.rate), Tracker(true_users(take), load_labeler(GLOVE))
-    )
-    save_tracked_take(run.tracked_take, tracked)
+    tracked = track_capture(take.capture(), Tracker(true_users(take), load_labeler(GLOVE)))
+    tracked.save(run.tracked_take)
     errors = []
     for hand in take.hands:
         model, found = hand.fit.model, tracked.motion(hand.side).qpos

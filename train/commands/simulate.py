@@ -12,7 +12,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
-from gloves.takes.take import SUFFIX, save_take
+from gloves.takes.take import SUFFIX
 from train.simulation.takes import TakeConfig, simulate_take
 
 PUBLISHED_GAPS = "3-4", "24-43"  # median and p90 of real finger markers' gaps [frames]; docs/room.md
@@ -30,7 +30,7 @@ def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     write_capture(out, Capture(names, take.points, take.rate))
     truth = out.with_suffix(SUFFIX)
-    save_take(truth, take)
+    take.save(truth)
     counts = count_gaps(take.markers_present())
     Console().print(
         f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}",

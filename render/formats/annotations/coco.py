@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.formats.annotations.common import CENTER, hand_mask, is_seen, rounded, run_lengths
 from render.frames.frame import HandTruth, RenderedFrame
 from render.frames.keypoints import KEYPOINT_NAMES, SKELETON

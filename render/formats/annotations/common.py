@@ -16,8 +16,8 @@ import numpy as np
 from handsim.errors import HandSimError
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import Side
+from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
-from render.cameras.camera import Camera
 from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
 from render.skin.forearm import FOREARM
 

@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from handsim.hand.shape import HandShape
+from handsim.space.camera import Camera
 from handsim.space.transforms import quaternion_matrix
-from render.cameras.camera import Camera
 from render.formats.annotations.common import (
     CENTER,
     by_side,

@@ -14,7 +14,7 @@ import numpy as np
 
 from handsim.errors import DatasetError
 from handsim.hand.topology import DIGITS, SIDES, Side
-from render.cameras.camera import Camera
+from handsim.space.camera import Camera
 from render.formats.annotations.common import by_side, centered_K, is_seen, rounded, to_json
 from render.formats.annotations.joint_orders import to_order
 from render.frames.frame import HandTruth, RenderedFrame

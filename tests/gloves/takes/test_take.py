@@ -12,7 +12,7 @@ import pytest
 
 from gloves.fit import GlovedHand, attach, nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.take import SCHEMA, SUFFIX, HeldBody, Take, load_take, save_take
+from gloves.takes.take import SCHEMA, SUFFIX, HeldBody, Take, load_take
 from handsim.errors import CaptureError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
@@ -56,7 +56,7 @@ def test_what_is_saved_is_what_is_read(take, tmp_path):
     alone = dataclasses.replace(take, body=None, hands=take.hands[:1], labels=one)
     for number, original in enumerate((take, alone)):
         path = tmp_path / f"{number}{SUFFIX}"
-        save_take(path, original)
+        original.save(path)
         again = load_take(path)
         for name in ("points", "ids", "labels"):
             np.testing.assert_array_equal(getattr(again, name), getattr(original, name))
@@ -120,14 +120,14 @@ def test_foreign_files_are_refused_in_a_sentence(tmp_path):
 
 def test_another_schema_is_named(take, tmp_path):
     path = tmp_path / f"take{SUFFIX}"
-    save_take(path, take)
+    take.save(path)
     altered(path, header=np.array(json.dumps(header_of(path) | {"schema": SCHEMA + 1})))
     assert_refused(path, f"schema {SCHEMA + 1}", f"expected {SCHEMA}")
 
 
 def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
     path = tmp_path / f"take{SUFFIX}"
-    save_take(path, take)
+    take.save(path)
     whole = path.read_bytes()
     for place in rng.integers(len(whole) - 1, size=60):  # cut
         path.write_bytes(whole[:place])
@@ -147,7 +147,7 @@ def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
 
 def test_arrays_that_do_not_fit_together_are_refused(take, tmp_path):
     path = tmp_path / f"take{SUFFIX}"
-    save_take(path, take)
+    take.save(path)
     whole = path.read_bytes()
     header = header_of(path)
     wrong = {
@@ -181,7 +181,7 @@ class Trap:
 
 def test_nothing_is_ever_unpickled(take, tmp_path):
     path = tmp_path / f"take{SUFFIX}"
-    save_take(path, take)
+    take.save(path)
     with np.load(path) as stored:
         arrays = {name: stored[name] for name in stored.files}
     sys.modules.pop("test_take_sprung", None)

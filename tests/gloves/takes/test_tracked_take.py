@@ -12,7 +12,7 @@ import pytest
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
 from gloves.takes.archives import KINDS
-from gloves.takes.take import SUFFIX, Take, load_take, save_take
+from gloves.takes.take import SUFFIX, Take, load_take
 from gloves.takes.tracked_take import (
     LOST,
     SCHEMA,
@@ -21,7 +21,6 @@ from gloves.takes.tracked_take import (
     MarkedBody,
     TrackedTake,
     load_tracked_take,
-    save_tracked_take,
 )
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.model import HandModel
@@ -78,7 +77,7 @@ def without_body(take: TrackedTake) -> TrackedTake:
 def test_what_is_saved_is_what_is_read(take, tmp_path):
     for number, original in enumerate((take, without_body(take))):
         path = tmp_path / f"{number}.npz"
-        save_tracked_take(path, original)
+        original.save(path)
         again = load_tracked_take(path)
         assert (again.rate, again.settings, again.sides) == (120.0, original.settings, ("left", "right"))
         for field in dataclasses.fields(TrackedTake):
@@ -180,8 +179,8 @@ def test_takes_are_told_from_tracked_takes(take, tmp_path):
     labels = np.where(take.labels < 2 * MARKERS, take.labels, -1)
     truth = Take(120.0, take.points, take.ids, labels, hands, None, {})
     true, tracked = tmp_path / f"one{SUFFIX}", tmp_path / "one.npz"
-    save_take(true, truth)
-    save_tracked_take(tracked, take)
+    truth.save(true)
+    take.save(tracked)
     assert_refused(true, "the truth of a simulated capture, expected a tracked take")
     with pytest.raises(CaptureError, match="a tracked take, expected the truth of a simulated capture"):
         load_take(tracked)
@@ -199,7 +198,7 @@ def test_foreign_and_other_files_are_refused_in_a_sentence(take, tmp_path):
     for content in (b"", b"Frame#\tTime\n", b"PK\x03\x04" + 60 * b"\x00", b"\x80\x04K\x01."):
         path.write_bytes(content)
         assert_refused(path, "not a tracked take, or a damaged one")
-    save_tracked_take(path, take)
+    take.save(path)
     with np.load(path) as stored:
         header = json.loads(str(stored["header"]))
     altered(path, header=np.array(json.dumps(header | {"schema": SCHEMA + 1})))
@@ -208,7 +207,7 @@ def test_foreign_and_other_files_are_refused_in_a_sentence(take, tmp_path):
 
 def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
     path = tmp_path / "take.npz"
-    save_tracked_take(path, take)
+    take.save(path)
     whole = path.read_bytes()
     for place in rng.integers(len(whole) - 1, size=20):
         path.write_bytes(whole[:place])
@@ -244,7 +243,7 @@ class Trap:
 
 def test_nothing_is_ever_unpickled(take, tmp_path):
     path = tmp_path / "take.npz"
-    save_tracked_take(path, take)
+    take.save(path)
     trap = np.empty(1, dtype=object)
     trap[0] = Trap()
     altered(path, qpos=trap)

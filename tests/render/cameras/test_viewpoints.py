@@ -10,13 +10,13 @@ import pytest
 from handsim.errors import ArgumentError
 from handsim.space.transforms import quaternion_matrix
 from render.cameras.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, hand_centers
-from render.shown_take import ShownTake, show_simulated
+from render.shown_take import ShownTake, show_take
 from train.simulation.takes import TakeConfig, simulate_take
 
 
 @pytest.fixture(scope="module")
 def take() -> ShownTake:
-    return show_simulated(simulate_take(TakeConfig(kind="hand-controller", num_frames=60)))
+    return show_take(simulate_take(TakeConfig(kind="hand-controller", num_frames=60)))
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)

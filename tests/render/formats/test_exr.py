@@ -7,8 +7,8 @@ import OpenEXR
 import pytest
 
 from handsim.errors import DatasetError, HandSimError
-from render.cameras.camera import Camera
-from render.cameras.lens import Lens
+from handsim.space.camera import Camera
+from handsim.space.lens import Lens
 from render.formats.exr import linear_light, read_exr, srgb, write_exr
 from render.frames.frame import Pictures
 

@@ -11,9 +11,9 @@ import trimesh
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.skin.surface import vertex_normals
+from handsim.space.camera import Camera, pinhole, preset
 from handsim.space.cameras import look_at
 from poses.shapes.validity import sample_valid_angles
-from render.cameras.camera import Camera, pinhole, preset
 from render.painting.rasterizer import Triangles, join, rasterize
 
 NO_EMBREE = pytest.mark.skipif(importlib.util.find_spec("embreex") is None, reason="embreex is not installed")

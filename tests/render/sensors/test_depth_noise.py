@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import ArgumentError
-from render.cameras.camera import Camera, pinhole
+from handsim.space.camera import Camera, pinhole
 from render.sensors.depth_noise import (
     SENSORS,
     DepthNoiseConfig,

@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from handsim.space.camera import Camera, camera_from_record
+from handsim.space.lens import Lens
 from handsim.space.transforms import quaternion_matrix
-from render.cameras.camera import Camera, camera_from_record
-from render.cameras.lens import Lens
 from render.formats.annotations.common import to_json
 from render.formats.annotations.hands_json import camera_record, frame_record, hands_record, markers_record
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import ArgumentError
-from render.cameras.camera import Camera
-from render.cameras.lens import Lens
+from handsim.space.camera import Camera
+from handsim.space.lens import Lens
 
 # A webcam, a wide lens with strong barrel distortion, a pincushion, and the fisheye of two headsets.
 BROWN = (

@@ -9,7 +9,8 @@ import mujoco
 import trimesh
 from rich.console import Console
 
-from handsim.app.command_table import load
+from gloves.attachment import attach_markers
+from gloves.layout import load_layout
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.hand.mjcf import Site, build_spec
@@ -41,8 +42,7 @@ def hand(
     model = HandModel.named(size, side=side)
     sites: tuple[Site, ...] = ()
     if glove is not None:
-        layout = load("gloves.layout:load_layout")(glove)
-        sites = load("gloves.attachment:attach_markers")(layout, model).sites(model)
+        sites = attach_markers(load_layout(glove), model).sites(model)
     write_model(out, model, sites=sites)
     console = Console()
     console.print(

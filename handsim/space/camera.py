@@ -10,7 +10,7 @@ import numpy as np
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, choices
-from render.cameras.lens import Lens
+from handsim.space.lens import Lens
 
 if TYPE_CHECKING:
     from jaxtyping import Float
