@@ -1,6 +1,9 @@
 """The application around the commands.
 
-- cli: the command `handsim`, a table of names, each loaded when it is called
+- command_table: the table of commands, each loaded when it is called
+- cli: the command `handsim`, its errors and exit codes
+- presets: commands whose defaults come from a preset
+- demo: what the steps of `handsim demo` share
 - progress: the progress bar of all commands
 - interrupts: Ctrl-C as a flag that a loop reads
 - workers: numbered jobs in worker processes

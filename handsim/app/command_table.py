@@ -39,14 +39,14 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
 
 # The steps of `handsim demo` in the order in which they run and in which their sections stand on the page.
 DEMO_STEPS: Final = (
-    "render.illustrations.demo:draw_hands",
-    "render.illustrations.demo:draw_worn_glove",
-    "render.illustrations.demo:draw_camera_view",
-    "train.reports.demo:generate_and_label",
-    "render.illustrations.demo:draw_labeled_frame",
-    "track.evaluation.demo:track_take",
-    "render.illustrations.demo:draw_tracked_take",
-    "train.reports.demo:figures_section",
+    "render.commands.demo:draw_hands",
+    "render.commands.demo:draw_worn_glove",
+    "render.commands.demo:draw_camera_view",
+    "train.commands.demo:generate_and_label",
+    "render.commands.demo:draw_labeled_frame",
+    "track.commands.demo:track_take",
+    "render.commands.demo:draw_tracked_take",
+    "train.commands.demo:figures_section",
 )
 
 

@@ -2,4 +2,5 @@
 
 - glove: `glove list`, `show`, `new` and `check`.
 - render: `render`, with its options.
+- demo: the steps of `handsim demo` that draw.
 """

@@ -74,7 +74,7 @@ def usable_frames(markers: Float[np.ndarray, "T M 3"], hand: GloveFit) -> NDArra
     return usable
 
 
-def solve_pose(
+def solve_frames(
     markers: Float[np.ndarray, "T M 3"],
     hand: GloveFit,
     frames: NDArray[np.int64],
@@ -96,7 +96,7 @@ def initial_poses(
     markers: Float[np.ndarray, "T M 3"], hand: GloveFit, usable: NDArray[np.int64]
 ) -> PoseTrack:
     """Poses of frames spread over the capture, on the hand that a calibration begins with."""
-    return solve_pose(markers, hand, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
+    return solve_frames(markers, hand, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
 
 
 def check_motion(track: PoseTrack, complete: Bool[np.ndarray, "T 5"], hand: GloveFit) -> None:

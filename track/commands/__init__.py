@@ -5,4 +5,5 @@
 `calibrate`: `handsim calibrate`, the user's hands and gloves from a capture.
 `track`: `handsim track`, a tracked take from a capture or a live stream.
 `reproduce`: `handsim reproduce`, the paper's tables.
+`demo`: the step of `handsim demo` that tracks.
 """

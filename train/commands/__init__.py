@@ -6,5 +6,6 @@
 - evaluate: `handsim evaluate` measures a labeler.
 - simulate: `handsim simulate` simulates a capture with its truth.
 - export: `handsim export` writes a labeler as an ONNX file.
-- reproduce: `handsim reproduce` prints the paper's tables of labeling beside ours.
+- labeling_tables: `handsim reproduce` prints the paper's tables of labeling beside ours.
+- demo: the steps of `handsim demo` that generate and label.
 """
