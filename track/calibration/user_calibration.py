@@ -33,7 +33,7 @@ from track.calibration.frames import (
     complete_digits,
     informative_frames,
     initial_poses,
-    solve_pose,
+    solve_frames,
     usable_frames,
 )
 from track.calibration.hand_parameters import NUM_PARAMETERS, shape_at
@@ -156,13 +156,13 @@ def calibrate(
     problem, estimate = _initial_problem(markers, right, track)
     estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
     rough = _user_hand(right, problem, estimate)
-    rough_track = solve_pose(markers, rough, usable)
+    rough_track = solve_frames(markers, rough, usable)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
     estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _MOST_STEPS, progress)
     done = _user_hand(right, problem, estimate)
     before = _gaps_before(right, markers, touches, usable)
-    final = solve_pose(markers, done, usable, rough_track.qpos)
+    final = solve_frames(markers, done, usable, rough_track.qpos)
     position_errors, length_errors = standard_errors(problem, estimate, fit)
     return Calibration(
         hand=done.with_side(start.side),
@@ -312,4 +312,4 @@ def _gaps_before(
     if not touches:
         return np.empty(0)
     touching = frames[[frame for frame, _ in touches]]
-    return contact_gaps(right.model, touches, solve_pose(markers, right, touching).qpos)
+    return contact_gaps(right.model, touches, solve_frames(markers, right, touching).qpos)
