@@ -19,7 +19,7 @@ class Status(Enum):
 
     TRACKED = "tracked"
     """It continues the pose of the frame before."""
-    FOUND = "found"
+    INITIALIZED = "found"
     """It was initialized from the points, without history."""
     COASTING = "coasting"
     """Too few markers are visible: the pose is the predicted one; it is given for a few frames only."""

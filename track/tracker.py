@@ -224,7 +224,7 @@ class Tracker:
         labels[among] = hand.labels
         targets = targets_of(frame.points, labels, state.num_markers)
         estimate = state.initialize(hand.fit.qpos[0], targets, frame.time)
-        return _tracked(state, Status.FOUND, frame.points, labels, estimate)
+        return _tracked(state, Status.INITIALIZED, frame.points, labels, estimate)
 
 
 def _tracked(

@@ -45,7 +45,7 @@ def run(tracker: Tracker, take: Take, frames: range) -> list[TrackedFrame]:
 def test_hands_are_initialized_and_tracked(take, labeler):
     frames = range(take.num_frames)
     tracked = run(Tracker(users(take), labeler), take, frames)
-    assert [hand.status for hand in tracked[0].hands] == [Status.FOUND, Status.FOUND]
+    assert [hand.status for hand in tracked[0].hands] == [Status.INITIALIZED, Status.INITIALIZED]
     assert all(hand.status is Status.TRACKED for frame in tracked[1:] for hand in frame.hands)
     right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
     assert np.mean(right) >= 0.98

@@ -24,7 +24,7 @@ from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig, simulate_take
 
 NUM_MARKERS = 38
-SURE = Status.TRACKED, Status.FOUND
+SURE = Status.TRACKED, Status.INITIALIZED
 FARTHEST = 0.004
 """[m] that joints may be off on average wherever a hand is said to be tracked."""
 

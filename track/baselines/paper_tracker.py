@@ -171,4 +171,4 @@ class PaperTracker:
             if fit is not None and fit.rms[0] <= MOST_RMS:
                 labels[own_labels >= 0] = own_labels[own_labels >= 0] + self._first_label[number]
                 hand.qpos = fit.qpos[0]
-                hands[number] = hand.tracked(Status.FOUND, points, own_labels, fit)
+                hands[number] = hand.tracked(Status.INITIALIZED, points, own_labels, fit)

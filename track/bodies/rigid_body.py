@@ -245,7 +245,7 @@ class BodyTracker:
             other, other_assignment = np.empty(7), np.empty_like(assignment)
             more, spread = self._match(points, None, np.inf, other_assignment, other)
             if more > FEWEST:
-                return self._accept(Status.FOUND, other, spread, other_assignment, ids, time)
+                return self._accept(Status.INITIALIZED, other, spread, other_assignment, ids, time)
         return self._accept(Status.TRACKED, pose, rms, assignment, ids, time)
 
     def _coast(self, points: NDArray[np.float64], ids: NDArray[np.int64], elapsed: float) -> BodyFrame | None:
@@ -271,7 +271,7 @@ class BodyTracker:
             )
             count, rms = self._match(points, predicted, radius, assignment, pose)
             if count > FEWEST or (count == FEWEST and radius <= _CONFIDENT_RADIUS):
-                return self._accept(Status.FOUND, pose, rms, assignment, ids, time)
+                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
         count, rms = self._match(points, None, np.inf, assignment, pose)
         if count >= FEWEST:
             there = transform_markers(self._positions, pose)
@@ -280,7 +280,7 @@ class BodyTracker:
             self._confirmed = self._confirmed + 1 if moved < _MOST_CANDIDATE_MOTION else 1
             self._candidate = pose
             if self._confirmed >= _frames_to_confirm(count, len(self._positions)):
-                return self._accept(Status.FOUND, pose, rms, assignment, ids, time)
+                return self._accept(Status.INITIALIZED, pose, rms, assignment, ids, time)
         else:
             self._confirmed = 0
         return BodyFrame(Status.LOST, None, np.full(len(points), -1), np.nan)
@@ -337,7 +337,7 @@ class BodyTracker:
     ) -> BodyFrame:
         """Update pose and velocity by a fit."""
         elapsed = time - self._time
-        if status == Status.FOUND:
+        if status == Status.INITIALIZED:
             self._velocity, self._most_markers, self._fits = np.zeros(6), 0, 0
         elif 0.0 < elapsed <= _LONGEST_PREDICTION:
             weight = _SMOOTHING if self._fits > 1 else 1.0

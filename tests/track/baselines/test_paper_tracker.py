@@ -97,8 +97,8 @@ def test_sides_are_drawn_and_a_wrong_one_is_thrown_away(users, labeler, still):
         first.append([hand.status for hand in frames[0].hands])
         assert all(hand.status is Status.TRACKED for hand in frames[-1].hands)
         assert np.array_equal(frames[-1].labels, seen_frame(still, 0).labels)
-    found = [statuses == [Status.FOUND] * 2 for statuses in first]
-    assert all(statuses in ([Status.FOUND] * 2, [Status.LOST] * 2) for statuses in first)
+    found = [statuses == [Status.INITIALIZED] * 2 for statuses in first]
+    assert all(statuses in ([Status.INITIALIZED] * 2, [Status.LOST] * 2) for statuses in first)
     assert 2 <= sum(found) <= 10, "the coin has two sides"
 
 
@@ -198,7 +198,7 @@ def test_points_without_ids_are_found_anew_in_every_frame(users, labeler, still)
     nameless = dataclasses.replace(still, ids=np.full_like(still.ids, -1))
     frames = run(PaperTracker(users, labeler, rng=np.random.default_rng(0)), nameless)
     assert not any(hand.status is Status.TRACKED for frame in frames for hand in frame.hands)
-    assert any(hand.status is Status.FOUND for frame in frames for hand in frame.hands)
+    assert any(hand.status is Status.INITIALIZED for frame in frames for hand in frame.hands)
 
 
 def test_frames_without_points_are_frames(users, labeler):

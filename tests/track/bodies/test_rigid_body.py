@@ -70,7 +70,7 @@ def test_every_frame_of_a_twin_is_right():
     errors = []
     for number, (points, ids, labels) in enumerate(frames(take)):
         frame = tracker.step(points, ids, number / take.rate)
-        assert frame.status == (Status.TRACKED if number else Status.FOUND)
+        assert frame.status == (Status.TRACKED if number else Status.INITIALIZED)
         np.testing.assert_array_equal(frame.labels, labels)
         assert frame.rms < 0.0015
         errors.append(apart(frame.T_world_body, take.body.T_world_body[number]))
@@ -84,7 +84,7 @@ def test_the_same_without_ids():
     for number, (points, ids, labels) in enumerate(frames(twin())):
         frame = tracker.step(points, np.full(len(ids), -1), number * STEP)
         assert not ((frame.labels >= 0) & (frame.labels != labels)).any()
-        assert frame.status in (Status.FOUND, Status.TRACKED)
+        assert frame.status in (Status.INITIALIZED, Status.TRACKED)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -103,7 +103,7 @@ def test_bodies_are_found_at_once_in_any_pose_and_order(name, seed):
     body, pose = template(name), transform(rng)
     points, labels = seen(body, pose, rng)
     frame = BodyTracker(body).step(points, np.arange(len(points)), 0.0)
-    assert frame.status == Status.FOUND
+    assert frame.status == Status.INITIALIZED
     np.testing.assert_array_equal(frame.labels[labels >= 0], labels[labels >= 0])
     assert (frame.labels[labels < 0] == -1).all()
     away, turned = apart(frame.T_world_body, pose)
@@ -117,7 +117,7 @@ def test_three_of_more_markers_follow_a_body_but_do_not_find_it(rng):
         points, _ = seen(body, pose, rng, without=(1,), strays=0)
         assert tracker.step(points, np.arange(3), number * STEP).status == Status.LOST
     points, labels = seen(body, pose, rng)
-    assert tracker.step(points, labels, 30 * STEP).status == Status.FOUND
+    assert tracker.step(points, labels, 30 * STEP).status == Status.INITIALIZED
     for number in range(31, 60):
         points, labels = seen(body, pose, rng, without=(1,))
         frame = tracker.step(points, labels, number * STEP)
@@ -141,7 +141,7 @@ def test_a_body_of_three_markers_is_believed_after_a_while(rng):
         points, labels = seen(body, pose, rng, strays=3)
         frame = tracker.step(points, np.arange(len(points)), number * STEP)
         words.append(frame.status)
-    assert words == [Status.LOST] * 9 + [Status.FOUND] + [Status.TRACKED] * 2
+    assert words == [Status.LOST] * 9 + [Status.INITIALIZED] + [Status.TRACKED] * 2
     np.testing.assert_array_equal(frame.labels, labels)
 
 
@@ -159,8 +159,8 @@ def test_a_body_coasts_a_little_and_is_found_again_where_it_was(rng):
             assert apart(words[-1].T_world_body, pose)[0] < 0.003
         assert not ((words[-1].labels >= 0) & (words[-1].labels != labels)).any()
     assert [frame.status for frame in words] == [
-        Status.FOUND, *[Status.TRACKED] * 9, *[Status.COASTING] * 3, *[Status.LOST] * 7,
-        *[Status.LOST] * 10, Status.FOUND, *[Status.TRACKED] * 9
+        Status.INITIALIZED, *[Status.TRACKED] * 9, *[Status.COASTING] * 3, *[Status.LOST] * 7,
+        *[Status.LOST] * 10, Status.INITIALIZED, *[Status.TRACKED] * 9
     ]  # fmt: skip
     assert (words[10].labels >= 0).sum() == 1, "the marker that is left"
 
@@ -174,7 +174,7 @@ def test_three_markers_near_where_it_was_find_it_again(rng):
         points, labels = seen(body, pose, rng, without=without)
         ids = np.where(labels >= 0, labels + (100 if number >= 14 else 0), -1)
         words.append(tracker.step(points, ids, number * STEP).status)
-    assert words[13:16] == [Status.LOST, Status.FOUND, Status.TRACKED]
+    assert words[13:16] == [Status.LOST, Status.INITIALIZED, Status.TRACKED]
 
 
 def test_ids_that_change_places_or_are_used_again_do_not_mislead(rng):
@@ -254,7 +254,7 @@ def test_a_mirrored_constellation_is_another_one(rng):
     body = RigidTemplate("thing", ("a", "b", "c", "d"), places)
     mirrored = RigidTemplate("mirrored", body.marker_names, places * (1, 1, -1))
     points, _ = seen(mirrored, transform(rng), rng, strays=0)
-    assert BodyTracker(mirrored).step(points, np.arange(4), 0.0).status == Status.FOUND
+    assert BodyTracker(mirrored).step(points, np.arange(4), 0.0).status == Status.INITIALIZED
     assert BodyTracker(body).step(points, np.arange(4), 0.0).status == Status.LOST
 
 
@@ -292,7 +292,7 @@ def test_no_stream_content_raises(data):
             np.testing.assert_allclose(
                 frame.T_world_body[:3, :3] @ frame.T_world_body[:3, :3].T, np.eye(3), atol=1e-9
             )
-        if frame.status in (Status.FOUND, Status.TRACKED):
+        if frame.status in (Status.INITIALIZED, Status.TRACKED):
             assert len(given_out) >= 3 and frame.rms <= 0.003
 
 
@@ -302,7 +302,7 @@ def test_a_crowd_of_points_is_not_searched_but_a_body_in_it_is_followed(rng):
     points, labels = seen(body, pose, rng, strays=2000)
     assert tracker.step(points, labels, 0.0).status == Status.LOST
     points, labels = seen(body, pose, rng)
-    assert tracker.step(points, labels, STEP).status == Status.FOUND
+    assert tracker.step(points, labels, STEP).status == Status.INITIALIZED
     points, labels = seen(body, pose, rng, strays=2000)
     assert tracker.step(points, labels, 2 * STEP).status == Status.TRACKED
 

@@ -103,7 +103,7 @@ def test_a_body_is_tracked_live():
             tracker.step(one.points, one.ids, one.time).status
             for one in itertools.islice(stream, take.num_frames)
         ]
-    assert words == [Status.FOUND] + [Status.TRACKED] * (take.num_frames - 1)
+    assert words == [Status.INITIALIZED] + [Status.TRACKED] * (take.num_frames - 1)
 
 
 def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
