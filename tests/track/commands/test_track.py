@@ -56,9 +56,8 @@ def user(tmp_path_factory):
     model = HandModel(shape)
     worn = wear(load_layout("dense19"), model, along=0.05, around=0.2, rng=rng)
     config = CalibrationTakeConfig(free=2.0, rounds=0)
-    take = simulate_calibration(((model, worn),), config, rng=rng)
-    columns = tuple(f"*{number}" for number in range(take.points.shape[1]))
-    write_capture(folder / "user.c3d", Capture(columns, take.points, take.rate))
+    take = simulate_calibration((GloveFit(model, worn),), config, rng=rng)
+    write_capture(folder / "user.c3d", take.capture())
     arguments = [str(folder / "user.c3d"), "--size", "L", "--out", str(folder / "user.json")]
     assert main(["calibrate", *arguments]) == 0
     return folder, GloveFit(model, worn)
