@@ -206,7 +206,7 @@ def test_mistakes_are_told(scene):
     with pytest.raises(ArgumentError, match=r"vertices has shape \(40, 10, 3\), expected \(40, 5730, 3\)"):
         clear_of_mesh(tree, skin[:, :10], markers, cameras, wanted)
     with pytest.raises(
-        ArgumentError, match=r"points \(40, 18, 3\), cameras \(16, 3\) and wanted \(40, 19, 16\) do not"
+        ArgumentError, match=r"points \(40, 18, 3\), cameras \(16, 3\) and needed \(40, 19, 16\) do not"
     ):
         clear_of_mesh(tree, skin, markers[:, 1:], cameras, wanted)
     broken = skin.copy()
