@@ -2,6 +2,7 @@
 
 - visibility: lines of sight past capsules, facing, field of view
 - mesh_tree: bounding-volume tree over a moving mesh
+- mesh_lines: compiled search of that tree
 - mesh_sight: lines of sight past meshes
 - mirrors: mirror images in shiny patches
 - strays: stray reflections that persist

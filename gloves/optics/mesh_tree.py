@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numba
 import numpy as np
 
+from gloves.optics.mesh_lines import refit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.shape import named_shape
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _LEAF: Final = 4  # triangles of a leaf at most
-_PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes are no special case
 
 
 class MeshTree:
@@ -157,36 +157,3 @@ def _leaf_vertices(faces: Any, first: Any) -> Any:
                     found += 1
     start[nodes] = found
     return spots[:found].copy(), start
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
-    """Refit every box to its triangles; written out, because loops over axes take longer.
-
-    Args:
-        vertices: The mesh (V, 3) [m].
-        skip: `MeshTree.skip` (N,).
-        spots: `MeshTree.spots`, the vertices of the leaves.
-        start: `MeshTree.spots_start` (N + 1,).
-        boxes: Low and high corner of each node (N, 6) [m], overwritten.
-    """
-    for back in range(len(skip)):
-        node = len(skip) - 1 - back
-        if start[node] == start[node + 1]:
-            left = node + 1
-            right = skip[left]
-            for i in range(3):
-                a, b = boxes[left, i], boxes[right, i]
-                boxes[node, i] = a if a < b else b
-                a, b = boxes[left, 3 + i], boxes[right, 3 + i]
-                boxes[node, 3 + i] = a if a > b else b
-            continue
-        lx, ly, lz, hx, hy, hz = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
-        for spot in range(start[node], start[node + 1]):
-            v = spots[spot]
-            x, y, z = vertices[v, 0], vertices[v, 1], vertices[v, 2]
-            lx, hx = (x if x < lx else lx), (x if x > hx else hx)
-            ly, hy = (y if y < ly else ly), (y if y > hy else hy)
-            lz, hz = (z if z < lz else lz), (z if z > hz else hz)
-        boxes[node, 0], boxes[node, 1], boxes[node, 2] = lx - _PAD, ly - _PAD, lz - _PAD
-        boxes[node, 3], boxes[node, 4], boxes[node, 5] = hx + _PAD, hy + _PAD, hz + _PAD

@@ -206,7 +206,7 @@ def test_mistakes_are_told(scene):
     with pytest.raises(ArgumentError, match=r"vertices has shape \(40, 10, 3\), expected \(40, 5730, 3\)"):
         clear_of_mesh(tree, skin[:, :10], markers, cameras, wanted)
     with pytest.raises(
-        ArgumentError, match=r"points \(40, 18, 3\), cameras \(16, 3\) and wanted \(40, 19, 16\) do not"
+        ArgumentError, match=r"points \(40, 18, 3\), cameras \(16, 3\) and needed \(40, 19, 16\) do not"
     ):
         clear_of_mesh(tree, skin, markers[:, 1:], cameras, wanted)
     broken = skin.copy()
@@ -217,5 +217,5 @@ def test_mistakes_are_told(scene):
         clear_of_body(tree, np.tile(np.diag([1e3, 1e3, 1e3, 1.0]), (FRAMES, 1, 1)), markers, cameras, wanted)
     with pytest.raises(ArgumentError, match="faces name vertices 0 to 3, expected 0 to 2"):
         MeshTree(np.eye(3), np.array([[0, 1, 3]]))
-    with pytest.raises(ArgumentError, match=r"are no \(V, 3\) and \(F, 3\) of a mesh"):
+    with pytest.raises(ArgumentError, match=r"expected \(V, 3\) and \(F, 3\)"):
         MeshTree(np.eye(3), np.zeros((0, 3), dtype=int))
