@@ -86,11 +86,11 @@ def make_case(number: int, rng: np.random.Generator) -> Case:
     side = SIDES[number // 15 % 2]
     tone = list(TONES)[(number // 30 + number) % 6]
     name = POSES[pose][int(rng.integers(len(POSES[pose])))]
-    model, qpos = pose_somebody(name, side, rng)
+    model, qpos = sample_pose(name, side, rng)
     return Case(pose, view, tone, side, name, model, qpos, place_camera(model, qpos, view, rng))
 
 
-def pose_somebody(name: str, side: Side, rng: np.random.Generator) -> tuple[HandModel, np.ndarray]:
+def sample_pose(name: str, side: Side, rng: np.random.Generator) -> tuple[HandModel, np.ndarray]:
     while True:
         model = HandModel(sample_shape(side=side, rng=rng))
         low, high = model.skeleton.ranges.T
@@ -116,10 +116,10 @@ def place_camera(model: HandModel, qpos: np.ndarray, view: str, rng: np.random.G
     right = np.cos(roll) * right + np.sin(roll) * np.cross(ahead, right)
     rotation = np.stack([right, np.cross(ahead, right), ahead], axis=1)
     skin = model.skin(qpos[None])[0]
-    local, wanted, distance = (skin - skin.mean(axis=0)) @ rotation, rng.uniform(*FILL), 0.6
+    local, share, distance = (skin - skin.mean(axis=0)) @ rotation, rng.uniform(*FILL), 0.6
     for _ in range(8):
         pixels = local[:, :2] / (local[:, 2:] + distance) * camera.K[0, 0]
-        distance *= (np.ptp(pixels, axis=0) / size).max() / wanted
+        distance *= (np.ptp(pixels, axis=0) / size).max() / share
     free = np.clip(size / 2 - np.abs(pixels).max(axis=0) - 15.0, 0.0, [120.0, 70.0])
     shift = rng.uniform(-1.0, 1.0, 2) * free / camera.K[0, 0] * distance
     pose = np.eye(4)

@@ -1,8 +1,8 @@
-"""How quickly pictures come, and how true their depth is.
+"""Speed of rendering, accuracy of depth, and memory.
 
     MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
 
-speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one a core: depth alone;
+speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
     colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
     loop that a user would write with pyrender (the same meshes, plain material, one light) and MuJoCo's own
     renderer (the hand's capsules, no skin), each for depth and for colors.
@@ -78,7 +78,7 @@ def draw_and_write(config: RenderConfig, folder: Path, frames: int, shard: int) 
 
 
 def rate(job: Callable[[], object], count: int) -> float:
-    """Pictures a second, the median of some rounds after one that does not count."""
+    """Pictures per second, the median of some rounds after a warm-up."""
     job()
     seconds = []
     for _ in range(ROUNDS):
@@ -89,7 +89,7 @@ def rate(job: Callable[[], object], count: int) -> float:
 
 
 def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> float:
-    """Pictures a second while all processes are at work: from the second shard of each on."""
+    """Pictures per second while all processes are at work: from the second shard of each on."""
     ends = []
     for _ in in_processes(job, range(1 + 6 * cores), cores):
         ends.append(time.perf_counter())
@@ -98,7 +98,7 @@ def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> flo
 
 
 def plain_pyrender(take: ShownTake, color: bool) -> None:
-    """What a user would write: a scene a frame, skinned meshes, one light."""
+    """What a user would write: one scene per frame, skinned meshes, one light."""
     pyrender = load_pyrender()
     view = Viewpoints(PLAIN.view, take, rng=np.random.default_rng(0))
     renderer = offscreen_renderer(640, 480)
@@ -135,7 +135,7 @@ def mujoco_loop(take: ShownTake, color: bool) -> None:
 
 def speed(frames: int) -> None:
     take, cores = a_take(frames), os.cpu_count() or 1
-    print(f"\nimages a second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
+    print(f"\nimages per second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
     with tempfile.TemporaryDirectory() as folder:
         jobs = {name: functools.partial(draw, config, frames) for name, config in KINDS.items()}
         jobs["- written as WebDataset"] = functools.partial(draw_and_write, COLORS, Path(folder), frames)
@@ -164,9 +164,9 @@ def accuracy(frames: int) -> None:
         caster = RayMeshIntersector(trimesh.Trimesh(vertices, surface.faces, process=False))
         directions = camera.rays().reshape(-1, 3) @ camera.T_world_camera[:3, :3].T
         origins = np.broadcast_to(camera.T_world_camera[:3, 3], directions.shape)
-        places, rays, faces = caster.intersects_location(origins, directions, multiple_hits=False)
+        positions, rays, faces = caster.intersects_location(origins, directions, multiple_hits=False)
         depth, part = np.zeros(len(directions)), np.zeros(len(directions), dtype=np.uint8)
-        depth[rays], part[rays] = camera.local(places)[:, 2], surface.parts[faces]
+        depth[rays], part[rays] = camera.local(positions)[:, 2], surface.parts[faces]
         depth, part = depth.reshape(480, 640), part.reshape(480, 640)
         both = (depth > 0) & (mine.depth > 0)
         off.append(1e3 * np.abs(depth - mine.depth)[both])

@@ -1,4 +1,4 @@
-"""How long a frame's sensors take, in milliseconds of processor time, one thread.
+"""Processor time of the sensors per frame, in milliseconds on one thread.
 
     python benchmarks/sensors.py [--width 640 --height 480 --repeats 50]
 

@@ -76,7 +76,7 @@ def decode_depth(data: bytes, *, name: str = "depth picture") -> Float32[np.ndar
     unit = _unit(data, name)
     steps = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     if steps is None:
-        raise DatasetError(f"{name}: damaged: it is no whole PNG picture")
+        raise DatasetError(f"{name}: damaged: it is not a whole PNG picture")
     if steps.dtype != np.uint16 or steps.ndim != 2:
         raise DatasetError(
             f"{name}: {steps.dtype} of shape {steps.shape}, expected a 16-bit gray picture of depth"
@@ -165,7 +165,7 @@ def _unit(data: bytes, name: str) -> float:
             except ValueError:
                 unit = np.nan
             if not 0.0 < unit < np.inf:
-                raise DatasetError(f"{name}: damaged: its unit '{text!r}' is no number of meters")
+                raise DatasetError(f"{name}: damaged: its unit '{text!r}' is not a number of meters")
             return unit
         offset += 12 + length
     return METERS_PER_UNIT

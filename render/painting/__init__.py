@@ -10,6 +10,6 @@
 - gl: the import of pyrender, and one off-screen renderer per process.
 - opengl_lights: the lamps of a picture in a pyrender scene.
 - opengl_painter: colors by OpenGL.
-- hardware: whether OpenGL has graphics hardware.
+- hardware: whether OpenGL draws on graphics hardware here.
 - painter: the choice between the two painters, and pictures over backgrounds.
 """

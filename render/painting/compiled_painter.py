@@ -96,21 +96,21 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _shade_surface(
-    nearness: Any,
-    first: Any,
+    nearness: NDArray[np.float32],
+    first: NDArray[np.int32],
     begin: int,
-    faces: Any,
-    vertices: Any,
-    texels: Any,
-    finish: Any,
-    lamps: Any,
-    ambient: Any,
-    to_map: Any,
-    nearest: Any,
+    faces: NDArray[np.int64],
+    vertices: NDArray[np.float64],
+    texels: NDArray[np.uint8],
+    finish: NDArray[np.float64],
+    lamps: NDArray[np.float64],
+    ambient: NDArray[np.float64],
+    to_map: NDArray[np.float64],
+    nearest: NDArray[np.float32],
     bias: float,
-    to_linear: Any,
-    to_display: Any,
-    sums: Any,
+    to_linear: NDArray[np.float64],
+    to_display: NDArray[np.float64],
+    sums: NDArray[np.float32],
 ) -> None:
     """Add one surface's colors, and how many of four samples per pixel it fills.
 
@@ -156,7 +156,9 @@ def _shade_surface(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _samples(nearness: Any, first: Any, begin: int, end: int, row: int, column: int) -> Any:
+def _samples(
+    nearness: NDArray[np.float32], first: NDArray[np.int32], begin: int, end: int, row: int, column: int
+) -> Any:
     """How many of a pixel's four samples a surface fills, and whether it fills all with similar depths.
 
     Args:
@@ -178,7 +180,14 @@ def _samples(nearness: Any, first: Any, begin: int, end: int, row: int, column: 
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _interpolate(vertices: Any, faces: Any, face: int, x: float, y: float, spot: Any) -> None:
+def _interpolate(
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    face: int,
+    x: float,
+    y: float,
+    spot: NDArray[np.float64],
+) -> None:
     """Write the surface point of a face behind a pixel: its corners' rows, interpolated with perspective.
 
     Args:
@@ -206,7 +215,9 @@ def _interpolate(vertices: Any, faces: Any, face: int, x: float, y: float, spot:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _apply_normal_map(vertices: Any, faces: Any, face: int, spot: Any) -> None:
+def _apply_normal_map(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], face: int, spot: NDArray[np.float64]
+) -> None:
     """Replace a normal (of `spot`) by the texture's, whose first axis is the direction in which u grows.
 
     Args:
@@ -237,7 +248,7 @@ def _apply_normal_map(vertices: Any, faces: Any, face: int, spot: Any) -> None:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _normalize(spot: Any) -> None:
+def _normalize(spot: NDArray[np.float64]) -> None:
     """Scale the normal of a surface point (see `shading.SPOT`) to unit length."""
     scale = 1.0 / np.sqrt(spot[6] * spot[6] + spot[7] * spot[7] + spot[8] * spot[8])
     for i in range(6, 9):

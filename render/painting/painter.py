@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numba
 import numpy as np
@@ -19,6 +19,7 @@ from render.scenery.lights import Lighting
 
 if TYPE_CHECKING:
     from jaxtyping import Float32, UInt8
+    from numpy.typing import NDArray
 
 Painter = Literal["compiled", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
@@ -91,7 +92,7 @@ def put_before(
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _mix(painted: Any, background: Any, mixed: Any) -> None:
+def _mix(painted: NDArray[np.uint8], background: NDArray[np.float32], mixed: NDArray[np.uint8]) -> None:
     """See `put_before`.
 
     Args:

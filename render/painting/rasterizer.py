@@ -19,6 +19,7 @@ from render.frames.frame import Pictures
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int, Int32, UInt8
+    from numpy.typing import NDArray
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
@@ -103,7 +104,7 @@ def nearest_faces(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def project(local: Any, K: Any) -> Any:
+def project(local: NDArray[np.float64], K: NDArray[np.float64]) -> Any:
     """Pixels [px] and one over the depth [1/m] (V, 3) of points; NaN for those nearer than `NEAR`.
 
     Args:
@@ -121,7 +122,12 @@ def project(local: Any, K: Any) -> Any:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
+def _draw(
+    corners: NDArray[np.float64],
+    faces: NDArray[np.int64],
+    nearness: NDArray[np.float32],
+    first: NDArray[np.int32],
+) -> None:
     """Draw faces into a z-buffer; see `nearest_faces`.
 
     Args:
@@ -163,7 +169,13 @@ def _draw(corners: Any, faces: Any, nearness: Any, first: Any) -> None:
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _write(
-    inverse: Any, first: Any, labels: Any, depth: Any, parts: Any, instances: Any, markers: Any
+    inverse: NDArray[np.float32],
+    first: NDArray[np.int32],
+    labels: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    parts: NDArray[np.uint8],
+    instances: NDArray[np.uint8],
+    markers: NDArray[np.uint8],
 ) -> None:
     """Write depth and ids of the nearest faces.
 
@@ -188,7 +200,13 @@ def _write(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _interpolate(faces: Any, normals: Any, corners: Any, first: Any, picture: Any) -> None:
+def _interpolate(
+    faces: NDArray[np.int64],
+    normals: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    first: NDArray[np.int32],
+    picture: NDArray[np.float32],
+) -> None:
     """Write the unit normals behind the centers of all pixels with a face.
 
     Args:

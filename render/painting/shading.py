@@ -6,12 +6,15 @@ glTF 2.0 specification, appendix B), as in pyrender's shader, so that both paint
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numba
 import numpy as np
 
 from render.painting.shadow_map import lit_share
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 GAMMA: Final = 2.2
 _FACING: Final = 0.04  # specular reflectance of dielectrics at normal incidence
@@ -31,7 +34,7 @@ coordinates (2), linear color (3), roughness, the texture's normal (3)."""
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def display(light: float, table: Any) -> float:
+def display(light: float, table: NDArray[np.float64]) -> float:
     """The display value of linear light, clipped to [0, 1]; `table` is `TO_DISPLAY` (2048,)."""
     root = np.sqrt(min(max(light, 0.0), 1.0)) * (_LEVELS - 1)
     low = min(int(root), _LEVELS - 2)
@@ -40,7 +43,7 @@ def display(light: float, table: Any) -> float:
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def read_texels(texels: Any, table: Any, spot: Any) -> None:
+def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float64], spot: NDArray[np.float64]) -> None:
     """Multiply a surface point's color and roughness by the texture's, and write its normal; bilinear.
 
     Args:
@@ -73,7 +76,14 @@ def read_texels(texels: Any, table: Any, spot: Any) -> None:
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def shade(
-    spot: Any, glow: float, lamps: Any, ambient: Any, to_map: Any, nearest: Any, bias: float, light: Any
+    spot: NDArray[np.float64],
+    glow: float,
+    lamps: NDArray[np.float64],
+    ambient: NDArray[np.float64],
+    to_map: NDArray[np.float64],
+    nearest: NDArray[np.float32],
+    bias: float,
+    light: NDArray[np.float64],
 ) -> None:
     """Write the linear light (red, green, blue) that a surface point sends to the camera in the origin.
 

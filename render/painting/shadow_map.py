@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numba
 import numpy as np
@@ -11,6 +11,7 @@ from render.painting.rasterizer import nearest_faces
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Float32, Int
+    from numpy.typing import NDArray
 
 _TEXELS: Final = (
     640  # along a side; hands and forearms are half a meter across, a finger's edge a millimeter soft
@@ -54,7 +55,9 @@ def shadow_map(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def lit_share(to_map: Any, nearest: Any, bias: float, x: float, y: float, z: float) -> float:
+def lit_share(
+    to_map: NDArray[np.float64], nearest: NDArray[np.float32], bias: float, x: float, y: float, z: float
+) -> float:
     """Visible share of the lamp at a position: the mean over a square of three texels around it.
 
     Args:

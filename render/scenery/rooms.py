@@ -122,21 +122,21 @@ def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.ra
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the casting.
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _cast(
-    rays: Any,
-    eye: Any,
-    room: Any,
-    patterns: Any,
-    pitches: Any,
-    colors: Any,
-    boards: Any,
-    frames: Any,
-    corners: Any,
-    box_colors: Any,
-    bands: Any,
-    shades: Any,
-    lamp: Any,
+    rays: NDArray[np.float32],
+    eye: NDArray[np.float64],
+    room: NDArray[np.float64],
+    patterns: NDArray[np.int64],
+    pitches: NDArray[np.float64],
+    colors: NDArray[np.float64],
+    boards: NDArray[np.float64],
+    frames: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    box_colors: NDArray[np.float64],
+    bands: NDArray[np.float64],
+    shades: NDArray[np.float64],
+    lamp: NDArray[np.float64],
     strength: float,
-    picture: Any,
+    picture: NDArray[np.float32],
 ) -> None:
     """Light (N, 3) that comes along each ray."""
     position, color = np.empty(3), np.empty(3)
@@ -166,7 +166,13 @@ def _cast(
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _nearest_box(rays: Any, ray: int, eye: Any, corners: Any, distance: float) -> Any:
+def _nearest_box(
+    rays: NDArray[np.float32],
+    ray: int,
+    eye: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    distance: float,
+) -> Any:
     """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none.
 
     Args:
@@ -192,7 +198,14 @@ def _nearest_box(rays: Any, ray: int, eye: Any, corners: Any, distance: float) -
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _wall_color(
-    position: Any, wall: int, patterns: Any, pitches: Any, colors: Any, boards: Any, frames: Any, color: Any
+    position: NDArray[np.float64],
+    wall: int,
+    patterns: NDArray[np.int64],
+    pitches: NDArray[np.float64],
+    colors: NDArray[np.float64],
+    boards: NDArray[np.float64],
+    frames: NDArray[np.float64],
+    color: NDArray[np.float64],
 ) -> None:
     """Write the color of a wall at a position: plain, stripes, tiles or boards, pictures and windows."""
     axis = wall // 2

@@ -133,7 +133,12 @@ def face_parts() -> UInt8[np.ndarray, "F"]:
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _occluded_share(points: Any, normals: Any, segments: Any, radii: Any) -> Any:
+def _occluded_share(
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    segments: NDArray[np.float64],
+    radii: NDArray[np.float64],
+) -> Any:
     """Share (V,) of each point's hemisphere behind capsules, each replaced by its nearest ball.
 
     Args:
