@@ -75,7 +75,7 @@ def test_ghosts_are_counted_and_measured_to_the_nearest_marker(rows):
 
 
 def test_nearest_neighbors(rows, monkeypatch):
-    monkeypatch.setattr(report, "_AT_ONCE", 3)  # the last frame comes in a part of its own
+    monkeypatch.setattr(report, "_CHUNK", 3)  # the last frame comes in a part of its own
     apart = report.neighbor_distances(rows)
     np.testing.assert_allclose(apart, [[0.03, 0.03, 0.04]] * 3 + [[0.01, 0.01, 0.06]], rtol=1e-6)
 
@@ -154,7 +154,8 @@ def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
     assert main(command) == 0  # the same command goes on in a folder that holds a report
     assert (out / "report.html").read_bytes() == first
     assert sorted(path.name for path in out.iterdir()) == [
-        "config.json", "hands-00000.npy", "manifest.json", "report.html", "rows-00000.npy",
+        "config.json", "hands-00000.npy", "manifest.json", "redrawn-00000.json", "report.html",
+        "rows-00000.npy",
     ]  # fmt: skip
 
 
@@ -164,7 +165,7 @@ import sys
 import train.commands.generate, train.commands.train, train.simulation.generation
 import train.reports.dataset_page, train.reports.run_page, train.reports.plot_style
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
-train.reports.datasetpicture((1, 1), lambda figure: figure.subplots())
+train.reports.plot_style.picture((1, 1), lambda figure: figure.subplots())
 assert "matplotlib.figure" in sys.modules and "matplotlib.pyplot" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

@@ -97,7 +97,7 @@ def test_the_last_look_agrees_with_the_card(run):
 
 
 def test_looking_at_held_out_frames_leaves_the_training_alone(dataset, run, tmp_path, monkeypatch):
-    monkeypatch.setattr(TrainingState, "look", lambda state, rows, names: None)
+    monkeypatch.setattr(TrainingState, "evaluate", lambda state, rows, names: None)
     train_labeler(dataset, SMALL, tmp_path / "blind")
     one, other = (torch.load(path / CHECKPOINT, weights_only=True) for path in (run[0], tmp_path / "blind"))
     for name, values in one["network"].items():
