@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -200,7 +201,7 @@ def measure(name: str, run: dict[str, Any]) -> dict[str, str]:
 
 
 def stored(text: str, name: str, measured: dict[str, str]) -> str:
-    """The text of figures.toml with a run's new values, today's date and the present commit."""
+    """The text of figures.toml with a run's new values, the present commit, this machine and today's date."""
     commit = subprocess.run(
         ["git", "rev-parse", "--short=7", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.strip()
@@ -208,10 +209,12 @@ def stored(text: str, name: str, measured: dict[str, str]) -> str:
     end = text.find("\n[", text.index(f"[runs.{name}.figures]\n") + 1)
     end = len(text) if end < 0 else end
     section = re.sub(r'^commit = ".*"$', f'commit = "{commit}"', text[start:end], flags=re.M)
+    gpu = "GPU" if shutil.which("nvidia-smi") else "no GPU"
+    section = re.sub(r'^machine = ".*"$', f'machine = "{os.cpu_count()} cores, {gpu}"', section, flags=re.M)
     section = re.sub(r'^date = ".*"$', f'date = "{date.today().isoformat()}"', section, flags=re.M)
     for key, value in measured.items():
         line = re.compile(rf'^({re.escape(key)} = {{ value = )"[^"]*"', re.M)
-        section = line.sub(lambda match, value=value: f'{match[1]}"{value}"', section)
+        section = line.sub(rf'\g<1>"{value}"', section)
     return text[:start] + section + text[end:]
 
 
