@@ -52,7 +52,7 @@ class Attachment:
         bones, shares = self.bone_indices, self.bone_weights
         if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
             raise ArgumentError(
-                f"bone_indices are no bones, expected whole numbers from 0 to {NUM_BONES - 1}"
+                f"bone_indices are not bones, expected whole numbers from 0 to {NUM_BONES - 1}"
             )
         if not ((shares >= 0.0).all() and (np.abs(shares.sum(axis=1) - 1.0) <= _SUM_TOLERANCE).all()):
             raise ArgumentError("bone_weights are not shares, expected positive numbers that sum to one")

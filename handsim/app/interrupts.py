@@ -10,7 +10,7 @@ from types import FrameType
 
 
 @contextmanager
-def interrupt_told() -> Iterator[Callable[[], bool]]:
+def interrupt_flag() -> Iterator[Callable[[], bool]]:
     """Within the block the first interrupt raises nothing; the yielded function returns whether it came.
 
     An exception from a signal can be lost: compiled code that calls back into Python swallows it. A second

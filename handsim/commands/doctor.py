@@ -55,10 +55,10 @@ class Finding:
     found: str
     expected: str = ""
     """What is needed, in words or as limits of a version; empty when anything will do."""
-    advice: str = ""
+    remedy: str = ""
     """What to do about it; empty when all is well."""
     needed: bool = True
-    """Whether commands fail until the advice is followed."""
+    """Whether commands fail until the remedy is followed."""
 
 
 def doctor() -> int:
@@ -72,7 +72,7 @@ def doctor() -> int:
     with Console(stderr=True).status("drawing a picture and looking for a GPU"):
         findings = examine()
     _print_report(findings)
-    return int(any(finding.needed and finding.advice for finding in findings))
+    return int(any(finding.needed and finding.remedy for finding in findings))
 
 
 def examine() -> list[Finding]:
@@ -92,11 +92,11 @@ def check_requirements() -> Iterator[Finding]:
     try:
         limits = metadata.metadata("handsim")["Requires-Python"]
     except metadata.PackageNotFoundError:
-        yield Finding("handsim", "not installed", advice="run `pip install -e .` in handsim's folder")
+        yield Finding("handsim", "not installed", remedy="run `pip install -e .` in handsim's folder")
         return
     python = ".".join(map(str, sys.version_info[:3]))
-    advice = "" if satisfies(python, limits) else "make a virtual environment with one of these versions"
-    yield Finding("Python", python, limits, advice)
+    remedy = "" if satisfies(python, limits) else "make a virtual environment with one of these versions"
+    yield Finding("Python", python, limits, remedy)
     for requirement in metadata.requires("handsim") or ():
         if ";" not in requirement:  # what has a marker belongs to an extra
             yield check_requirement(requirement)
@@ -105,12 +105,12 @@ def check_requirements() -> Iterator[Finding]:
 def check_requirement(requirement: str) -> Finding:
     """One dependency, written as in pyproject.toml: a name, then limits joined by commas."""
     name, limits = re.fullmatch(r"([\w.-]+)\s*(.*)", requirement).groups()  # type: ignore[union-attr]
-    advice = f"run `pip install '{name}{limits}'`"
+    remedy = f"run `pip install '{name}{limits}'`"
     try:
         found = metadata.version(name)
     except metadata.PackageNotFoundError:
-        return Finding(name, "missing", limits, advice)
-    return Finding(name, found, limits, "" if satisfies(found, limits) else advice)
+        return Finding(name, "missing", limits, remedy)
+    return Finding(name, found, limits, "" if satisfies(found, limits) else remedy)
 
 
 def satisfies(version: str, limits: str) -> bool:
@@ -134,16 +134,16 @@ def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]
     for name in ("handsim", *SIBLINGS):
         strangers = sorted(set(owners.get(name, ())) - {"handsim"})
         if strangers:
-            advice = f"run `pip uninstall {' '.join(strangers)}`, then install handsim anew"
-            yield Finding(f"import {name}", f"also owned by {', '.join(strangers)}", "handsim alone", advice)
+            remedy = f"run `pip uninstall {' '.join(strangers)}`, then install handsim anew"
+            yield Finding(f"import {name}", f"also owned by {', '.join(strangers)}", "handsim alone", remedy)
         elif name in shadowed:
             yield Finding(f"import {name}", shadowed[name], "beside handsim", "rename that, or go elsewhere")
-    advice = "run `pip uninstall pyrender pyrender-maintained`, then `pip install pyrender-maintained`"
+    remedy = "run `pip uninstall pyrender pyrender-maintained`, then `pip install pyrender-maintained`"
     flavors = sorted(set(owners.get("pyrender", ())))
     broken = _pyrender_version() == "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later
     if broken or len(flavors) > 1:
         found = "0.1.45" if broken else " and ".join(flavors)
-        yield Finding("import pyrender", found, "pyrender-maintained alone", advice)
+        yield Finding("import pyrender", found, "pyrender-maintained alone", remedy)
 
 
 def _pyrender_version() -> str:
@@ -169,8 +169,8 @@ def check_drawing(code: int, output: str) -> Finding:
 
 def check_gpu(code: int, output: str) -> Finding:
     """What torch can compute on; only a torch that cannot be imported is a fault."""
-    advice = "" if code == 0 else "install torch anew; CONTRIBUTING.md says how to get its CPU build"
-    return Finding("GPU for training", output, advice=advice)
+    remedy = "" if code == 0 else "install torch anew; CONTRIBUTING.md says how to get its CPU build"
+    return Finding("GPU for training", output, remedy=remedy)
 
 
 def check_room() -> Iterator[Finding]:
@@ -178,8 +178,8 @@ def check_room() -> Iterator[Finding]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     yield Finding("CPU cores", str(cores))
     free = shutil.disk_usage(Path.cwd()).free / 1e9
-    advice = "" if free >= 1.0 else "free some space, or give --out on another disk"
-    yield Finding("free disk here", f"{free:.1f} GB", "1 GB", advice, needed=False)
+    remedy = "" if free >= 1.0 else "free some space, or give --out on another disk"
+    yield Finding("free disk here", f"{free:.1f} GB", "1 GB", remedy, needed=False)
 
 
 def _start(code: str) -> subprocess.Popen[str]:
@@ -207,12 +207,12 @@ def _print_report(findings: Sequence[Finding]) -> None:
 
     table = Table("", "what", "found", "expected", box=None, pad_edge=False)
     for finding in findings:
-        mark = "[green]ok" if not finding.advice else "[red]missing" if finding.needed else "[yellow]low"
+        mark = "[green]ok" if not finding.remedy else "[red]missing" if finding.needed else "[yellow]low"
         table.add_row(mark, Text(finding.what), Text(finding.found), Text(finding.expected))
     console = Console()
     console.print(table)
-    troubles = [finding for finding in findings if finding.advice]
+    troubles = [finding for finding in findings if finding.remedy]
     for finding in troubles:
-        console.print(Text(f"{finding.what}: {finding.advice}."), soft_wrap=True)
+        console.print(Text(f"{finding.what}: {finding.remedy}."), soft_wrap=True)
     if not troubles:
         console.print("Nothing is missing.")

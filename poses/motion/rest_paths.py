@@ -40,14 +40,16 @@ def path_to_rest(
         PoseError: No path was valid.
     """
     # Each round draws other durations, and so other frames: a path close to the limit may pass.
-    for stops in chain(*(_detours(start, resting_angles(model)) for _ in range(_ROUNDS))):
+    for stops in chain(*(_via_paths(start, resting_angles(model)) for _ in range(_ROUNDS))):
         path = np.concatenate([straight_path(*pair, config, rng) for pair in pairwise([start, *stops])])
         if is_valid(model, path).all():
             return path
     raise PoseError("no valid path leads from one of the poses to this hand's rest")
 
 
-def _detours(start: NDArray[np.float64], resting: NDArray[np.float64]) -> Iterator[list[NDArray[np.float64]]]:
+def _via_paths(
+    start: NDArray[np.float64], resting: NDArray[np.float64]
+) -> Iterator[list[NDArray[np.float64]]]:
     """Stops on paths to rest: fingers part or not, the thumb swings out or not, one digit moves first."""
     spread = gesture("spread")
     fan = np.where(np.arange(NUM_JOINTS) % 4 == 0, spread - gesture("flat"), 0.0)

@@ -19,7 +19,7 @@ from gloves.captures.markers import labeled_capture
 from gloves.fit import GloveFit
 from gloves.takes.take import SUFFIX
 from gloves.takes.tracked_take import TrackedTake
-from handsim.app.interrupts import interrupt_told
+from handsim.app.interrupts import interrupt_flag
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError, CaptureError
 from handsim.hand.topology import Side
@@ -167,7 +167,7 @@ def _track_live(url: str, seconds: float | None, timed: TimedTracker) -> tuple[T
     with (
         closing(open_stream(url)) as stream,
         console.status("waiting for the first frame") as status,
-        interrupt_told() as interrupted,  # the frames so far are kept
+        interrupt_flag() as interrupted,  # the frames so far are kept
     ):
         start, shown = perf_counter(), 0.0
         for frame, tracked in track_stream(stream, timed):

@@ -8,12 +8,12 @@ import threading
 
 import pytest
 
-from handsim.app.interrupts import interrupt_told
+from handsim.app.interrupts import interrupt_flag
 
 
 def test_the_first_interrupt_is_told_and_the_second_raises():
     before = signal.getsignal(signal.SIGINT)
-    with interrupt_told() as interrupted:
+    with interrupt_flag() as interrupted:
         assert not interrupted()
         os.kill(os.getpid(), signal.SIGINT)
         assert interrupted()
@@ -27,7 +27,7 @@ def test_other_threads_are_never_told():
     answers: list[bool] = []
 
     def ask() -> None:
-        with interrupt_told() as interrupted:
+        with interrupt_flag() as interrupted:
             answers.append(interrupted())
 
     thread = threading.Thread(target=ask)

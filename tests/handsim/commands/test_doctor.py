@@ -34,13 +34,13 @@ def test_a_present_dependency_is_fine() -> None:
 
 def test_an_old_dependency_comes_with_its_remedy() -> None:
     finding = check_requirement("numpy>=99,<100")
-    assert finding.advice == "run `pip install 'numpy>=99,<100'`"
+    assert finding.remedy == "run `pip install 'numpy>=99,<100'`"
     assert finding.needed
 
 
 def test_an_absent_dependency_comes_with_its_remedy() -> None:
     finding = check_requirement("no-such-thing>=1")
-    assert (finding.found, finding.advice) == ("missing", "run `pip install 'no-such-thing>=1'`")
+    assert (finding.found, finding.remedy) == ("missing", "run `pip install 'no-such-thing>=1'`")
 
 
 def test_names_in_good_hands_need_no_word() -> None:
@@ -50,7 +50,7 @@ def test_names_in_good_hands_need_no_word() -> None:
 def test_a_second_owner_of_a_name_is_told() -> None:
     (finding,) = check_names({"render": ["handsim", "render"], "train": ["handsim"]}, {})
     assert finding.what == "import render"
-    assert finding.advice == "run `pip uninstall render`, then install handsim anew"
+    assert finding.remedy == "run `pip uninstall render`, then install handsim anew"
 
 
 def test_a_shadowed_sibling_is_told() -> None:
@@ -60,7 +60,7 @@ def test_a_shadowed_sibling_is_told() -> None:
 
 def test_two_pyrenders_are_told() -> None:
     (finding,) = check_names({"pyrender": ["pyrender", "pyrender-maintained"]}, {})
-    assert "pip install pyrender-maintained" in finding.advice
+    assert "pip install pyrender-maintained" in finding.remedy
 
 
 def test_the_broken_pyrender_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -76,9 +76,9 @@ def test_the_installed_pyrender_states_its_version() -> None:
 def test_failed_drawing_names_the_system_packages() -> None:
     finding = check_drawing(1, "ImportError: no library")
     assert finding.needed
-    assert finding.advice
+    assert finding.remedy
     if sys.platform == "linux":
-        assert "libegl1" in finding.advice
+        assert "libegl1" in finding.remedy
 
 
 def test_a_probe_tells_its_last_line_or_its_error() -> None:
@@ -109,7 +109,7 @@ def test_exit_code_and_report(
     out = capsys.readouterr().out
     for finding in findings:
         assert finding.found in out
-        assert finding.advice in out
+        assert finding.remedy in out
 
 
 def test_this_machine_is_examined() -> None:
@@ -119,7 +119,7 @@ def test_this_machine_is_examined() -> None:
     try:
         metadata.version("handsim")
     except metadata.PackageNotFoundError:
-        assert findings["handsim"].advice
+        assert findings["handsim"].remedy
     else:
-        assert findings["Python"].advice == ""
+        assert findings["Python"].remedy == ""
         assert findings["numpy"].found == metadata.version("numpy")
