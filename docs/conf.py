@@ -28,6 +28,7 @@ html_theme = "furo"
 html_title = f"handsim {__version__}"
 html_show_sourcelink = html_copy_source = False
 myst_heading_anchors = 3
+suppress_warnings = ["ref.python"]  # several types have a field `qpos`; napoleon links the word to each
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True}
