@@ -115,7 +115,7 @@ def test_every_module_that_a_page_names_exists():
     missing = []
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         for name in re.findall(
-            r"`((?:handsim|poses|gloves|render|train|track)(?:\.(?!py\b)\w+)+)", path.read_text()
+            r"`((?:handsim|poses|gloves|render|train|track)(?:\.(?!(?:py|json|jpg)\b)\w+)+)", path.read_text()
         ):
             if not _exists(name):
                 missing.append(f"{path.name}: {name}")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from handsim.app.cli import main
-from train.commands import reproduce as table_commands
+from train.commands import labeling_tables
 from train.evaluation.labeler_evaluation import evaluate_takes
 from train.evaluation.paper import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from train.evaluation.tables import FIGURES, augmentations
@@ -80,7 +80,7 @@ def test_table_2_trains_and_tests_four_networks(tmp_path, capsys, monkeypatch):
 def test_table_4_has_a_column_a_test_set(capsys, monkeypatch, takes):
     monkeypatch.setenv("COLUMNS", "200")
     # The same captures, but short.
-    monkeypatch.setattr(table_commands, "simulate_takes", lambda glove, seed, done: takes)
+    monkeypatch.setattr(labeling_tables, "simulate_takes", lambda glove, seed, done: takes)
     assert main(["reproduce", "table4", "--num-frames", "100"]) == 0
     said = capsys.readouterr().out
     for figure, words in FIGURES.items():
