@@ -1,41 +1,48 @@
-"""Describe a marker glove of your own, put it on a hand, and ask which cameras see it.
+"""Describe a marker glove of your own, put it on a hand, and count the cameras that see each marker.
 
     python examples/02_wear_your_own_glove.py
 
-The same layout as a file: `handsim glove new my_glove.toml`, then `handsim glove check my_glove.toml`.
+A layout is a TOML file: a name, a bone and a position on the bone for each marker. `handsim glove new` writes
+a commented one, and `handsim glove check` draws it on a hand.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 
-from gloves.attachment import attach_markers
-from gloves.layout import MarkerLayout, MarkerPlace
-from gloves.optics.visibility import visible_cameras
-from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import named_rig
-from poses.shapes.library import gesture
+from gloves import GloveFit, MarkerLayout, attach, load_layout
+from handsim import CameraRig, HandModel, HandSimError, join_qpos, load_rig
+from poses import load_gestures
+
+TIPS = {f"{digit}_tip": f"{digit}_distal" for digit in ("thumb", "index", "middle", "ring", "little")}
+BACK = {"back_a": (0.35, 0.2), "back_b": (0.75, -0.1), "back_c": (0.25, -0.2)}  # along and across the palm
+
+
+def eight_markers() -> str:
+    marker = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = {}\naround = 0.0\nacross = {}\n'
+    tips = [marker.format(name, bone, 0.7, 0.0) for name, bone in TIPS.items()]
+    back = [marker.format(name, "palm", *position) for name, position in BACK.items()]
+    return "\n".join(['name = "eight"\nradius_mm = 3.2\n', *tips, *back])
 
 
 def main() -> None:
-    tips = [
-        MarkerPlace(f"{digit}_tip", f"{digit}_distal", along=0.7, around=0.0)
-        for digit in ("thumb", "index", "middle", "ring", "little")
-    ]
-    back = [
-        MarkerPlace("back_a", "palm", along=0.35, around=0.0, across=0.2),
-        MarkerPlace("back_b", "palm", along=0.75, around=0.0, across=-0.1),
-        MarkerPlace("back_c", "palm", along=0.25, around=0.0, across=-0.2),
-    ]
-    layout = MarkerLayout("eight", (*tips, *back), radius=0.0032)
-    model = HandModel.named("M")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "eight.toml"
+        path.write_text(eight_markers())
+        layout: MarkerLayout = load_layout(path)
+        try:
+            load_layout(Path(folder) / "nine.toml")
+        except HandSimError as error:  # every mistake of a user ends in one sentence
+            print(str(error).replace(folder, "..."))
+    glove: GloveFit = attach(layout, HandModel.named("M"))
+    rig: CameraRig = load_rig("figure5")  # the paper's sixteen cameras
+    gestures = load_gestures()
     names = ("spread", "relaxed", "fist")
-    qpos = join_qpos(np.stack([gesture(name) for name in names]), position=[0.0, 0.0, 1.1])
-    bones = model.forward_kinematics(qpos)
-    markers, normals = attach_markers(layout, model).markers(model, bones)  # (3, 8, 3) each
-    seen = visible_cameras(
-        markers, normals, named_rig("figure5"), model.capsules.posed(bones), model.capsules.radii
-    )  # (3, 8, 16)
+    qpos = join_qpos(np.stack([gestures[name] for name in names]), position=[0.0, 0.0, 1.1])  # (3, 27)
+    seen = glove.visible(qpos, rig)  # (3, 8, 16)
     for name, cameras in zip(names, seen.sum(axis=-1), strict=True):
         print(f"{name:8}", ", ".join(f"{m} {n}" for m, n in zip(layout.names, cameras, strict=True)))
 

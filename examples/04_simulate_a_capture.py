@@ -1,30 +1,35 @@
-"""Simulate a capture of two hands and a pen, count its gaps, and label it.
+"""Simulate a capture of two hands and a pen, count its gaps, save it and label it.
 
     python examples/04_simulate_a_capture.py
 
-The room's optical system loses markers and makes false ones; the labeler that comes with the package names
-what it put out, frame by frame, and the truth beside it says how often it is right.
+The simulated optical system loses markers and makes ghosts. The take knows the truth, so the labels that the
+shipped labeler gives to each frame can be counted. `handsim simulate` writes the same two files.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
 import numpy as np
 
-from gloves.captures.gaps import count_gaps
-from train.evaluation.labeler_evaluation import evaluate_takes
-from train.labelers.storage import load_labeler
-from train.simulation.room_settings import TWINS
-from train.simulation.takes import TakeConfig, simulate_take
+from gloves import Capture, Take, load_take, read_capture, write_capture
+from train import TakeConfig, evaluate_takes, load_labeler, simulate_take
 
 
 def main() -> None:
-    take = simulate_take(TakeConfig(kind="hand-pen", num_frames=300))  # 2.5 s at 120 Hz
+    simulated = simulate_take(TakeConfig(kind="hand-pen", num_frames=300))  # 2.5 s at 120 Hz
+    with TemporaryDirectory() as folder:
+        write_capture(Path(folder) / "pen.trc", simulated.capture())  # points without labels
+        simulated.save(Path(folder) / "pen.truth.npz")  # labels, IDs and motion as well
+        capture: Capture = read_capture(Path(folder) / "pen.trc")
+        take: Take = load_take(Path(folder) / "pen.truth.npz")
+    print(f"{capture.num_frames} frames of {len(capture.names)} columns at {capture.rate:g} Hz")
+    present = take.markers_present()  # (300, 38)
+    gaps = (present[:-1] & ~present[1:]).sum()  # a marker disappears
     ghosts = np.isfinite(take.points[..., 0]) & (take.labels < 0)  # (300, N)
-    ours, paper = count_gaps(take.markers_present()), TWINS["hand-pen"].paper
-    print(f"{ours.gaps} gaps in {ours.frames} frames (the paper: {paper.gaps} in {paper.frames})")
-    print(f"{ours.average_length:.2f} frames a gap (the paper: {paper.average_length})")
-    print(f"{ours.average_missing:.2f} markers missing in such a frame (the paper: {paper.average_missing})")
-    print(f"{ghosts.sum() / ours.frames:.2f} ghosts a frame")
+    print(f"{gaps} gaps, {100 * (1 - present.mean()):.2f} % of the markers missing")
+    print(f"{ghosts.sum() / take.num_frames:.2f} ghosts per frame")
     figures = evaluate_takes(load_labeler("dense19"), [take]).figures
     for name in ("slot_accuracy", "occlusion_recall", "ghost_recall"):
         print(f"{name.replace('_', ' ')}: {100 * figures[name]:.2f} %")

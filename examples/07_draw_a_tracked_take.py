@@ -1,62 +1,53 @@
-"""Draw pictures of a tracked capture, read them back, and see how far their keypoints are from the truth.
+"""Draw pictures of a tracked capture, and measure how far their keypoints are from the truth.
 
     python examples/07_draw_a_tracked_take.py
 
-The same from the command line: `handsim render tracked.npz --out pictures --format coco`.
+Pictures are drawn in memory and into files. The command line does the latter too:
+`handsim render tracked.npz --out pictures --format coco`.
 """
 
 from __future__ import annotations
 
 import json
-import tempfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from gloves.captures.capture import Capture
-from gloves.fit import nominal_fit
-from handsim.hand.model import HandModel
-from handsim.space.camera import Camera, preset
-from render.cameras.viewpoints import ViewConfig
-from render.formats.png_depth import read_depth
-from render.frames.keypoints import hand_keypoints
-from render.session import RenderConfig, render_take
-from track.capture_tracking import track_capture
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from gloves import nominal_fit
+from handsim import Camera
+from render import RenderConfig, RenderedFrame, SkinLook, ViewConfig, draw_frames, render_take
+from track import Tracker, track_capture
+from train import TakeConfig, load_labeler, simulate_take
+
+
+def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
+    camera: Camera = frame.camera
+    for hand, true in zip(frame.hands, truth.hands, strict=True):
+        off = np.linalg.norm(hand.pixels - camera.project(true.keypoints), axis=1)[hand.visible]
+        shown = frame.ideal.depth[frame.ideal.depth > 0]
+        print(
+            f"{frame.key}, {hand.shape.side}: {hand.visible.sum()} of 21 keypoints visible, "
+            f"{np.mean(off):.1f} px off, hands at {1e3 * np.median(shown):.0f} mm"
+        )
 
 
 def main() -> None:
     truth = simulate_take(TakeConfig(kind="hand-hand", num_frames=120))  # 1 s at 120 Hz
-    columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
-    capture = Capture(columns, truth.points, truth.rate)
     hands = [nominal_fit(hand.layout, "M", hand.side) for hand in truth.hands]  # nobody was calibrated
-    config = RenderConfig(view=ViewConfig("orbit"), passes=("rgb", "depth"), every=20, seed=1)
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        tracked = track_capture(capture, Tracker(hands, load_labeler("dense19")))
-        tracked.save(folder / "tracked.npz")
-        count = render_take(folder / "tracked.npz", folder / "pictures", ["coco"], config, workers=1)
-        coco = json.loads((folder / "pictures" / "annotations.json").read_text())
-        print(f"{count} pictures, {len(coco['annotations'])} hands")
-        for image in coco["images"]:
-            file = folder / "pictures" / "images" / image["file_name"]
-            depth = read_depth(file.with_suffix(".depth.png"))
-            camera: Camera = preset("vga").at(np.array(image["T_world_camera"]))
-            for hand in coco["annotations"]:
-                if hand["image_id"] != image["id"]:
-                    continue
-                shown = np.array(hand["keypoints"]).reshape(21, 3)
-                true = next(one for one in truth.hands if one.side == hand["side"])
-                frame = image["frame"]
-                points = hand_keypoints(HandModel(true.shape), true.qpos[frame : frame + 1])[0]
-                # COCO counts pixels from the first one's center, cameras here from the picture's corner.
-                off = np.linalg.norm(shown[:, :2] + 0.5 - camera.project(points), axis=1)[shown[:, 2] > 0]
-                print(
-                    f"frame {frame}, {hand['side']}: {int((shown[:, 2] == 2).sum())} of 21 keypoints seen, "
-                    f"{np.mean(off):.1f} px off, hand at {1e3 * np.median(depth[depth > 0]):.0f} mm"
-                )
+    tracked = track_capture(truth.capture(), Tracker(hands, load_labeler("dense19")))
+    tone = SkinLook(lightness=45.0).typology_angle  # [deg]; people with skin about as dark as this
+    config = RenderConfig(
+        view=ViewConfig("orbit"), passes=("rgb", "depth"), tones=(tone - 5.0, tone + 5.0), every=40, seed=1
+    )
+    drawn = draw_frames(tracked, config, [0, 40, 80])
+    for pair in zip(drawn, draw_frames(truth, config, [0, 40, 80]), strict=True):
+        compare(*pair)
+    with TemporaryDirectory() as folder:
+        tracked.save(Path(folder) / "tracked.npz")
+        count = render_take(Path(folder) / "tracked.npz", Path(folder) / "out", ["coco"], config, workers=1)
+        coco = json.loads((Path(folder) / "out" / "annotations.json").read_text())
+    print(f"{count} pictures, {len(coco['annotations'])} annotated hands")
 
 
 if __name__ == "__main__":

@@ -118,6 +118,9 @@ def attach(layout: MarkerLayout, model: HandModel) -> GloveFit:
         layout: The glove's markers.
         model: The hand.
 
+    Returns:
+        The hand in its glove; `GloveFit.markers` gives marker centers (T, M, 3) [m] of poses.
+
     Raises:
         LayoutError: A marker meets no skin; the message names the marker.
     """
@@ -125,5 +128,15 @@ def attach(layout: MarkerLayout, model: HandModel) -> GloveFit:
 
 
 def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
-    """A hand of one of the five sizes (XS to XL), with its glove put on as designed."""
+    """A hand of one of the five sizes, with its glove put on as designed.
+
+    Args:
+        layout: The glove's markers.
+        size: XS, S, M, L or XL: 0.165 to 0.210 [m] of hand length.
+        side: Which hand.
+
+    Raises:
+        ArgumentError: There is no such size or side.
+        LayoutError: A marker meets no skin; the message names the marker.
+    """
     return attach(layout, HandModel.named(size, side=side))

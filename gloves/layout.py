@@ -138,6 +138,12 @@ def list_layouts() -> tuple[str, ...]:
 def load_layout(name_or_path: str | Path) -> MarkerLayout:
     """A shipped layout by its name, or your own by the path of its `.toml` file.
 
+    The file has the marker radius in [mm] and angles in [deg]; the layout has them in [m] and [rad].
+    `handsim glove new FILE` writes a commented file to begin with.
+
+    Args:
+        name_or_path: `dense19`, `sparse13`, another shipped name, or a path.
+
     Raises:
         LayoutError: No such layout or file, or the file does not describe one; the message names the file.
     """

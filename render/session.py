@@ -56,15 +56,15 @@ def render_take(
     """Draw a take; a second call resumes where the first was stopped.
 
     Args:
-        path: A tracked take, or the truth of a simulated one.
+        path: A tracked take (`.npz`), or the truth of a simulated one (`.truth.npz`).
         out: Folder; each of several formats has a folder of its own in it.
-        formats: Some of `render.formats.writer.FORMATS`.
+        formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
         workers: Processes; all cores when not given.
         progress: Called after every shard.
 
     Returns:
-        Number of pictures.
+        Number of pictures. Depth is in [m], pixels are in [px], as the format has them.
 
     Raises:
         HandSimError: The take or the settings cannot be drawn; finished shards are kept.
@@ -154,6 +154,13 @@ def draw_frames(
         config: What to draw.
         frames: Numbers of frames in the take.
         shard: Number of the shard; people change with it, as does all else that does not vary by frame.
+
+    Yields:
+        Each frame once per camera: pictures (H, W, 3), depth (H, W) [m], and the truth of every hand in the
+        world [m] and in the picture [px].
+
+    Raises:
+        HandSimError: A camera stands in a hand or an object.
     """
     shown = take if isinstance(take, ShownTake) else show_take(take)
     return draw_shard(shown, _viewpoints(shown, config), config, shard, frames)

@@ -41,9 +41,12 @@ def track_capture(capture: Capture, tracker: Tracker, *, progress: Progress | No
     """Track a capture.
 
     Args:
-        capture: The capture; its marker names are not used.
+        capture: Positions (T, N, 3) [m]; marker names are not used.
         tracker: A tracker that has not seen a frame.
         progress: Called after each frame with the number of tracked frames and of all frames.
+
+    Returns:
+        Poses (T, H, 27) [m, rad], labels (T, N) and status of every frame.
 
     Raises:
         ArgumentError: The capture is not in meters.

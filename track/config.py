@@ -302,7 +302,10 @@ class QueryConfig(_Settings):
 
 @dataclass(frozen=True)
 class TrackerConfig(_Settings):
-    """All settings of `track.tracker.Tracker`; `dataclasses.asdict` makes JSON of them.
+    """All settings of `track.Tracker`; `dataclasses.asdict` makes JSON of them.
+
+    Each field is a dataclass whose fields state their units: lengths in [m], times in [s], angles in [rad].
+    A tracked take records the settings that made it.
 
     Raises:
         ArgumentError: A number of a concern is not finite, not positive, or out of its range.

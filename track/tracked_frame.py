@@ -67,6 +67,7 @@ class TrackedFrame:
     """A frame's hands, bodies and points."""
 
     time: float
+    """Time of the frame [s]."""
     hands: tuple[TrackedHand, ...]
     labels: Int[np.ndarray, "N"]
     """Marker of each point, counted through the hands in their order, then the bodies; -1 for none."""

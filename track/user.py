@@ -70,7 +70,13 @@ def save_user(path: str | Path, hands: Sequence[GloveFit], notes: str = "") -> N
 
 
 def load_user(path: str | Path) -> tuple[GloveFit, ...]:
-    """Hands and gloves that `save_user` wrote.
+    """Hands and gloves of a user, from the JSON file that `handsim calibrate` wrote.
+
+    Args:
+        path: The file, usually `user.json`; lengths are in [m], angles in [rad].
+
+    Returns:
+        One hand or two, each in its glove.
 
     Raises:
         UserError: The file does not exist, is not a user's file, has another schema, or is damaged.

@@ -19,6 +19,12 @@ WRITABLE: Final = (".trc", ".c3d")
 def read_capture(path: str | Path) -> Capture:
     """Read a `.trc`, `.c3d` or Motive `.csv` file.
 
+    Args:
+        path: The file; its suffix decides the format.
+
+    Returns:
+        One trajectory per column: positions (T, N, 3) in [m], whatever the file's unit, and the rate [Hz].
+
     Raises:
         CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its units are unknown.
     """
@@ -41,6 +47,10 @@ def write_capture(path: str | Path, capture: Capture) -> None:
     """Write a `.trc` or `.c3d` file in millimeters, whole or not at all.
 
     A TRC keeps positions to 5e-9 m; a C3D keeps single precision (6e-8 of the value).
+
+    Args:
+        path: The file; its suffix decides the format.
+        capture: Positions (T, N, 3) [m] at a rate [Hz].
 
     Raises:
         CaptureError: The suffix is unknown, a name cannot be written to the file, or writing fails.

@@ -104,7 +104,11 @@ class Take:
         return Capture(names, self.points, self.rate)
 
     def save(self, path: Path) -> None:
-        """Write a `.truth.npz`, whole or not at all; `load_take` reads it."""
+        """Write a `.truth.npz`, whole or not at all; `load_take` reads it.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         body = self.body
         header = {
             "units": "metres, radians, world frame",
@@ -125,7 +129,13 @@ class Take:
 
 
 def load_take(path: Path) -> Take:
-    """Read a `.truth.npz`.
+    """Read a `.truth.npz`, which `handsim simulate` and `Take.save` write; nothing is unpickled.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Points (T, N, 3) [m] with IDs and true labels, and the hands' poses (T, 27) [m, rad].
 
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.

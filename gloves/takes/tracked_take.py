@@ -145,7 +145,11 @@ class TrackedTake:
         return bridge_gaps(self.times, qpos, self.rate)
 
     def save(self, path: Path) -> None:
-        """Write the take (.npz), whole or not at all; `load_tracked_take` gives the same numbers again."""
+        """Write the take (.npz), whole or not at all; `load_tracked_take` gives the same numbers again.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         header = {
             "units": "metres, radians, seconds, wxyz, world frame",
             "rate": self.rate,
@@ -163,7 +167,13 @@ class TrackedTake:
 
 
 def load_tracked_take(path: Path) -> TrackedTake:
-    """Read what `TrackedTake.save` wrote.
+    """Read the `.npz` that `handsim track` or `TrackedTake.save` wrote; nothing is unpickled.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Times (T,) [s], poses (T, H, 27) [m, rad], markers (T, H, M, 3) [m] and labels (T, N).
 
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.

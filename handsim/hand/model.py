@@ -64,7 +64,7 @@ class HandModel:
         return self.skeleton.rest_transforms()
 
     def forward_kinematics(self, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T L 4 4"]:
-        """`T_world_bone` of every bone in every frame.
+        """`T_world_bone` of every bone in every frame, with positions in [m].
 
         Args:
             qpos: Wrist position [m], wrist orientation (wxyz), twenty joint angles [rad].
@@ -80,6 +80,9 @@ class HandModel:
 
         Args:
             qpos: As for `forward_kinematics`.
+
+        Raises:
+            ArgumentError: `qpos` is not (T, 27) or not finite.
         """
         surface = self.surface
         return skin_frames(
@@ -95,6 +98,9 @@ class HandModel:
 
         Args:
             qpos: As for `forward_kinematics`.
+
+        Raises:
+            ArgumentError: `qpos` is not (T, 27) or not finite.
         """
         return penetration_depth(self.capsules, self.forward_kinematics(qpos))
 
@@ -111,6 +117,9 @@ def join_qpos(
         angles: Joint angles [rad], in the order of `topology.JOINTS`.
         position: Wrist position in the world [m], one per frame or one for all.
         quaternion: Wrist orientation in the world (wxyz), one per frame or one for all.
+
+    Returns:
+        Wrist position [m], wrist orientation (wxyz), joint angles [rad]: MuJoCo's qpos.
 
     Raises:
         ArgumentError: `angles` is not (T, 20) or not finite.

@@ -180,9 +180,12 @@ def sample_shape(
     """A random person's hand: length and breadth as ANSUR II correlates them, proportions varied on top.
 
     Args:
-        population: The people to draw from.
+        population: The people to draw from; adults by default.
         side: Which hand.
         rng: Source of all randomness.
+
+    Returns:
+        Length and breadth [m], bone lengths (5, 3) [m], directions of the digits (5, 3) [rad] and girths.
     """
     sex = "female" if rng.random() < 0.5 else "male"
     (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]

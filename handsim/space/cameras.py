@@ -128,6 +128,12 @@ def named_rig(name: str) -> CameraRig:
 def load_rig(name_or_path: str | Path) -> CameraRig:
     """A shipped rig by its name, or your own by the path of its `.toml` file (format: docs/rigs.md).
 
+    Args:
+        name_or_path: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, or a path.
+
+    Returns:
+        The rig: camera poses `T_world_camera` (C, 4, 4) [m], field of view [rad] and resolution [px].
+
     Raises:
         RigError: No such rig or file, or the file does not describe one; the sentence names the file.
     """

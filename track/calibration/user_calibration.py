@@ -143,6 +143,9 @@ def calibrate(
         rate: Frames per second [Hz].
         progress: Called after each step.
 
+    Returns:
+        The calibrated hand in its glove, residuals [m] before and after, and standard errors [m].
+
     Raises:
         CalibrationError: Too few frames have enough markers, or the hand does not move.
         ArgumentError: `markers` do not fit the glove, or `rate` is not positive.

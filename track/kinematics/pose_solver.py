@@ -234,13 +234,16 @@ def solve_pose(
     initial: Float[np.ndarray, "T 27"] | None = None,
     iterations: int | None = None,
 ) -> PoseFit:
-    """`PoseSolver.solve` for a hand in its glove that is used once.
+    """Poses of a hand whose markers are nearest to labeled ones, each frame by itself.
 
     Args:
         fit: The hand in its glove.
         targets: Labeled markers in the glove's order [m]; NaN where missing.
-        initial: Poses to start from.
+        initial: Poses to start from [m, rad]; a few general ones when not given.
         iterations: Steps at most from each start.
+
+    Returns:
+        Poses (T, 27) [m, rad], RMS distances (T,) [m] and residuals (T, M, 3) [m].
 
     Raises:
         ArgumentError: The arrays do not fit the glove or each other, or a frame has fewer than 4 markers.

@@ -55,6 +55,9 @@ def corrupt(
         corruption: How much is drawn at random on top.
         ghosts: Ghosts that the rig sees (B, G, 3) [m], NaN where there is none.
         rng: Source of all randomness.
+
+    Returns:
+        Points (B, N, 3) [m], which of them are there (B, N), and the marker of each (B, N), -1 for a ghost.
     """
     batch, count = markers.shape[:2]
     present = np.isfinite(markers).all(-1)

@@ -141,8 +141,11 @@ def load_manifest(path: Path) -> Manifest:
 class Dataset:
     """A finished training set, its rows memory-mapped.
 
+    A row is one frame of one hand. Its fields are `qpos` (27,) [m, rad], true `markers` (M, 3) [m], the
+    `cameras` that see each marker, positions `observed` (M, 3) [m] and `ghosts` (4, 3) [m].
+
     Args:
-        path: The folder that `handsim generate` wrote.
+        path: The folder that `handsim generate` wrote: `.npy` shards and a `manifest.json`.
 
     Raises:
         DatasetError: Not a training set, unfinished, of another schema, or damaged (the file is named).

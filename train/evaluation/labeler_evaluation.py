@@ -55,6 +55,12 @@ def evaluate_labeler(
         markers: True markers (T, M, 3) [m] in the labeler's order, NaN where missing.
         corruption: Occlusion, ghosts and jitter to draw.
         rng: Source of all randomness.
+
+    Returns:
+        Figures as shares in [0, 1], by their names, and the counts that they come from.
+
+    Raises:
+        ArgumentError: `markers` are not in meters.
     """
     count = _Count(labeler)
     for first in range(0, len(markers), _CHUNK):
@@ -72,6 +78,10 @@ def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
     Args:
         labeler: The labeler to evaluate.
         takes: Takes with truth.
+
+    Returns:
+        Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
+        are those within 0.1 [m] of its markers.
 
     Raises:
         CaptureError: A take's glove has other markers than the labeler knows.

@@ -35,6 +35,9 @@ def load_labeler(name_or_path: str | Path) -> Labeler:
     Args:
         name_or_path: A glove with a shipped labeler, a folder, or an .onnx file.
 
+    Returns:
+        A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
+
     Raises:
         WeightsError: Unknown, damaged, or not a labeler's weights.
     """

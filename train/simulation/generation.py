@@ -53,6 +53,10 @@ def generate_dataset(
         workers: Processes; all cores when not given.
         progress: Called after every shard.
 
+    Returns:
+        The manifest, which is also the file `manifest.json` beside the `.npy` shards; `Dataset(out)` reads
+        them. Positions are in [m], angles in [rad].
+
     Raises:
         DatasetError: `out` holds a set of another config, or a worker died.
         LayoutError: The glove is unknown or does not fit.
