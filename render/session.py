@@ -156,8 +156,8 @@ def draw_frames(
         shard: Number of the shard; people change with it, as does all else that does not vary by frame.
 
     Yields:
-        Each frame once per camera: pictures (H, W, 3), depth (H, W) [m], and the truth of every hand in the
-        world [m] and in the picture [px].
+        Each frame once per camera, with pictures (H, W, 3), depth (H, W) [m], and the truth of every hand in
+        the world [m] and in the picture [px].
 
     Raises:
         HandSimError: A camera stands in a hand or an object.

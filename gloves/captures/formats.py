@@ -23,7 +23,8 @@ def read_capture(path: str | Path) -> Capture:
         path: The file; its suffix decides the format.
 
     Returns:
-        One trajectory per column: positions (T, N, 3) in [m], whatever the file's unit, and the rate [Hz].
+        Positions (T, N, 3) in [m], whatever the file's unit, with one trajectory per column, and the rate
+        [Hz].
 
     Raises:
         CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its units are unknown.

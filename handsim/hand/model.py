@@ -119,7 +119,7 @@ def join_qpos(
         quaternion: Wrist orientation in the world (wxyz), one per frame or one for all.
 
     Returns:
-        Wrist position [m], wrist orientation (wxyz), joint angles [rad]: MuJoCo's qpos.
+        MuJoCo's qpos, which is wrist position [m], wrist orientation (wxyz) and joint angles [rad].
 
     Raises:
         ArgumentError: `angles` is not (T, 20) or not finite.

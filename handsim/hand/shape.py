@@ -185,7 +185,8 @@ def sample_shape(
         rng: Source of all randomness.
 
     Returns:
-        Length and breadth [m], bone lengths (5, 3) [m], directions of the digits (5, 3) [rad] and girths.
+        The hand's length and breadth [m], bone lengths (5, 3) [m], digit directions (5, 3) [rad] and radii
+        (5, 4) [m].
     """
     sex = "female" if rng.random() < 0.5 else "male"
     (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]

@@ -132,7 +132,7 @@ def load_rig(name_or_path: str | Path) -> CameraRig:
         name_or_path: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, or a path.
 
     Returns:
-        The rig: camera poses `T_world_camera` (C, 4, 4) [m], field of view [rad] and resolution [px].
+        The rig with its camera poses (C, 4, 4) [m], field of view [rad] and resolution [px].
 
     Raises:
         RigError: No such rig or file, or the file does not describe one; the sentence names the file.

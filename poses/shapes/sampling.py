@@ -63,7 +63,7 @@ def sample_poses(
         rng: Source of all randomness.
 
     Returns:
-        qpos: wrist position [m], wrist orientation (wxyz), joint angles [rad].
+        Wrist position [m], wrist orientation (wxyz) and joint angles [rad] of every pose.
 
     Raises:
         ArgumentError: `num_poses` is not positive, or the sampler returned another shape or numbers that are
