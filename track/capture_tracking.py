@@ -17,7 +17,7 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from gloves.optics.identities import number_runs
-from gloves.takes.tracked_take import LOST, STATUSES, MarkedBody, TrackedTake
+from gloves.takes.tracked_take import LOST, STATUSES, TrackedTake
 from handsim.errors import CaptureError
 from handsim.hand.topology import NUM_QPOS
 from track.streams.point_stream import StreamedFrame
@@ -133,9 +133,7 @@ class TakeRecorder:
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
         self._config = tracker.config
-        self._bodies = tuple(
-            MarkedBody(body.name, body.marker_names, body.positions) for body in tracker.bodies
-        )
+        self._bodies = tracker.bodies
         self._frames: list[tuple[StreamedFrame, TrackedFrame]] = []
 
     @property

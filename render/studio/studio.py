@@ -254,7 +254,7 @@ def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
         if nearest < 2.0 * NEAR:
             raise HandSimError(
                 f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or thing in frame {frame}, "
-                f"expected {2e3 * NEAR:.0f} mm or more; index it elsewhere"
+                f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
             )
 
 

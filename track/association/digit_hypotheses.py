@@ -15,11 +15,11 @@ import numba
 import numpy as np
 
 from handsim.hand.topology import DIGITS
+from handsim.kernels.rotations import write_quaternion_matrix
 from track.association.digit_fit import fit_hypothesis
 from track.kinematics.joint_prior import JointPrior, digit_prior
 from track.kinematics.marker_kinematics import HandArrays, compute_markers, workspace
 from track.kinematics.marker_prediction import MarkerPrediction
-from track.kinematics.starting_poses import write_rotation_matrix
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -129,7 +129,7 @@ def evaluate_digit(
         assignments: See there.
     """
     pose, wrist = model.predicted.qpos, np.empty((3, 3))
-    write_rotation_matrix(pose[3:7], wrist)
+    write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     local, label_log_odds = np.zeros((len(candidates), 3)), np.empty((len(candidates), len(markers)))
     for number, point in enumerate(candidates):
         for i in range(3):

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
+from handsim.kernels.rotations import quaternion_product, write_quaternion_matrix
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -18,12 +20,7 @@ if TYPE_CHECKING:
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def write_transform(pose: NDArray[np.float64], transform: NDArray[np.float64]) -> None:
     """Write a pose (7,) as a matrix (4, 4), whose last row is left as it is."""
-    w, x, y, z = pose[3], pose[4], pose[5], pose[6]
-    transform[0, 0], transform[0, 1] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z)
-    transform[1, 0], transform[1, 1] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z)
-    transform[2, 0], transform[2, 1] = 2 * (x * z - w * y), 2 * (y * z + w * x)
-    transform[0, 2], transform[1, 2] = 2 * (x * z + w * y), 2 * (y * z - w * x)
-    transform[2, 2] = 1 - 2 * (x * x + y * y)
+    write_quaternion_matrix(transform, pose[3], pose[4], pose[5], pose[6])
     transform[0, 3], transform[1, 3], transform[2, 3] = pose[0], pose[1], pose[2]
 
 
@@ -62,8 +59,9 @@ def predict_pose(
     angle = np.sqrt((half**2).sum())
     if angle > 1e-12:
         sine, cosine = np.sin(angle) / angle, np.cos(angle)
-        rotation = np.array([cosine, sine * half[0], sine * half[1], sine * half[2]])
-        later[3:] = _quaternion_product(rotation, pose[3:])
+        later[3], later[4], later[5], later[6] = quaternion_product(
+            cosine, sine * half[0], sine * half[1], sine * half[2], pose[3], pose[4], pose[5], pose[6]
+        )
     return later
 
 
@@ -74,8 +72,10 @@ def velocity_between(
     """The velocity (6,) with which `predict_pose` goes from the first pose (7,) to the second."""
     velocity = np.empty(6)
     velocity[:3] = (second[:3] - first[:3]) / seconds
-    inverse = np.array([first[3], -first[4], -first[5], -first[6]])
-    rotation = _quaternion_product(second[3:], inverse)
+    rotation = np.empty(4)
+    rotation[0], rotation[1], rotation[2], rotation[3] = quaternion_product(
+        second[3], second[4], second[5], second[6], first[3], -first[4], -first[5], -first[6]
+    )
     if rotation[0] < 0.0:  # the same rotation by the shorter way
         rotation = -rotation
     sine = np.sqrt((rotation[1:] ** 2).sum())
@@ -83,21 +83,6 @@ def velocity_between(
         2.0 / seconds if sine < 1e-12 else 2.0 * np.arctan2(sine, rotation[0]) / sine / seconds
     )
     return velocity
-
-
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _quaternion_product(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Hamilton product of two quaternions (4,), wxyz."""
-    a, b, c, d = first[0], first[1], first[2], first[3]
-    e, f, g, h = second[0], second[1], second[2], second[3]
-    return np.array(
-        [
-            a * e - b * f - c * g - d * h,
-            a * f + b * e + c * h - d * g,
-            a * g - b * h + c * e + d * f,
-            a * h + b * g - c * f + d * e,
-        ]
-    )
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from gloves.takes.tracked_take import MarkedBody
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.space.objects import RigidObject
@@ -53,17 +54,12 @@ _FARTHEST: Final = 1e3  # [m] from the origin; points beyond are ignored
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RigidTemplate:
-    """The markers of a rigid body in its own frame.
+class RigidTemplate(MarkedBody):
+    """A rigid body whose markers determine its pose: the markers in its own frame.
 
     Raises:
         ArgumentError: `positions` have another shape, or `template_fault` finds a fault.
     """
-
-    name: str
-    marker_names: tuple[str, ...]
-    positions: Float[np.ndarray, "Q 3"]
-    """In the body's frame [m]."""
 
     def __post_init__(self) -> None:
         positions = np.array(check_array("positions", self.positions, (len(self.marker_names), 3)), order="C")

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from handsim.hand.topology import NUM_JOINTS
+from handsim.kernels.rotations import write_quaternion_matrix
 from track.kinematics.levenberg_marquardt import marker_residuals
 from track.kinematics.marker_kinematics import (
     NUM_UNKNOWNS,
@@ -22,7 +23,6 @@ from track.kinematics.marker_kinematics import (
     workspace,
 )
 from track.kinematics.small_systems import invert_positive, solve_positive
-from track.kinematics.starting_poses import write_rotation_matrix
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -93,7 +93,7 @@ def predict_markers(
     """
     count = len(target)
     work, wrist, weights = workspace(count), np.empty((3, 3)), np.zeros(count)
-    write_rotation_matrix(pose[3:7], wrist)
+    write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     out.qpos[:] = pose
     marker_residuals(hand, target, pose, work)
     seen = np.zeros(len(on_part), dtype=np.int64)
@@ -235,7 +235,7 @@ def world_markers(
 ) -> None:
     """Write the positions of a pose's markers in the world [m] to `positions`."""
     work, wrist = workspace(len(positions)), np.empty((3, 3))
-    write_rotation_matrix(pose[3:7], wrist)
+    write_quaternion_matrix(wrist, pose[3], pose[4], pose[5], pose[6])
     compute_markers(hand, pose[7:], work)
     for marker in range(len(positions)):
         positions[marker] = pose[:3] + wrist @ work.markers[marker]

@@ -10,6 +10,7 @@ import numpy as np
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
 from handsim.hand.topology import NUM_QPOS
+from handsim.kernels.rotations import write_quaternion_matrix
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -109,7 +110,7 @@ def _choose_digits(
         markers: Markers of the result in the wrist's frame [m], filled.
     """
     rotation = np.empty((3, 3))
-    write_rotation_matrix(pose[3:7], rotation)
+    write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
     squares = np.zeros((5, len(shapes.angles)))
     for marker in range(len(target)):
         if digits[marker] < 0 or np.isnan(target[marker, 0]):
@@ -180,30 +181,9 @@ def align_rigid(
     values, vectors = np.linalg.eigh(form)
     rotation = np.empty((3, 3))
     pose[3:7] = vectors[:, 3]
-    write_rotation_matrix(pose[3:7], rotation)
+    write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
     for i in range(3):
         pose[i] = centers[1, i]
         for j in range(3):
             pose[i] -= rotation[i, j] * centers[0, j]
     return size - 2.0 * values[3]  # type: ignore[no-any-return]
-
-
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def write_rotation_matrix(quaternion: Float[np.ndarray, "4"], rotation: Float[np.ndarray, "3 3"]) -> None:
-    """Write the matrix of a unit quaternion (wxyz) to `rotation`."""
-    w, x, y, z = quaternion
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-    )
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = (
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-    )
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = (
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
