@@ -31,7 +31,7 @@ BRITISH = re.compile(
 
 
 # Words in files keep their spelling: files written before stay readable, units are read in both spellings.
-KEPT = re.compile(r"metres_per_unit|\"metres, radians|\"(milli|centi)?metres\": ")
+KEPT = re.compile(r"metres_per_unit|--labelled|\"metres, radians|\"(milli|centi)?metres\": ")
 
 
 def relative(path: Path) -> str:

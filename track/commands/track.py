@@ -52,7 +52,7 @@ def track(
     hands: tuple[Side, ...] | None = None,
     body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     labeler: str | None = None,
-    labeled: Path | None = None,
+    labeled: Annotated[Path | None, tyro.conf.arg(aliases=["--labelled"])] = None,
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
 

@@ -121,7 +121,16 @@ def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
     wand, out, labeled = tmp_path / "wand.toml", tmp_path / "take.npz", tmp_path / "labeled.c3d"
     assert main(["body", str(capture.with_suffix(".truth.npz")), "--out", str(wand)]) == 0
     assert capsys.readouterr().out == f"{wand}: controller, 6 markers, at most 99.9 mm apart\n"
-    asked = ["--hands", "right", "--body", str(wand), "--body", "mug", "--labeled", str(labeled)]
+    asked = [
+        "--hands",
+        "right",
+        "--body",
+        str(wand),
+        "--body",
+        "mug",
+        "--labelled",
+        str(labeled),
+    ]  # the earlier spelling holds
     assert main(["track", str(capture), "--out", str(out), *asked]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[2].startswith(
