@@ -128,7 +128,7 @@ def _viewpoints(take: ShownTake, config: RenderConfig) -> Viewpoints:
 @functools.lru_cache(maxsize=1)
 def _opened(path: Path, config: RenderConfig) -> tuple[ShownTake, Viewpoints]:
     """A take and its cameras; cached, because a worker draws many of its shards."""
-    cv2.setNumThreads(1)  # present is one process per core
+    cv2.setNumThreads(1)  # there is one process per core
     take = load_shown_take(path)
     return take, _viewpoints(take, config)
 

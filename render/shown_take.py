@@ -26,7 +26,7 @@ class ShownBody:
     """One rigid body of a take."""
 
     name: str
-    thing: RigidObject | None
+    obj: RigidObject | None
     """Its shape; None for a body of the user's own, of which only the markers are known."""
     markers: Float[np.ndarray, "Q 3"]
     """Markers in the body's frame [m]."""
@@ -107,8 +107,8 @@ def _show_tracked(take: TrackedTake) -> ShownTake:
 
 
 def _body(name: str, markers: NDArray[np.float64], poses: NDArray[np.float64]) -> ShownBody:
-    thing = named_object(name) if name in object_names() else None
-    return ShownBody(name, thing, markers if thing is None else thing.markers, poses)
+    obj = named_object(name) if name in object_names() else None
+    return ShownBody(name, obj, markers if obj is None else obj.markers, poses)
 
 
 def _transforms(poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -163,7 +163,7 @@ class PresenceConfig(_Settings):
     return_most: float = _share(0.65)
     """Largest chance to come back in a frame."""
     seen_elsewhere: float = _any_sign(-7.0)
-    """Log chance that a point is a marker which was seen as another point while this one was there."""
+    """Log probability that a point is a marker that had another point while this one was visible."""
     stray_lifetime: float = 0.1
     """Mean time for which a stray point lives [s]."""
     most_age_log_odds: float = 3.0
@@ -243,7 +243,7 @@ class InitializationConfig(_Settings):
     search_most: float = 0.012
     """Largest such spread [m]."""
     free_coordinates: float = 20.0
-    """Coordinates of its points that a pose fits whatever they are: about its degrees of freedom."""
+    """Degrees of freedom that a pose takes from the coordinates of its points, in effect."""
     least_spread: float = 0.0003
     """Least spread that is estimated from a fit [m]."""
     most_rms: float = 0.008
@@ -269,7 +269,7 @@ class TrackConfig(_Settings):
     longest_coast: float = 0.1
     """Time for which a pose is predicted without enough labels [s]."""
     doubt_share: float = _share(0.6)
-    """Share of a hand's markers below which, if labeled, the track is doubted."""
+    """A track with a smaller share of its markers labeled is doubted."""
     doubt_rms: float = 0.003
     """RMS distance, biases removed, from which on the track is doubted [m]."""
     doubt_radius: float = 0.2

@@ -116,7 +116,7 @@ def parse_table(
 
 def _check_whole(numbered: list[tuple[int, bytes]], delimiter: bytes, num_columns: int) -> None:
     number, line = numbered[-1]
-    # Blank cells beyond the table are worth one at most: the delimiter that may end a row.
+    # At most one blank cell beyond the table counts: the delimiter that may end a row.
     usual = min(numbered[0][1].count(delimiter) + 1, num_columns + 1)
     expected, got = max(usual, num_columns), line.count(delimiter) + 1
     if got < expected:

@@ -12,7 +12,8 @@ from gloves.captures.trc import read_trc, write_trc
 from handsim.errors import CaptureError, choices
 from handsim.files.atomic import atomic_write
 
-READABLE: Final = (".trc", ".c3d", ".csv")
+_READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": read_motive_csv}
+READABLE: Final = tuple(_READERS)
 WRITABLE: Final = (".trc", ".c3d")
 
 
@@ -31,7 +32,6 @@ def read_capture(path: str | Path) -> Capture:
     """
     path = Path(path)
     check_suffix(path, READABLE)
-    readers = dict(zip(READABLE, (read_trc, read_c3d, read_motive_csv), strict=True))
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -39,7 +39,7 @@ def read_capture(path: str | Path) -> Capture:
     if not data:
         raise CaptureError(f"{path}: the file is empty")
     try:
-        return readers[path.suffix.lower()](data)
+        return _READERS[path.suffix.lower()](data)
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}") from error
 

@@ -54,7 +54,7 @@ def cast_rays(
         centers: Blob centers (C, S, 2) [px].
         radii: Blob radii (C, S) [px]; 0 where there is none.
         directions: Where the rays go (S, C, 3), in the world.
-        usable: Where it goes whether there is a ray (S, C).
+        usable: Output (S, C), whether a camera has a ray to a source.
     """
     focal, roundness = camera[0], camera[4]
     count = seen.shape[0]

@@ -1,6 +1,6 @@
 """The one command, `handsim`: a table of names, each loaded when it is called.
 
-Exit codes: 0; 1 for what a user can set right, told in one line; 2 for usage; 130 when interrupted.
+Exit codes: 0; 1 for a mistake of the user, explained in one line; 2 for usage; 130 when interrupted.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ class PresetCommand:
     """A command of the table that reads its arguments once before they are parsed.
 
     A preset must become the default of the other options: compared afterwards, an option that was given and
-    equals the usual default cannot be told from one that was not given.
+    equals the usual default cannot be distinguished from one that was not given.
     """
 
     choose: Callable[[Sequence[str], str], Callable[..., Any]]

@@ -167,7 +167,7 @@ def _past_forearms(take: ShownTake, offset: NDArray[np.float64]) -> NDArray[np.f
     direction = offset / length
     medians = np.nanmedian(-_along(take), axis=0)
     medians /= np.linalg.norm(medians, axis=1, keepdims=True)
-    for arm in [*medians] * 2:  # past one may be into the other
+    for arm in [*medians] * 2:  # twice: avoiding one arm may lead into the other
         if direction @ arm > np.cos(_HEAD_CLEARANCE):
             across = direction - (direction @ arm) * arm
             if np.linalg.norm(across) < 1e-3:

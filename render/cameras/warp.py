@@ -97,7 +97,7 @@ def warp(camera: Camera, pictures: Sequence[NDArray[Any]], interpolation: Interp
 
 
 def warp_depth(camera: Camera, depths: Sequence[Float32[np.ndarray, "h w"]]) -> Float32[np.ndarray, "H W"]:
-    """Depth along the camera's axis [m] from that of its faces along theirs.
+    """Depth along the camera's axis [m] from depths along the axes of its faces.
 
     Between pixels of one surface the reciprocal is interpolated, which is exact for planes; at edges the
     nearest pixel counts. What is not ahead of the camera (a fisheye may see it) has depth 0.

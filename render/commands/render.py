@@ -69,7 +69,7 @@ class RenderOptions:
         """
         return RenderConfig(
             **{name: getattr(self, name) for name in _AS_IN_CONFIG},
-            tones=_angles(self.tones),
+            tones=_tone_range(self.tones),
             background=_backgrounds(self.background, self.photos),
             depth_sensor=_sensors(self.depth_sensor),
             color_sensor=ExposureConfig() if self.color_sensor else None,
@@ -115,7 +115,7 @@ def render(
         console.print(f"{out / SHEET}: some of them at one glance", soft_wrap=True, markup=False)
 
 
-def _angles(tones: tuple[str, ...]) -> tuple[float, float]:
+def _tone_range(tones: tuple[str, ...]) -> tuple[float, float]:
     """Typology angles [deg] from the darkest to the lightest of the classes."""
     if not tones:
         return ALL_TONES

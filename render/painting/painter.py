@@ -48,7 +48,7 @@ def paint(
     Raises:
         HandSimError: OpenGL is requested and missing on this machine; the message says what to install.
     """
-    every = {"compiled": paint_compiled, "opengl": paint_opengl}[painter]
+    paint_colors = {"compiled": paint_compiled, "opengl": paint_opengl}[painter]
     width, height = camera.size
     picture = np.zeros((height, width, 4), dtype=np.uint8)
     left, top, right, bottom = _window(camera, drawn)
@@ -56,7 +56,7 @@ def paint(
         inner = dataclasses.replace(
             camera, size=(right - left, bottom - top), K=camera.K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
         )
-        picture[top:bottom, left:right] = every(inner, drawn, lighting)
+        picture[top:bottom, left:right] = paint_colors(inner, drawn, lighting)
     return picture
 
 

@@ -50,9 +50,10 @@ def sample_surroundings(
 
 
 def expose_for(lighting: Lighting, skin: SkinLook) -> Lighting:
-    """The light as a camera has it that looks at a hand: more of it for dark skin, less for light.
+    """The lighting after automatic exposure for a hand: stronger for dark skin, weaker for light skin.
 
-    Cameras meter the picture's middle and what is around it; half of what skins differ by is made up for.
+    Cameras meter the middle of the picture and its surroundings, so half of the difference between skins is
+    compensated.
     """
     reflectance = ((skin.lightness + 16.0) / 116.0) ** 3  # CIELAB's definition
     gain = float((_MIDDLE_SKIN / reflectance) ** _METERED)

@@ -62,7 +62,7 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
     """A random exposure."""
     red, blue = np.exp(config.balance * rng.standard_normal(2))
     least, most = np.log(config.white_electrons)
-    goes = bool(rng.random() < config.jpeg_share)
+    is_jpeg = bool(rng.random() < config.jpeg_share)
     quality = int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
     return Exposure(
         stops=float(rng.uniform(*config.stops)),
@@ -70,7 +70,7 @@ def sample_exposure(config: ExposureConfig, *, rng: np.random.Generator) -> Expo
         white_electrons=float(np.exp(rng.uniform(least, most))),
         read_noise=float(rng.uniform(*config.read_noise)),
         vignetting=float(rng.uniform(*config.vignetting)),
-        jpeg_quality=quality if goes else None,
+        jpeg_quality=quality if is_jpeg else None,
     )
 
 

@@ -91,10 +91,10 @@ def measure(
 
 
 def shadowed(disparity: Float32[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Pixels that something nearer hides from the projector, which stands to the right in the same row.
+    """Pixels that a nearer surface hides from the projector, which stands to the right in the same row.
 
-    The projector has a pixel of disparity d that many columns further left; of what falls onto one of its
-    columns it sees the nearest.
+    A pixel of disparity d is d columns further left in the projector's picture. Where several pixels fall on
+    one of its columns, the nearest one is visible to it.
     """
     height, width = disparity.shape
     most = int(np.ceil(disparity.max(initial=0.0))) + 1

@@ -129,7 +129,7 @@ class Studio:
         )
 
     def _pose(self, hand: GlovedHand, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
-        """Qpos (27,) of a hand `shift` seconds after a frame; None where known is none."""
+        """Qpos (27,) of a hand `shift` seconds after a frame; None where the hand has no pose."""
         pose = _between(hand.qpos, frame, shift * self.take.rate)
         if pose is None:
             return None
@@ -145,12 +145,12 @@ class Studio:
                 drawn += figure.drawn(pose, number)
                 number += 1
         for body in self._bodies:
-            index = _between(body.body.T_world_body, frame, shift * self.take.rate)
-            if index is not None:
+            T_world_body = _between(body.body.T_world_body, frame, shift * self.take.rate)
+            if T_world_body is not None:
                 number += 1
-                left, _, right = np.linalg.svd(index[:3, :3])
-                index[:3, :3] = left @ right
-                drawn += body.drawn(index, number)
+                left, _, right = np.linalg.svd(T_world_body[:3, :3])
+                T_world_body[:3, :3] = left @ right
+                drawn += body.drawn(T_world_body, number)
         return drawn
 
     def _geometry(self, camera: Camera, drawn: Sequence[Drawn], *, with_normals: bool) -> Pictures:
@@ -253,7 +253,7 @@ def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
         nearest = np.linalg.norm(one.triangles.vertices - center, axis=1).min()
         if nearest < 2.0 * NEAR:
             raise HandSimError(
-                f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or thing in frame {frame}, "
+                f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
                 f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
             )
 

@@ -47,5 +47,5 @@ class FrameState:
         return unlabeled
 
     def unlabeled_by_others(self, hands: int | list[int]) -> Int[np.ndarray, "F"]:
-        """Indices of the points that have no label of any hand but some."""
+        """Indices (F,) of the points that carry no label of any hand except the given ones."""
         return np.flatnonzero((np.delete(self.labels, hands, axis=0) < 0).all(axis=0))

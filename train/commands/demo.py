@@ -41,7 +41,7 @@ _SHOWN: Final = {
 
 def generate_and_label(run: DemoRun) -> None:
     """Generate a small training set, label it clean and corrupted, and keep one labeled frame."""
-    labeler = load_labeler(GLOVE)  # first, so that a missing labeler is told before any work
+    labeler = load_labeler(GLOVE)  # first, so that a missing labeler is reported before any work
     config = DatasetConfig(glove=GLOVE, num_frames=run.num_frames, seed=run.seed)
     start = time.perf_counter()
     generate_dataset(

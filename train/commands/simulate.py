@@ -15,8 +15,6 @@ from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX
 from train.simulation.takes import TakeConfig, simulate_take
 
-PUBLISHED_GAPS = "3-4", "24-43"  # median and p90 of real finger markers' gaps [frames]; docs/room.md
-
 
 def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -> None:
     """Simulate a capture of two hands; the truth goes beside it.

@@ -32,7 +32,7 @@ class SceneSight:
     def __init__(self, scene: SceneMotion, rig: CameraRig) -> None:
         self.scene, self.rig = scene, rig
         self.T_world_bone = [hand.fit.model.forward_kinematics(hand.qpos) for hand in scene.hands]
-        """Bone frames (T, 21, 4, 4) of each hand."""
+        """Bone frames (T, L, 4, 4) of each hand [m]."""
 
     @cached_property
     def markers(self) -> tuple[Float[np.ndarray, "T P 3"], Float[np.ndarray, "T P 3"]]:

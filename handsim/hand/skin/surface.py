@@ -124,7 +124,7 @@ def _fitted_cage(shape: HandShape, template: _Template) -> np.ndarray:
 
 
 def _cage_parts(shape: HandShape, frames: np.ndarray, topology: CageTopology) -> np.ndarray:
-    """The cage is affine in its scales: vertices (3, K, 3) at none, what one of width adds, and of depth."""
+    """The cage is affine in its scales: vertices (3, K, 3) [m] at zero, per width, per depth."""
 
     def scaled(wide: float, deep: float) -> np.ndarray:
         rings = [np.full(len(digit), wide) for digit in topology.rings]

@@ -1,4 +1,4 @@
-"""FreiHAND: `training_K.json` and its sisters, one entry a hand, for loaders of that dataset.
+"""FreiHAND: `training_K.json` and the files beside it, one entry per hand, for loaders of that dataset.
 
 `K @ xyz` gives pixels that are counted from the first one's center. Left hands stay left hands, although
 FreiHAND has none; `training_info.json` says which is which. There are no MANO parameters:
