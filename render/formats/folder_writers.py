@@ -65,7 +65,7 @@ class FolderWriter:
 
 
 class PngWriter(FolderWriter):
-    """`shard-00000/KEY.png` and the other pictures of a frame, and `KEY.json` with all that is known of the frame."""
+    """`shard-00000/KEY.png`, the other pictures of a frame, and `KEY.json` with everything known of it."""
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
         _write_pictures(folder, frame, lossless=True)

@@ -149,8 +149,8 @@ class BodyFigure:
     def __init__(self, body: ShownBody, color: tuple[float, float, float]) -> None:
         self.body = body
         self._material = functools.cache(functools.partial(plain_material, color))
-        if body.thing is not None:
-            self._normals = vertex_normals(body.thing.vertices, body.thing.faces)
+        if body.obj is not None:
+            self._normals = vertex_normals(body.obj.vertices, body.obj.faces)
 
     def drawn(self, T_world_body: Float[np.ndarray, "4 4"], instance: int) -> list[Drawn]:
         """Its surface, where that is known, and its markers.
@@ -160,7 +160,7 @@ class BodyFigure:
             instance: Number of the body among the instances of the picture.
         """
         rotation, position, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
-        thing = self.body.thing
+        thing = self.body.obj
         if thing is not None:
             ids = [np.full(len(thing.faces), number, dtype=np.uint8) for number in (0, instance, 0)]
             vertices = thing.vertices @ rotation.T + position
