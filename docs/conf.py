@@ -31,7 +31,7 @@ myst_heading_anchors = 3
 suppress_warnings = ["ref.python"]  # several types have a field `qpos`; napoleon links the word to each
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
-autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True, "undoc-members": True}
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True  # attributes of a dataclass are described once, beside the field
 
