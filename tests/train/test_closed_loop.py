@@ -110,11 +110,11 @@ def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
     mine = shown.hands[0].qpos
     there = np.isfinite(mine[:, 0])
     assert there.mean() > 0.95
-    off = hand_keypoints(true.model, mine[there]) - hand_keypoints(true.model, true.qpos[there])
+    off = hand_keypoints(true.fit.model, mine[there]) - hand_keypoints(true.fit.model, true.qpos[there])
     assert 1e3 * np.linalg.norm(off, axis=-1).mean() < 1.0
     config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("depth", "ids"), depth_sensor=None)
     for frame in draw_frames(shown, config, np.flatnonzero(there)[::60].tolist()):
-        points = hand_keypoints(true.model, true.qpos[frame.number : frame.number + 1])[0]
+        points = hand_keypoints(true.fit.model, true.qpos[frame.number : frame.number + 1])[0]
         assert np.linalg.norm(frame.camera.project(points) - frame.hands[0].pixels, axis=-1).mean() < 2.0
         assert frame.hands[0].visible.sum() >= 5
 

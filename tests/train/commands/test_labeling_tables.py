@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 
 from handsim.app.cli import main
 from train.commands import labeling_tables
+from train.config import preset_config
 from train.evaluation.labeler_evaluation import evaluate_takes
 from train.evaluation.paper import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from train.evaluation.tables import FIGURES, augmentations
@@ -54,11 +57,16 @@ def test_unseen_people_follow_the_seed_and_are_in_no_training_set():
 
 def test_table_2_trains_and_tests_four_networks(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
+
+    def small_recipe(*args):  # 16 bits take minutes on a CPU without instructions for them
+        return dataclasses.replace(preset_config(*args), precision="32", batch=32)
+
+    monkeypatch.setattr(labeling_tables, "preset_config", small_recipe)
     data = tmp_path / "set"
     small = ["--num-frames", "600", "--frames-per-hand", "60", "--workers", "1"]
     assert main(["generate", "--out", str(data), *small]) == 0
     capsys.readouterr()
-    command = ["reproduce", "table2", str(data), "--out", str(tmp_path / "runs"), "--samples", "512"]
+    command = ["reproduce", "table2", str(data), "--out", str(tmp_path / "runs"), "--samples", "64"]
     command += ["--num-frames", "30", "--kinds", "set", "cnn"]
     assert main(command) == 0
     said = capsys.readouterr().out
