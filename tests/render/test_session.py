@@ -180,5 +180,5 @@ def test_a_camera_inside_a_hand_is_refused(path):
     inside = Viewpoints(config.view, take, rng=np.random.default_rng(0))
     inside._poses[0] = np.broadcast_to(np.eye(4), (48, 4, 4)).copy()
     inside._poses[0][:, :3, 3] = take.hands[0].fit.model.skin(take.hands[0].qpos)[:, 100] + 0.002
-    with pytest.raises(HandSimError, match="mm from a hand or thing in frame 0"):
+    with pytest.raises(HandSimError, match="mm from a hand or object in frame 0"):
         list(draw_shard(take, inside, config, 0, [0]))
