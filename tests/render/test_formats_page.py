@@ -40,4 +40,4 @@ def test_examples_run(code: str, make_frame, tmp_path: Path) -> None:
 
 def test_the_page_names_every_format() -> None:
     assert all(f"| `{name}` |" in PAGE for name in FORMATS)
-    assert len(EXAMPLES) >= 5
+    assert len(EXAMPLES) == 5

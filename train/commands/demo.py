@@ -48,7 +48,8 @@ def generate_and_label(run: DemoRun) -> None:
         config, run.dataset, progress=lambda done, total: run.report(f"generating frames: {done} of {total}")
     )
     seconds = time.perf_counter() - start
-    rows = Dataset(run.dataset).rows()
+    dataset = Dataset(run.dataset)
+    rows = dataset.rows()
     markers = rows["markers"].astype(np.float64)
     columns = {}
     for title, corruption in (("clean", Corruption(0, 0)), ("occluded", Corruption(_DROPS, _GHOSTS))):
@@ -65,10 +66,10 @@ def generate_and_label(run: DemoRun) -> None:
         run.figures,
         {"columns": columns, "generated_per_second": run.num_frames / seconds, "labeled_per_second": labeled},
     )
-    _keep_frame(run, rows, labeler)
+    _keep_frame(run, dataset, rows, labeler)
 
 
-def _keep_frame(run: DemoRun, rows: np.ndarray, labeler: Labeler) -> None:
+def _keep_frame(run: DemoRun, dataset: Dataset, rows: np.ndarray, labeler: Labeler) -> None:
     """Write one frame with ghosts and its labels for the drawing step."""
     number = _clear_frame(rows)
     row = rows[number]
@@ -87,7 +88,7 @@ def _keep_frame(run: DemoRun, rows: np.ndarray, labeler: Labeler) -> None:
         truth=cloud.truth[0][present],
         seen=np.isfinite(row["observed"][:, 0]),
         qpos=row["qpos"].astype(np.float64),
-        hand=np.array(pack_hand(Dataset(run.dataset).hands(0)[int(row["hand"])]), dtype=HAND_DTYPE),
+        hand=np.array(pack_hand(dataset.hands(0)[int(row["hand"])]), dtype=HAND_DTYPE),
     )
 
 
