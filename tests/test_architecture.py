@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import itertools
 import re
 import subprocess
 from collections import Counter, defaultdict
@@ -183,15 +182,3 @@ def test_american_spelling():
             if (match := BRITISH.search(line)) and not KEPT.search(line):
                 found.append(f"{name}:{number}: {match[0]}")
     assert found == []
-
-
-def test_layers_of_the_contract_are_all_packages(graph):
-    """Every package is on a layer: nothing is imported from a package above."""
-    order = {"handsim": 0, "gloves": 1, "poses": 1, "render": 2, "train": 2, "track": 3}
-    for importer, imported in itertools.chain.from_iterable(
-        ((module, other) for other in graph.find_modules_directly_imported_by(module))
-        for module in graph.modules
-    ):
-        assert order[imported.split(".")[0]] <= order[importer.split(".")[0]], (
-            f"{importer} imports {imported}"
-        )

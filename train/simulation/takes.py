@@ -28,7 +28,7 @@ _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)
 
 @dataclass(frozen=True, slots=True)
 class TakeConfig:
-    """Everything that decides the bytes of a simulated take."""
+    """Everything that decides the bytes of a simulated take; takes have 120 frames per second [Hz]."""
 
     kind: Kind = "single-hand"
     num_frames: int | None = None
