@@ -1,11 +1,12 @@
 """From nothing to labels better than the paper's best network on each of its four kinds of test, timed.
 
-python benchmarks/first_labels.py [--captures DATA] [--frames 100000] [--samples 400000]
+python benchmarks/first_labels.py [--captures DATA] [--labeler cnn] [--frames 100000] [--samples 400000]
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import tempfile
 import time
 from pathlib import Path
@@ -15,7 +16,7 @@ from machine import describe
 
 from gloves.captures.collection import find_captures, read_markers
 from gloves.layout import load_layout
-from train.config import TrainConfig
+from train.config import KINDS, TrainConfig, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.evaluation.paper import AUGMENTATIONS, TABLE2
@@ -28,24 +29,27 @@ from train.simulation.held_out import held_out_markers
 from train.training_state import TrainingState
 
 GLOVE = "dense19"
-EVERY = 40_000  # samples between two looks
-FRAMES = 3000  # of each test set
+EVERY = {"set": 40_000, "cnn": 20_000}  # samples between two looks
+FRAMES = {"set": 3000, "cnn": 300}  # of each test set
 LIMIT = 10.0  # minutes
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--captures", type=Path)
+    parser.add_argument("--labeler", choices=KINDS, default="set")
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--samples", type=int, default=400_000)
     options = parser.parse_args()
     print(describe("torch", "mujoco"))
-    tests = {"unseen simulated": held_out_markers(GLOVE, FRAMES, seed=1)}
+    tested = FRAMES[options.labeler]
+    tests = {"unseen simulated": held_out_markers(GLOVE, tested, seed=1)}
     if options.captures is not None:
         markers = read_markers(find_captures([options.captures]), load_layout(GLOVE).names)
-        tests["captures"] = markers[:: -(-len(markers) // FRAMES)]
+        tests["captures"] = markers[:: -(-len(markers) // tested)]
     with tempfile.TemporaryDirectory() as folder:
-        beaten = race(tests, options.frames, options.samples, Path(folder))
+        config = dataclasses.replace(default_config(options.labeler), samples=options.samples)
+        beaten = race(tests, options.frames, config, Path(folder))
     for name, times in beaten.items():
         print(name + ": " + ", ".join(f"{test} after {minutes:.1f} min" for test, minutes in times.items()))
     last = max((time for times in beaten.values() for time in times.values()), default=np.inf)
@@ -54,7 +58,7 @@ def main() -> None:
 
 
 def race(
-    tests: dict[str, np.ndarray], frames: int, samples: int, folder: Path
+    tests: dict[str, np.ndarray], frames: int, config: TrainConfig, folder: Path
 ) -> dict[str, dict[str, float]]:
     """Minutes from the start until the paper's best network was beaten, by test set and kind of test."""
     start = time.perf_counter()
@@ -62,13 +66,12 @@ def race(
     dataset = Dataset(folder / "set")
     rows, names = dataset.rows(), dataset.marker_names
     print(f"{(time.perf_counter() - start) / 60:5.1f} min: {frames} frames generated")
-    config = TrainConfig(samples=samples)
-    state = TrainingState(config, start_fabric(config, folder))
+    state = TrainingState(config, start_fabric(config, folder), rows)
     beaten: dict[str, dict[str, float]] = {name: {} for name in tests}
-    while state.done < samples:
+    while state.done < config.samples:
         rng = np.random.default_rng(state.done)
         state.step(draw_batch(rows, config, rng=rng), rng=rng)
-        if state.done % EVERY >= config.batch and state.done < samples:
+        if state.done % EVERY[config.labeler] >= config.batch and state.done < config.samples:
             continue
         labeler = labeler_of(state.averaged(), names)
         for name, markers in tests.items():

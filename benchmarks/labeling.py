@@ -1,6 +1,9 @@
 """How long labelers take for one hand on one core, matching included, whatever runs them.
 
-python benchmarks/labeling.py [--frames 2000]
+python benchmarks/labeling.py [--frames 2000] [--cnn RUN]
+
+RUN is a folder that handsim train --labeler cnn wrote; without it the paper's network is timed untrained, so
+that it tries every view.
 """
 
 from __future__ import annotations
@@ -17,44 +20,53 @@ import onnxruntime
 import torch
 from machine import describe
 
-from train.config import SetLabelerConfig
-from train.labelers.cnn_labeler import TrainedCNNLabeler
-from train.labelers.cnn_network import DeepLabelCNN
-from train.labelers.kinds import new_network
+from train.config import CNNConfig
+from train.data.augmentation import Corruption, corrupt
+from train.labelers.depth_image import depth_images
+from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
 from train.labelers.set_labeler import TrainedSetLabeler
 from train.labelers.set_network import LabelScores
 from train.labelers.storage import load_labeler, load_network
+from train.labelers.views import principal_axes
+from train.simulation.held_out import held_out_markers
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=2000)
-    count = parser.parse_args().frames
+    parser.add_argument("--cnn", type=Path)
+    options = parser.parse_args()
+    count = options.frames
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     print(describe("torch", "onnxruntime", "scipy"))
-    rng = np.random.default_rng(0)
-    frames = [rng.uniform(-0.06, 0.06, size=(rng.integers(14, 22), 3)) for _ in range(count)]
+    markers = held_out_markers("dense19", count, seed=0)
+    cloud = corrupt(markers, Corruption(), rng=np.random.default_rng(0))
+    frames = [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)]
     network, card = load_network("dense19")
     names = tuple(card["marker_names"])
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "dense19.onnx"
         export_onnx(network, names, path)
         onnx = OnnxLabeler(path)
-        cnn = new_network("cnn", SetLabelerConfig())
+        cnn = new_network(CNNConfig()) if options.cnn is None else load_network(options.cnn)[0]
+        export_onnx(cnn, names, Path(folder) / "cnn.onnx")
+        paper_onnx = OnnxLabeler(Path(folder) / "cnn.onnx")
         images = convolutions(cnn, Path(folder) / "cnn.onnx")
     traced = TrainedSetLabeler(TracedNetwork(network), names)
-    labeler, paper = load_labeler("dense19"), TrainedCNNLabeler(cnn, names)
+    labeler, paper = load_labeler("dense19"), labeler_of(cnn, names)
     few = frames[: max(1, count // 20)]
     runs: dict[str, tuple[Callable[[np.ndarray], object], list[np.ndarray]]] = {
         "set labeler, onnxruntime": (lambda frame: onnx.label_frames([frame]), frames),
         "set labeler, torch traced": (lambda frame: traced.label_frames([frame]), frames),
         "set labeler, torch": (lambda frame: labeler.label_frames([frame]), frames),
-        "paper's network, torch, both sides": (lambda frame: paper.label_frames([frame]), few),
-        "- its convolutions alone, torch": (lambda _: images["torch"](), few),
-        "- the same in bf16": (lambda _: images["bf16"](), few),
-        "- the same, onnxruntime": (lambda _: images["onnxruntime"](), few),
+        "paper's network, torch": (lambda frame: paper.label_frames([frame]), few),
+        "paper's network, onnxruntime": (lambda frame: paper_onnx.label_frames([frame]), few),
+        "- one image, torch": (lambda _: images["torch"](), few),
+        "- one image, onnxruntime": (lambda _: images["onnxruntime"](), few),
+        "- eight images, torch": (lambda _: images["torch, eight"](), few),
+        "- eight images, onnxruntime": (lambda _: images["onnxruntime, eight"](), few),
     }
     print("one hand at a time, one thread                p50       p99 [ms]")
     for name, (label, clouds) in runs.items():
@@ -82,24 +94,24 @@ class TracedNetwork(torch.nn.Module):
         return LabelScores(*self.traced(points, present))
 
 
-def convolutions(cnn: DeepLabelCNN, path: Path) -> dict[str, Callable[[], object]]:
-    """The paper's network on one image, run in three ways."""
-    image = torch.rand(1, 1, 52, 52).to(memory_format=torch.channels_last)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch.onnx.export(cnn.eval(), (image,), str(path), input_names=["image"], dynamo=False)
+def convolutions(cnn: torch.nn.Module, path: Path) -> dict[str, Callable[[], object]]:
+    """The paper's network on one image and on eight."""
+    points = held_out_markers("dense19", 8, seed=1)
+    present = np.ones(points.shape[:2], dtype=bool)
+    images = depth_images(points, present, principal_axes(points, present))[0][:, None]
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
 
-    def torch_run(bf16: bool) -> object:
-        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            return cnn(image)
+    @torch.inference_mode()
+    def torch_run(count: int) -> object:
+        return cnn(torch.from_numpy(images[:count]))
 
     return {
-        "torch": lambda: torch_run(False),
-        "bf16": lambda: torch_run(True),
-        "onnxruntime": lambda: session.run(None, {"image": image.numpy()}),
+        "torch": lambda: torch_run(1),
+        "torch, eight": lambda: torch_run(8),
+        "onnxruntime": lambda: session.run(None, {"images": images[:1]}),
+        "onnxruntime, eight": lambda: session.run(None, {"images": images}),
     }
 
 

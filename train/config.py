@@ -12,6 +12,8 @@ Kind = Literal["set", "cnn"]
 """`set` is the default labeler (`train.labelers.set_network`), `cnn` the paper's
 (`train.labelers.cnn_network`)."""
 
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+
 
 @dataclass(frozen=True, slots=True)
 class SetLabelerConfig:
@@ -28,6 +30,33 @@ class SetLabelerConfig:
     """Gaussian basis functions that encode a distance."""
     reach: float = 0.24
     """Largest distance [m] with a basis function of its own; a hand's markers span about this much."""
+
+
+Views = Literal["aligned", "random"]
+"""`aligned` turns every hand like the mean hand (`train.labelers.views`); `random` is the paper's policy:
+any view in training, for labeling the one of ten on which the cloud spreads best."""
+
+
+@dataclass(frozen=True, slots=True)
+class CNNConfig:
+    """How the paper's network sees a cloud, and how labels follow from the positions that it predicts."""
+
+    num_labels: int = 19
+    views: Views = "aligned"
+    reject: float | None = None
+    """Cost of a point without a label [m]: no point is matched over a larger distance. Chosen on held-out
+    simulated frames when not given."""
+    spread: float | None = None
+    """Distance over which a label's weight in the confidence falls by a factor of e [m]; chosen likewise."""
+
+    def __post_init__(self) -> None:
+        for name in ("reject", "spread"):
+            value = getattr(self, name)
+            if value is not None and not value > 0.0:
+                raise HandSimError(f"{name} is {value}, expected more than 0")
+
+
+NetworkConfig = SetLabelerConfig | CNNConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +77,11 @@ class TrainConfig:
     weight_decay: float = 0.01
     average: float = 0.999
     """Decay of the running mean of the weights, which is what is saved; 0 saves the last weights."""
-    precision: Literal["32", "bf16"] = "32"
-    """Precision of the forward pass; bf16 is faster on hardware that has it, and less accurate."""
+    average_every: int = 1
+    """Steps between two updates of that mean."""
+    precision: Literal["auto", "32", "bf16"] = "32"
+    """Precision of the forward pass; bf16 is faster on hardware that has it, and less accurate. `auto` takes
+    it there."""
     devices: int = 1
     """GPUs to share each batch, where there are any."""
     jitter: float = 0.005
@@ -63,11 +95,20 @@ class TrainConfig:
     """Most ghosts added in the paper's corruption."""
     anisotropy: float = 0.06
     """Log standard deviation of the stretch of each hand along three random directions."""
+    knee: float = 0.02
+    """Distance at which the loss of the paper's network turns from quadratic to linear [half an image's
+    width]."""
     seed: int = 0
     network: SetLabelerConfig = dataclasses.field(default_factory=SetLabelerConfig)
+    cnn: CNNConfig = dataclasses.field(default_factory=CNNConfig)
+
+    @property
+    def chosen(self) -> NetworkConfig:
+        """The settings of the network of this kind."""
+        return self.cnn if self.labeler == "cnn" else self.network
 
     def __post_init__(self) -> None:
-        for name in ("samples", "batch", "devices"):
+        for name in ("samples", "batch", "devices", "average_every"):
             if getattr(self, name) < 1:
                 raise HandSimError(f"{name} is {getattr(self, name)}, expected at least 1")
 
@@ -81,8 +122,9 @@ def preset_config(preset: Preset, num_frames: int) -> TrainConfig:
     """The settings of a published recipe for a training set of `num_frames`.
 
     `han2018` is section 3.3 of Han et al. 2018: plain SGD from 0.6, batches of 256, 75 epochs, random drops
-    and ghosts. The paper does not give the jitter; ours is that of its published data (±3 mm). The 16-bit
-    precision is not the paper's either; it is three times as fast on a CPU that has it.
+    and ghosts, views from anywhere, a smooth L1 loss with its usual knee of one, and points matched over
+    15 mm at most. The paper does not give the jitter; ours is that of its published data (±3 mm). A 16-bit
+    precision on hardware that has it is not the paper's either.
     """
     del preset  # one so far
     return TrainConfig(
@@ -93,8 +135,27 @@ def preset_config(preset: Preset, num_frames: int) -> TrainConfig:
         schedule="steps",
         weight_decay=0.0,
         average=0.0,
-        precision="bf16",
+        precision="auto",
         jitter=0.003,
         rig_share=0.0,
         anisotropy=0.0,
+        knee=1.0,
+        cnn=CNNConfig(views="random", reject=0.015),
+    )
+
+
+def default_config(labeler: Kind) -> TrainConfig:
+    """The settings that a labeler of this kind is trained with when no others are given."""
+    if labeler == "set":
+        return TrainConfig()
+    return TrainConfig(
+        labeler="cnn",
+        samples=1_500_000,
+        batch=64,
+        learning_rate=1e-3,
+        average=0.99,
+        average_every=16,
+        precision="auto",
+        jitter=0.003,
+        rig_share=0.0,
     )

@@ -11,8 +11,11 @@ class History:
 
     losses: list[tuple[int, float, float]] = field(default_factory=list)
     """Samples done, mean loss of the steps since the previous entry, learning rate of the last of them."""
-    accuracies: list[tuple[int, float]] = field(default_factory=list)
-    """Samples done, slot accuracy on some held-out frames with the paper's corruption."""
+    accuracies: list[tuple[int, float, float]] = field(default_factory=list)
+    """Samples done, minutes of steps until then, slot accuracy on some held-out frames with the paper's
+    corruption."""
+    minutes: float = 0.0
+    """Time of all steps."""
     waiting: float = 0.0
     """Sum of the losses of the steps that are in no entry yet."""
     steps: int = 0

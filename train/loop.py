@@ -19,11 +19,13 @@ from torch import nn
 from handsim._version import __version__
 from handsim.errors import DatasetError, WeightsError
 from handsim.files.json_files import claim
-from train.config import TrainConfig
+from train.config import Kind, TrainConfig
 from train.data.augmentation import Corruption
 from train.data.batches import draw_batch, paper_corruption
 from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler
+from train.evaluation.matching_costs import choose_costs
+from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import labeler_of
 from train.labelers.storage import save_network
 from train.reports.run_page import write_run_page
@@ -37,7 +39,8 @@ _CONFIG: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
 _MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
-_MAX_EVALUATED: Final = 512
+_CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # of each of these evaluations
+_CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # of the last one
 
 Progress = Callable[[int, int, float], None]
 """Called with samples done, samples expected, and the loss."""
@@ -68,14 +71,18 @@ def train_labeler(
         WeightsError: `out` holds a run of other settings.
     """
     names = dataset.marker_names
-    config = dataclasses.replace(config, network=dataclasses.replace(config.network, num_labels=len(names)))
+    config = dataclasses.replace(
+        config,
+        network=dataclasses.replace(config.network, num_labels=len(names)),
+        cnn=dataclasses.replace(config.cnn, num_labels=len(names)),
+    )
     rows, held_out = _split(dataset, config.batch)
     fabric = start_fabric(config, out)
     settings = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
     with fabric.rank_zero_first():
         claim(out / _CONFIG, settings, noun="training run", error=WeightsError)
     torch.manual_seed(config.seed)
-    state = TrainingState(config, fabric)
+    state = TrainingState(config, fabric, rows)
     state.restore(out / CHECKPOINT)
     saved = time.monotonic()
     while state.done < config.samples:
@@ -84,7 +91,7 @@ def train_labeler(
         share = dataclasses.replace(config, batch=config.batch // fabric.world_size)
         loss = state.step(draw_batch(rows, share, rng=rng), rng=rng)
         if fabric.is_global_zero and passed(state.done, config, _NUM_EVALUATIONS):
-            state.evaluate(held_out[:: -(-len(held_out) // _MAX_EVALUATED)], names)
+            state.evaluate(held_out[:: -(-len(held_out) // _CURVE_FRAMES[config.labeler])], names)
         if progress is not None and fabric.is_global_zero:
             progress(min(state.done, config.samples), config.samples, loss)
         if time.monotonic() - saved > save_every:
@@ -92,9 +99,14 @@ def train_labeler(
             saved = time.monotonic()
     state.save(out / CHECKPOINT)
     network = state.averaged()
-    card, report = _card(network, held_out, config, dataset)
+    if isinstance(network, DeepLabelCNN):
+        choose_costs(network, names, held_out)
+    card, report = _card(
+        network, held_out[:: -(-len(held_out) // _CARD_FRAMES[config.labeler])], config, dataset
+    )
     if fabric.is_global_zero:
-        save_network(out, config.labeler, network, config.network, card)
+        card["curve"] = state.history.accuracies
+        save_network(out, network, card)
         write_run_page(out, card, state.history, report)
     return card
 
@@ -116,11 +128,20 @@ def start_fabric(config: TrainConfig, out: Path) -> Fabric:
     fabric = Fabric(
         accelerator="cuda" if torch.cuda.is_available() else "cpu",
         devices=config.devices,
-        precision="bf16-mixed" if config.precision == "bf16" else "32-true",
+        precision="bf16-mixed" if _takes_bf16(config.precision) else "32-true",
         loggers=TensorBoardLogger(out, name="tensorboard", version=""),
     )
     fabric.launch()
     return fabric
+
+
+def _takes_bf16(precision: str) -> bool:
+    """Whether the forward pass runs in bf16; without instructions for it a CPU is many times slower."""
+    if precision != "auto":
+        return precision == "bf16"
+    if torch.cuda.is_available():
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
 
 
 def _card(

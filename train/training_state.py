@@ -19,7 +19,7 @@ from train.config import TrainConfig
 from train.data.batches import Batch, paper_corruption
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler
 from train.history import History
-from train.labelers.kinds import batch_loss, labeler_of, new_network
+from train.labelers.kinds import batch_loss, labeler_of, new_network, prepare_network
 from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
@@ -31,10 +31,11 @@ _CURVE: Final = 200  # points of the loss curve
 class TrainingState:
     """The state that a run carries from step to step and a checkpoint keeps."""
 
-    def __init__(self, config: TrainConfig, fabric: Fabric) -> None:
+    def __init__(self, config: TrainConfig, fabric: Fabric, rows: NDArray[np.void]) -> None:
         self.config = config
         self.fabric = fabric
-        network = new_network(config.labeler, config.network)
+        network = new_network(config.chosen)
+        prepare_network(network, rows)
         self.network, self.optimizer = fabric.setup(network, _optimizer(config, network))
         self.mean = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
         self.done = 0
@@ -43,10 +44,11 @@ class TrainingState:
 
     def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
         """Make one gradient step and return the loss before it."""
+        began = time.perf_counter()
         rate = self.config.learning_rate * _rate(self.config, self.done / self.config.samples)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        loss = batch_loss(self.config.labeler, self.network, batch, self.fabric.device, rng=rng)
+        loss = batch_loss(self.config, self.network, batch, self.fabric.device, rng=rng)
         self.optimizer.zero_grad()
         self.fabric.backward(loss)
         if self.config.optimizer == "adamw":
@@ -56,12 +58,16 @@ class TrainingState:
         self._average()
         value = float(loss.detach())
         self.history.add(value)
+        self.history.minutes += (time.perf_counter() - began) / 60.0
         if passed(self.done, self.config, _CURVE) or self.done >= self.config.samples:
             self._log(rate)
         return value
 
     def _average(self) -> None:
-        decay = min(self.config.average, self.done / (self.done + 20.0 * self.config.batch))
+        every = self.config.batch * self.config.average_every
+        if self.done % every and self.done < self.config.samples:
+            return
+        decay = min(self.config.average, self.done / (self.done + 20.0 * every))
         with torch.no_grad():
             for name, tensor in self.network.state_dict().items():
                 if tensor.is_floating_point():
@@ -83,13 +89,13 @@ class TrainingState:
         """Record the slot accuracy of the mean weights on a few held-out rows, the same each time."""
         report = paper_report(labeler_of(self.averaged(), names), rows)
         accuracy = report.figures["slot_accuracy"]
-        self.history.accuracies.append((self.done, accuracy))
+        self.history.accuracies.append((self.done, self.history.minutes, accuracy))
         self.fabric.log_dict({"held_out_slot_accuracy": accuracy}, step=self.done)
 
     def averaged(self) -> nn.Module:
         """The network with the mean weights."""
         with torch.random.fork_rng(devices=[]):  # the initial weights are replaced at once
-            network = new_network(self.config.labeler, self.config.network)
+            network = new_network(self.config.chosen)
         network.load_state_dict({name: tensor.cpu() for name, tensor in self.mean.items()})
         return network.eval()
 
@@ -130,7 +136,9 @@ def _optimizer(config: TrainConfig, network: nn.Module) -> torch.optim.Optimizer
         return torch.optim.SGD(
             network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
         )
-    return torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    return torch.optim.AdamW(
+        network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay, fused=True
+    )
 
 
 def _rate(config: TrainConfig, progress: float) -> float:

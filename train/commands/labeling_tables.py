@@ -15,7 +15,7 @@ from gloves.captures.collection import find_captures, read_markers
 from gloves.captures.gaps import count_gaps, run_lengths
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError
-from train.config import Kind, TrainConfig, preset_config
+from train.config import Kind, default_config
 from train.data.shards import Dataset
 from train.evaluation.paper import AUGMENTATIONS, TABLE4, TABLE6
 from train.evaluation.tables import (
@@ -53,7 +53,7 @@ def table2(
     Args:
         data: Training set that handsim generate wrote.
         out: Folder for the runs; the same command continues where it was stopped.
-        kinds: Networks to train: set, cnn (by the paper's recipe) or both.
+        kinds: Networks to train: set, cnn or both.
         samples: Clouds that each network is trained on (the paper: 12.8 million).
         num_frames: Test frames of people and poses that are not in the training set.
         captures: Labeled captures or folders of them, for a second table.
@@ -81,10 +81,8 @@ def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samp
     from train.loop import train_labeler
 
     drawn = augmentations(len(dataset.marker_names))[name]
-    recipe = preset_config("han2018", dataset.manifest.num_frames) if kind == "cnn" else TrainConfig()
-    config = dataclasses.replace(
-        recipe, samples=samples, seed=seed, rig_share=0.0, occlude=drawn.occlude, ghosts=drawn.ghosts
-    )
+    usual = dataclasses.replace(default_config(kind), samples=samples, seed=seed, rig_share=0.0)
+    config = dataclasses.replace(usual, occlude=drawn.occlude, ghosts=drawn.ghosts)
     with progress_bar("samples") as (bar, task):
         train_labeler(
             dataset,

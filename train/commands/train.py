@@ -12,7 +12,7 @@ from rich.console import Console
 
 from handsim.app.presets import PresetCommand, given_option
 from handsim.app.progress import progress_bar
-from train.config import PRESETS, Preset, TrainConfig, preset_config
+from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
 from train.data.shards import Dataset, load_manifest
 from train.reports.figures_table import print_figures
 from train.reports.run_page import PAGE
@@ -49,12 +49,14 @@ def _train(
     Console().print(f"report in {out / PAGE}", soft_wrap=True, markup=False)
 
 
-def _with_preset_as_default(args: Sequence[str], prog: str) -> Callable[..., None]:
-    """`handsim train` with the settings of the preset among its arguments as the default of `config`."""
+def _with_recipe_as_default(args: Sequence[str], prog: str) -> Callable[..., None]:
+    """`handsim train` with the settings of the given labeler or preset as the default of `config`."""
     name = given_option(args, "--preset")
     preset = next((preset for preset in PRESETS if preset == name), None)
     if preset is None:
-        return _train
+        labeler = given_option(args, "--labeler")
+        kind: Kind = next((kind for kind in KINDS if kind == labeler), "set")
+        return functools.partial(_train, config=default_config(kind))
     # The recipe counts epochs, so the training set must be known before its defaults are.
     folder = tyro.cli(
         functools.partial(_dataset_of, config=preset_config(preset, _PAPER_FRAMES)), prog=prog, args=args
@@ -74,4 +76,4 @@ def _dataset_of(
     return dataset
 
 
-train: Final = PresetCommand(_with_preset_as_default)
+train: Final = PresetCommand(_with_recipe_as_default)

@@ -7,33 +7,36 @@ layout's marker order; labels come from matching them with the points (equation 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from train.labelers.matching import GHOST
+from train.config import CNNConfig, TrainConfig
+from train.data.batches import Batch
+from train.labelers.depth_image import depth_images
+from train.labelers.sparse_convolution import filter_sparse
+from train.labelers.views import NUM_MOMENTS, MeanHand, random_views
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
+    from jaxtyping import Float
 
-REJECT = 0.015
-"""Distance beyond which a point is a ghost rather than the marker predicted there [m]; the paper's gate."""
+_SPARSE: Final = 10  # layers up to the third filter, which leave a large part of an image uniform
 
 
 class DeepLabelCNN(nn.Module):
     """Positions of a layout's markers from sparse 52×52 depth images.
 
     Args:
-        num_labels: Markers of the layout.
+        config: Markers of the layout, and how the network is used.
     """
 
-    def __init__(self, num_labels: int) -> None:
+    def __init__(self, config: CNNConfig) -> None:
         super().__init__()
-        self.num_labels = num_labels
+        self.config = config
+        self.mean_hand = _MeanHandBuffers(config.num_labels)
         self.features = nn.Sequential(
             *_filters(1, 64),
             *_filters(64, 64),
@@ -47,13 +50,42 @@ class DeepLabelCNN(nn.Module):
             nn.Flatten(),
             nn.Linear(128 * 9 * 9, 2048),
             nn.ReLU(inplace=True),
-            nn.Linear(2048, num_labels * 3),
+            nn.Linear(2048, config.num_labels * 3),
         )
 
     def forward(self, images: Float[Tensor, "B 1 52 52"]) -> Float[Tensor, "B M 3"]:
         """Marker positions in view units, those of occluded markers too."""
-        positions: Tensor = self.positions(self.features(images))
-        return positions.view(-1, self.num_labels, 3)
+        if _computes_sparsely(images):
+            layers = list(self.features)
+            features = filter_sparse(images, layers[:_SPARSE]).dense()
+            for layer in layers[_SPARSE:]:
+                features = layer(features)
+            positions: Tensor = self.positions(features)
+        else:
+            positions = self.positions(self.features(images.contiguous(memory_format=torch.channels_last)))
+        return positions.view(-1, self.config.num_labels, 3)
+
+
+class _MeanHandBuffers(nn.Module):
+    """A mean hand (`train.labelers.views.MeanHand`) that is saved with the weights."""
+
+    def __init__(self, num_labels: int) -> None:
+        super().__init__()
+        self.register_buffer("markers", torch.zeros(num_labels, 3))
+        self.register_buffer("moments", torch.zeros(NUM_MOMENTS))
+        self.register_buffer("precision", torch.zeros(NUM_MOMENTS, NUM_MOMENTS))
+
+    def set(self, hand: MeanHand) -> None:
+        for name, tensor in self.named_buffers():
+            tensor.copy_(torch.from_numpy(getattr(hand, name)))
+
+    def get(self) -> MeanHand:
+        return MeanHand(*(tensor.double().cpu().numpy() for tensor in self.buffers()))
+
+
+def _computes_sparsely(images: Tensor) -> bool:
+    """Whether images are filtered where they are not background: on a CPU, in 32 bits, not while exported."""
+    return not (images.is_cuda or torch.is_autocast_enabled("cpu") or torch.jit.is_tracing())  # type: ignore[no-untyped-call, attr-defined]
 
 
 def _filters(channels_in: int, channels_out: int) -> tuple[nn.Module, ...]:
@@ -62,40 +94,35 @@ def _filters(channels_in: int, channels_out: int) -> tuple[nn.Module, ...]:
 
 
 def position_loss(
-    predicted: Float[Tensor, "B M 3"], targets: Float[Tensor, "B M 3"], present: Bool[Tensor, "B M"]
+    predicted: Float[Tensor, "B M 3"], targets: Float[Tensor, "B M 3"], *, knee: float = 1.0
 ) -> Tensor:
-    """Smooth L1 distance, the mean over coordinates of present markers; 0 where there are none.
+    """Smooth L1 distance, the mean over coordinates.
 
     Args:
         predicted: From `DeepLabelCNN`.
-        targets: True positions in view units; absent markers are ignored and may be NaN.
-        present: Which markers count.
+        targets: True positions in view units, those of occluded markers too.
+        knee: Distance at which it turns from quadratic to linear [view unit]; the paper gives none, 1 is
+            usual.
     """
-    total = functional.smooth_l1_loss(predicted[present], targets[present], reduction="sum")
-    return total / max(1, 3 * int(present.sum()))
+    return functional.smooth_l1_loss(predicted, targets, beta=knee)
 
 
-def match_positions(
-    predicted: Float[np.ndarray, "M 3"], points: Float[np.ndarray, "N 3"], reject: float = REJECT
-) -> Int[np.ndarray, "N"]:
-    """One-to-one labeling of a cloud with the least total distance.
-
-    The paper's equation 1, with the reject option that its results imply: a point may stay without a label at
-    the cost of `reject`, so no point is matched over a larger distance.
-
-    Args:
-        predicted: Predicted position of each marker [m].
-        points: The cloud in the same frame [m]; NaN rows are missing.
-        reject: Cost of a point without a label [m].
-
-    Returns:
-        Label of each point, `GHOST` where none.
-    """
-    count, num_labels = len(points), len(predicted)
-    distances = np.linalg.norm(points[:, None] - predicted[None], axis=-1)
-    cost = np.full((count, num_labels + count), np.inf)
-    cost[:, :num_labels] = np.where(np.isfinite(distances), distances, np.inf)
-    cost[np.arange(count), num_labels + np.arange(count)] = reject
-    _, columns = linear_sum_assignment(cost)
-    labels: NDArray[np.int64] = np.where(columns < num_labels, columns, GHOST)
-    return labels
+def cnn_loss(
+    network: nn.Module,
+    batch: Batch,
+    device: torch.device,
+    config: TrainConfig,
+    *,
+    rng: np.random.Generator,
+) -> Tensor:
+    """Loss of one batch, each cloud in a view of its own (section 3.1 of the paper)."""
+    points, present = batch.cloud.points, batch.cloud.present
+    if config.cnn.views == "aligned":
+        hand = network.mean_hand.get()  # type: ignore[operator, union-attr]
+        views = hand.training_views(points, present, batch.markers, rng=rng)
+    else:
+        views = random_views(len(points), rng=rng)
+    images, frames = depth_images(points, present, views)
+    targets = torch.from_numpy(frames.normalize(batch.markers).astype(np.float32)).to(device)
+    seen = torch.from_numpy(images)[:, None].to(device)
+    return position_loss(network(seen), targets, knee=config.knee)

@@ -9,12 +9,11 @@ The images stretch depth to a fixed range; network outputs do not, so that dista
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from handsim.errors import HandSimError, choices
-from handsim.space.transforms import quaternion_matrix, random_quaternions
+from train.labelers.views import centered
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32
@@ -30,10 +29,6 @@ SMALLEST_EXTENT = 0.01
 """Least extent from the mean that the zoom assumes [m]; a single point has none."""
 FLAT = 1e-6
 """Depth ranges below this are rounding [m]; their points get the middle brightness."""
-NUM_CANDIDATES = 10
-"""Views among which `random10` chooses."""
-
-ViewPolicy = Literal["random", "random10"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +36,7 @@ class ViewFrames:
     """The cameras of a batch of depth images."""
 
     rotations: Float[np.ndarray, "B 3 3"]
-    """From the input's frame into the camera's."""
+    """From the input's frame into the camera's; with determinant -1 the image is mirrored."""
     centers: Float[np.ndarray, "B 3"]
     """Mean of each cloud in the input's frame [m]."""
     scales: Float[np.ndarray, "B"]
@@ -64,43 +59,6 @@ class ViewFrames:
         return positions
 
 
-def view_rotations(
-    points: Float[np.ndarray, "B N 3"],
-    present: Bool[np.ndarray, "B N"],
-    *,
-    policy: ViewPolicy,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
-    """Rotations (B, 3, 3) from the clouds' frame into the camera's.
-
-    Args:
-        points: Clouds [m]; padding is ignored.
-        present: Which points are there.
-        policy: `random`, any view (training); `random10`, the one of ten, the same ten for all clouds, on
-            which the projected cloud spreads best (labeling): the smaller eigenvalue of its covariance is
-            largest. Of equals the larger eigenvalue counts, which is the order of determinants but tells
-            views of a straight line apart.
-        rng: Source of all randomness.
-
-    Raises:
-        HandSimError: The policy is unknown.
-    """
-    if policy not in get_args(ViewPolicy):
-        raise HandSimError(choices(policy, get_args(ViewPolicy), noun="view policy"))
-    batch = len(points)
-    if policy == "random":
-        return quaternion_matrix(random_quaternions(batch, rng=rng))
-    candidates = quaternion_matrix(random_quaternions(NUM_CANDIDATES, rng=rng))  # (V, 3, 3)
-    _, offsets = _center(points, present)
-    covariance = offsets.swapaxes(1, 2) @ offsets / np.maximum(present.sum(1), 1)[:, None, None]  # (B, 3, 3)
-    image_axes = candidates[:, :2]  # (V, 2, 3)
-    spreads = np.linalg.eigvalsh(image_axes @ covariance[:, None] @ image_axes.swapaxes(1, 2))  # ascending
-    rounding = 1e-12 * np.trace(covariance, axis1=1, axis2=2)[:, None]
-    smaller = np.where(spreads[..., 0] > rounding, spreads[..., 0], 0.0)
-    best = np.lexsort((spreads[..., 1], smaller), axis=-1)[:, -1]
-    return candidates[best]
-
-
 def depth_images(
     points: Float[np.ndarray, "B N 3"],
     present: Bool[np.ndarray, "B N"],
@@ -113,7 +71,7 @@ def depth_images(
     Args:
         points: Clouds [m]; padding is ignored.
         present: Which points are there.
-        rotations: From the clouds' frame into the camera's.
+        rotations: From the clouds' frame into the camera's; with determinant -1 the image is mirrored.
 
     Returns:
         Images (row, column), 0 for background and 0.1 (near) to 1.0 (far) for points; and the cameras.
@@ -137,7 +95,7 @@ def _view_frames(
     points: NDArray[np.float64], present: NDArray[np.bool_], rotations: NDArray[np.float64]
 ) -> ViewFrames:
     """Cameras (B) that see every present point."""
-    centers, offsets = _center(points, present)
+    offsets, centers = centered(points, present)
     rotated = offsets @ rotations.swapaxes(1, 2)
     extent = np.abs(rotated[..., :2]).max(axis=(1, 2), initial=SMALLEST_EXTENT)
     nearest = np.where(present, rotated[..., 2], np.inf).min(axis=1, initial=np.inf)
@@ -152,12 +110,3 @@ def _view_frames(
         nearest=nearest,
         depth_ranges=np.where(ranges > FLAT, ranges, 0.0),
     )
-
-
-def _center(
-    points: NDArray[np.float64], present: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means (B, 3) of the present points, and offsets (B, N, 3) from them, 0 for padding."""
-    known = np.where(present[..., None], points, 0.0)
-    centers = known.sum(axis=1) / np.maximum(present.sum(axis=1), 1)[:, None]
-    return centers, np.where(present[..., None], known - centers[:, None], 0.0)

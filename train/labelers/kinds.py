@@ -2,43 +2,68 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+import numpy as np
 import torch
 from torch import nn
 
-from train.config import Kind, SetLabelerConfig
-from train.data.batches import Batch
-from train.labelers.cnn_labeler import TrainedCNNLabeler, cnn_loss
-from train.labelers.cnn_network import DeepLabelCNN
+from train.config import CNNConfig, NetworkConfig, TrainConfig
+from train.data.batches import Batch, draw_batch
+from train.labelers.cnn_labeler import CNNLabeler
+from train.labelers.cnn_network import DeepLabelCNN, cnn_loss
 from train.labelers.protocol import Labeler
 from train.labelers.set_labeler import TrainedSetLabeler, set_loss
 from train.labelers.set_network import SetLabeler
+from train.labelers.views import MeanHand
 
 if TYPE_CHECKING:
-    import numpy as np
+    from numpy.typing import NDArray
+
+_PREPARED: Final = 20_000  # frames
 
 
-def new_network(kind: Kind, config: SetLabelerConfig) -> nn.Module:
-    """An untrained network; the paper's uses only the number of labels of the config."""
-    if kind == "cnn":
-        network = DeepLabelCNN(config.num_labels)
+def new_network(config: NetworkConfig) -> nn.Module:
+    """An untrained network of the kind that its settings are for."""
+    if isinstance(config, CNNConfig):
+        network = DeepLabelCNN(config)
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
     return SetLabeler(config)
 
 
+def prepare_network(network: nn.Module, rows: NDArray[np.void]) -> None:
+    """Give an untrained network what it must know of a training set before the first step."""
+    if isinstance(network, DeepLabelCNN):
+        rng = np.random.default_rng(0)
+        batch = draw_batch(rows, TrainConfig(batch=_PREPARED, rig_share=0.0, anisotropy=0.0), rng=rng)
+        hand = MeanHand.of_clouds(batch.markers, batch.cloud.points, batch.cloud.present)
+        network.mean_hand.set(hand)
+
+
 def batch_loss(
-    kind: Kind, network: nn.Module, batch: Batch, device: torch.device, *, rng: np.random.Generator
+    config: TrainConfig, network: nn.Module, batch: Batch, device: torch.device, *, rng: np.random.Generator
 ) -> torch.Tensor:
     """Loss of one batch, a scalar."""
-    if kind == "cnn":
-        return cnn_loss(network, batch, device, rng=rng)
+    if config.labeler == "cnn":
+        return cnn_loss(network, batch, device, config, rng=rng)
     return set_loss(network, batch, device)
+
+
+def cnn_labeler(network: DeepLabelCNN, marker_names: tuple[str, ...]) -> CNNLabeler:
+    """The paper's network with trained weights as a labeler."""
+    network.eval()
+
+    @torch.inference_mode()
+    def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
+        predicted: NDArray[np.float32] = network(torch.from_numpy(images)).numpy()
+        return predicted
+
+    return CNNLabeler(positions, network.mean_hand.get(), network.config, marker_names)
 
 
 def labeler_of(network: nn.Module, marker_names: tuple[str, ...]) -> Labeler:
     """A trained network as a labeler."""
     if isinstance(network, DeepLabelCNN):
-        return TrainedCNNLabeler(network, marker_names)
+        return cnn_labeler(network, marker_names)
     assert isinstance(network, SetLabeler)
     return TrainedSetLabeler(network, marker_names)

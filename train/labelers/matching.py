@@ -1,4 +1,4 @@
-"""From scores to labels: one point per label, one label per point, with a reject option for both."""
+"""From scores or distances to labels: one point per label, one label per point, with a reject option."""
 
 from __future__ import annotations
 
@@ -71,6 +71,28 @@ def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.n
     table[:, :num_labels] = 2.0 * costs[:count, :num_labels] - costs[count, :num_labels]
     table.ravel()[num_labels :: num_labels + count + 1] = costs[:count, num_labels]
     _, columns = linear_sum_assignment(table)
+    labels: NDArray[np.int64] = np.where(columns < num_labels, columns, GHOST)
+    return labels
+
+
+def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[np.ndarray, "N"]:
+    """One-to-one labeling of a cloud with the least total distance.
+
+    The paper's equation 1, with the reject option that its results imply: a point may stay without a label at
+    the cost of `reject`, so no point is matched over a larger distance.
+
+    Args:
+        distances: Distance of each point from the predicted position of each marker [m].
+        reject: Cost of a point without a label [m].
+
+    Returns:
+        Label of each point, `GHOST` where none.
+    """
+    count, num_labels = distances.shape
+    cost = np.full((count, num_labels + count), np.inf)
+    cost[:, :num_labels] = distances
+    cost[np.arange(count), num_labels + np.arange(count)] = reject
+    _, columns = linear_sum_assignment(cost)
     labels: NDArray[np.int64] = np.where(columns < num_labels, columns, GHOST)
     return labels
 

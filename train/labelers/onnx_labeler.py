@@ -1,9 +1,10 @@
-"""The set labeler as one ONNX file: written with torch, run by onnxruntime without it."""
+"""A labeler as one ONNX file: written with torch, run by onnxruntime without it."""
 
 from __future__ import annotations
 
 import json
 import warnings
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -11,16 +12,21 @@ import numpy as np
 
 from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
+from train.config import CNNConfig
+from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+from train.labelers.views import MeanHand
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from jaxtyping import Float
     from numpy.typing import NDArray
     from torch import nn
 
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
+_CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
+_IMAGES: Final = "images"  # its input
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
 _OPSET: Final = 17
@@ -28,7 +34,7 @@ _HINT: Final = "install it with: pip install 'handsim[onnx]'"
 
 
 class OnnxLabeler:
-    """The set labeler from an ONNX file, on one thread, as `handsim export` wrote it.
+    """A labeler of either kind from an ONNX file, on one thread, as `handsim export` wrote it.
 
     Args:
         path: The .onnx file.
@@ -53,42 +59,63 @@ class OnnxLabeler:
             self._session = onnxruntime.InferenceSession(
                 path.read_bytes(), options, providers=["CPUExecutionProvider"]
             )
-            names = json.loads(self._session.get_modelmeta().custom_metadata_map[_NAMES])
+            metadata = self._session.get_modelmeta().custom_metadata_map
+            names = json.loads(metadata[_NAMES])
+            self.marker_names: tuple[str, ...] = tuple(names)
+            self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
         except Exception as error:  # onnxruntime's errors have no common class of their own
             raise WeightsError(
                 f"{path} is damaged or not a labeler's: expected what handsim export wrote"
             ) from error
-        self.marker_names: tuple[str, ...] = tuple(names)
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
         return label_in_batches(frames, self._label)
 
-    def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
+    def _label_by_scores(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
+        """The set labeler."""
         scores = self._session.run(_OUTPUTS, dict(zip(_INPUTS, pad_clouds(clouds), strict=True)))
         return label_by_scores(clouds, *scores)
 
+    def _label_by_images(self, settings: str) -> Callable[[list[NDArray[np.float64]]], list[Labeling]]:
+        """The paper's network, with what its metadata tells of its use."""
+        content = json.loads(settings)
+        hand = MeanHand(*(np.array(content["mean_hand"][field.name]) for field in fields(MeanHand)))
+        config = CNNConfig(**content["config"])
+
+        def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
+            predicted: NDArray[np.float32] = self._session.run(None, {_IMAGES: images})[0]
+            return predicted
+
+        return CNNLabeler(positions, hand, config, self.marker_names).label_batch
+
 
 def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
-    """Write a trained set labeler as an ONNX file for clouds of any number and size.
+    """Write a trained labeler as an ONNX file for any number of clouds of any size.
 
     Raises:
-        HandSimError: onnx is not installed, or the network is of another kind.
+        HandSimError: onnx is not installed.
     """
     import torch
 
-    from train.labelers.set_network import SetLabeler
-
-    if not isinstance(network, SetLabeler):
-        raise HandSimError("only labelers of kind 'set' can be exported, this one is of kind 'cnn'")
+    from train.labelers.cnn_network import DeepLabelCNN
 
     try:
         import onnx
     except ImportError as error:
         raise HandSimError(f"exporting needs onnx; {_HINT}") from error
-    example = torch.randn(2, 5, 3), torch.tensor([[True] * 5, [True] * 4 + [False]])
-    axes = {name: {0: "frames", 1: "points"} for name in _INPUTS}
-    axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
+    properties = {_NAMES: json.dumps(list(marker_names))}
+    example: tuple[torch.Tensor, ...]
+    if isinstance(network, DeepLabelCNN):
+        example, inputs, outputs = (torch.zeros(2, 1, 52, 52),), [_IMAGES], ["positions"]
+        axes = {name: {0: "images"} for name in (*inputs, *outputs)}
+        hand = {name: value.tolist() for name, value in asdict(network.mean_hand.get()).items()}
+        properties[_CNN] = json.dumps({"config": asdict(network.config), "mean_hand": hand})
+    else:
+        example = torch.randn(2, 5, 3), torch.tensor([[True] * 5, [True] * 4 + [False]])
+        inputs, outputs = list(_INPUTS), list(_OUTPUTS)
+        axes = {name: {0: "frames", 1: "points"} for name in _INPUTS}
+        axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
     with atomic_write(path) as temporary, warnings.catch_warnings():
         # The newer exporter needs another package and fixes the sizes of expanded arrays.
         warnings.simplefilter("ignore")
@@ -96,13 +123,13 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
             network.eval(),
             example,
             str(temporary),
-            input_names=list(_INPUTS),
-            output_names=list(_OUTPUTS),
+            input_names=inputs,
+            output_names=outputs,
             dynamic_axes=axes,
             opset_version=_OPSET,
             dynamo=False,
         )
         model = onnx.load(str(temporary))
-        onnx.helper.set_model_props(model, {_NAMES: json.dumps(list(marker_names))})
+        onnx.helper.set_model_props(model, properties)
         onnx.checker.check_model(model, full_check=True)
         onnx.save(model, str(temporary))

@@ -11,7 +11,7 @@ from gloves.layout import load_layout
 from handsim.errors import WeightsError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
-from train.config import Kind, SetLabelerConfig
+from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
+_CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
 
 
@@ -72,7 +73,7 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     try:
         content = json.loads(card.read_text(encoding="utf-8"))
         names = tuple(content["marker_names"])
-        network = new_network(content.get("labeler", "set"), SetLabelerConfig(**content["network"]))
+        network = new_network(_CONFIGS[content.get("labeler", "set")](**content["network"]))
         network.load_state_dict(load_file(weights))
     except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise WeightsError(
@@ -83,15 +84,15 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     return network, content
 
 
-def save_network(
-    folder: Path, kind: Kind, network: nn.Module, config: SetLabelerConfig, card: dict[str, Any]
-) -> None:
+def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None:
     """Write weights and model card; `card` holds at least `marker_names`."""
     from safetensors.torch import save_file
 
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     with atomic_write(folder / WEIGHTS) as temporary:
         save_file(tensors, temporary)
+    config: NetworkConfig = network.config  # type: ignore[assignment]
+    kind = "cnn" if isinstance(config, CNNConfig) else "set"
     save_json(folder / CARD, {"labeler": kind, "network": dataclasses.asdict(config), **card})
 
 

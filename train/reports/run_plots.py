@@ -45,7 +45,7 @@ def draw_curves(figure: Figure, history: History) -> None:
         axis(LogFormatter(minor_thresholds=(2.0, 0.5)))
     upper.set_ylabel("loss")
     if history.accuracies:
-        seen, accuracy = np.array(history.accuracies, dtype=np.float64).T
+        seen, _, accuracy = np.array(history.accuracies, dtype=np.float64).T
         middle.plot(seen, 100.0 * accuracy, "o-", color=WARM, linewidth=1.6, markersize=4.5)
         middle.annotate(f"{100.0 * accuracy[-1]:.2f}", (seen[-1], 100.0 * accuracy[-1]), (0, -12),
                         textcoords="offset points", ha="right", color=WARM, weight="bold")  # fmt: skip

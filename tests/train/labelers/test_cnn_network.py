@@ -10,15 +10,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train.labelers.cnn_network import DeepLabelCNN, match_positions, position_loss
-from train.labelers.depth_image import depth_images, view_rotations
-from train.labelers.matching import GHOST
+from train.config import CNNConfig
+from train.labelers.cnn_network import DeepLabelCNN, position_loss
+from train.labelers.depth_image import depth_images
+from train.labelers.matching import GHOST, match_distances
+from train.labelers.views import random_views
 
 
 @pytest.fixture(scope="module")
 def network():
     torch.manual_seed(0)
-    return DeepLabelCNN(19).eval()
+    return DeepLabelCNN(CNNConfig()).eval()
 
 
 def test_layers_are_those_of_table_1(network):
@@ -30,9 +32,10 @@ def test_layers_are_those_of_table_1(network):
         if isinstance(layer, torch.nn.Conv2d | torch.nn.Linear):
             filters.append(tuple(layer.weight.shape))
     with torch.inference_mode():
-        positions = network(torch.rand(2, 1, 52, 52))
-    assert positions.shape == (2, 19, 3)
-    assert inputs == [
+        images = torch.rand(2, 1, 52, 52)
+        assert network.positions(network.features(images)).shape == (2, 57)
+        assert network(images).shape == (2, 19, 3)
+    assert inputs[:9] == [
         (1, 52, 52),
         (64, 50, 50),
         (64, 48, 48),
@@ -66,19 +69,16 @@ def test_parameters_add_up(network):
     count = sum(parameter.numel() for parameter in network.parameters())
     assert count == weights + biases + normalization == 21_760_121
     with torch.device("meta"):
-        sparse = sum(parameter.numel() for parameter in DeepLabelCNN(13).parameters())
+        sparse = sum(parameter.numel() for parameter in DeepLabelCNN(CNNConfig(num_labels=13)).parameters())
     assert count - sparse == 6 * 3 * (2048 + 1)
 
 
-def test_loss_is_smooth_l1_over_present_markers():
-    predicted = torch.zeros(1, 3, 3, requires_grad=True)
-    targets = torch.tensor([[[0.5, 0.0, -0.5], [3.0, 0.0, 0.0], [torch.nan, torch.nan, torch.nan]]])
-    loss = position_loss(predicted, targets, torch.tensor([[True, True, False]]))
-    assert torch.isclose(loss, torch.tensor((0.125 + 0.125 + 2.5) / 6))
-    loss.backward()
-    assert torch.isfinite(predicted.grad).all()
-    assert (predicted.grad[0, 2] == 0).all()
-    assert position_loss(predicted, targets, torch.zeros(1, 3, dtype=torch.bool)) == 0
+def test_loss_is_smooth_l1_with_a_knee():
+    predicted = torch.zeros(1, 2, 3)
+    targets = torch.tensor([[[0.5, 0.0, -0.5], [3.0, 0.0, 0.0]]])
+    assert torch.isclose(position_loss(predicted, targets), torch.tensor((0.125 + 0.125 + 2.5) / 6))
+    bent = (0.5 - 0.05) * 2 + 3.0 - 0.05
+    assert torch.isclose(position_loss(predicted, targets, knee=0.1), torch.tensor(bent / 6))
 
 
 @given(seed=st.integers(0, 10_000), count=st.integers(0, 4), num_labels=st.integers(1, 3))
@@ -97,25 +97,24 @@ def test_no_matching_is_cheaper(seed, count, num_labels):
             for point, label in zip(points, labels, strict=True)
         )
 
-    labels = match_positions(predicted, points, reject)
+    labels = match_distances(np.linalg.norm(points[:, None] - predicted, axis=-1), reject)
     assert labels.shape == (count,)
     assert np.isclose(
         cost(labels.tolist()), min(map(cost, itertools.product(range(-1, num_labels), repeat=count)))
     )
 
 
-def test_matching_rejects_what_is_far_or_missing():
-    predicted = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
-    points = np.array([[0.2, 0.016, 0], [0.1, 0.014, 0], [np.nan] * 3, [0.1, 0.001, 0]])
-    assert match_positions(predicted, points).tolist() == [-1, -1, -1, 1]
-    assert match_positions(predicted, points, reject=0.02).tolist() == [2, -1, -1, 1]
+def test_matching_rejects_what_is_far():
+    distances = np.array([[0.016, 0.1], [0.014, 0.1], [0.1, 0.001]])
+    assert match_distances(distances, 0.015).tolist() == [-1, 0, 1]
+    assert match_distances(distances[[0, 2]], 0.015).tolist() == [-1, 1]
+    assert match_distances(distances[[0, 2]], 0.02).tolist() == [0, 1]
 
 
 def test_matching_counts_distances_not_their_squares():
     """0 and 8.1 mm beat 4 and 5 mm, whose squares are the lesser."""
-    predicted = np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.0]])
-    points = np.array([[0.004, 0.0, 0.0], [0.007, 0.004, 0.0]])
-    assert match_positions(predicted, points).tolist() == [1, 0]
+    distances = np.array([[0.004, 0.0], [0.0081, 0.005]])
+    assert match_distances(distances, 0.015).tolist() == [1, 0]
 
 
 def test_network_learns_a_few_clouds_by_heart(rng):
@@ -125,15 +124,15 @@ def test_network_learns_a_few_clouds_by_heart(rng):
     """
     points = rng.uniform(-0.1, 0.1, size=(8, 19, 3))
     present = np.ones((8, 19), dtype=bool)
-    images, frames = depth_images(points, present, view_rotations(points, present, policy="random", rng=rng))
+    images, frames = depth_images(points, present, random_views(8, rng=rng))
     inputs = torch.from_numpy(images)[:, None]
     targets = torch.from_numpy(frames.normalize(points)).float()
     torch.manual_seed(0)
-    network = DeepLabelCNN(19)
+    network = DeepLabelCNN(CNNConfig())
     optimizer = torch.optim.Adam(network.parameters(), lr=5e-5)
     losses = []
     for _ in range(12):
-        loss = position_loss(network(inputs), targets, torch.from_numpy(present))
+        loss = position_loss(network(inputs), targets)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

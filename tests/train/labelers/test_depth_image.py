@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from handsim.errors import HandSimError
 from handsim.space.transforms import quaternion_matrix, random_quaternions
-from train.labelers.depth_image import SMALLEST_EXTENT, depth_images, view_rotations
+from train.labelers.depth_image import SMALLEST_EXTENT, depth_images
+from train.labelers.views import MIRROR_IMAGE, random_views, spread_views
 
 STRAIGHT = np.eye(3)[None]
 seeds = st.integers(0, 100_000)
@@ -139,9 +139,8 @@ def test_nearer_point_keeps_the_pixel(order):
     assert np.isclose(image[26, 5], 0.1 + 0.9 * 0.7)
 
 
-@pytest.mark.parametrize("policy", ["random", "random10"])
 @pytest.mark.parametrize("shape", ["nothing", "one", "equal", "line", "plane"])
-def test_degenerate_clouds(shape, policy, rng):
+def test_degenerate_clouds(shape, rng):
     points = rng.uniform(-0.1, 0.1, size=(1, 6, 3)) + 1.0
     present = everything(points)
     if shape == "nothing":
@@ -154,7 +153,7 @@ def test_degenerate_clouds(shape, policy, rng):
         points[..., 1:] = 0.0
     else:
         points[..., 2] = 0.0
-    for views in (STRAIGHT, view_rotations(points, present, policy=policy, rng=rng)):
+    for views in (STRAIGHT, random_views(1, rng=rng), spread_views(points, present, rng=rng)):
         images, frames = depth_images(points, present, views)
         assert np.isfinite(images).all()
         assert images.any() == (shape != "nothing")
@@ -167,42 +166,13 @@ def test_degenerate_clouds(shape, policy, rng):
 
 def test_no_clouds_at_all(rng):
     points, present = np.zeros((0, 5, 3)), np.zeros((0, 5), dtype=bool)
-    views = view_rotations(points, present, policy="random10", rng=rng)
-    assert depth_images(points, present, views)[0].shape == (0, 52, 52)
+    assert depth_images(points, present, spread_views(points, present, rng=rng))[0].shape == (0, 52, 52)
 
 
-@pytest.mark.parametrize("policy", ["random", "random10"])
-def test_views_are_rotations_and_follow_the_seed(policy, rng):
-    points, present = cloud(rng, batch=8)
-    views = view_rotations(points, present, policy=policy, rng=np.random.default_rng(4))
-    np.testing.assert_allclose(
-        views @ views.swapaxes(1, 2), np.broadcast_to(np.eye(3), (8, 3, 3)), atol=1e-12
-    )
-    np.testing.assert_allclose(np.linalg.det(views), 1.0)
-    same = view_rotations(points, present, policy=policy, rng=np.random.default_rng(4))
-    np.testing.assert_array_equal(views, same)
-
-
-def test_best_of_ten_spreads_best(rng):
-    points, present = cloud(rng, batch=20)
-    points[..., 2] *= 0.1
-    chosen = view_rotations(points, present, policy="random10", rng=np.random.default_rng(7))
-    candidates = quaternion_matrix(random_quaternions(10, rng=np.random.default_rng(7)))
-    for index, view in enumerate(chosen):
-        seen = points[index, present[index]]
-        spreads = [np.linalg.eigvalsh(np.cov((seen @ turn.T)[:, :2].T))[0] for turn in candidates]
-        np.testing.assert_array_equal(view, candidates[np.argmax(spreads)])
-
-
-def test_a_line_is_seen_from_the_side(rng):
-    points = np.zeros((20, 5, 3))
-    points[..., 0] = np.linspace(-0.1, 0.1, 5)
-    views = view_rotations(points, everything(points), policy="random10", rng=np.random.default_rng(7))
-    candidates = quaternion_matrix(random_quaternions(10, rng=np.random.default_rng(7)))
-    np.testing.assert_allclose(np.abs(views[:, 2, 0]), np.abs(candidates[:, 2, 0]).min())
-
-
-def test_unknown_policy(rng):
-    points, present = cloud(rng)
-    with pytest.raises(HandSimError, match=r"unknown view policy 'random20'.*random, random10"):
-        view_rotations(points, present, policy="random20", rng=rng)
+def test_a_mirrored_view_shows_the_mirrored_cloud(rng):
+    points, present = cloud(rng, batch=4)
+    views = random_views(4, rng=rng)
+    mirrored = depth_images(points, present, MIRROR_IMAGE[:, None] * views)[0]
+    mirrored_cloud = (points @ views.swapaxes(1, 2)) * MIRROR_IMAGE
+    straight = np.broadcast_to(np.eye(3), (4, 3, 3))
+    np.testing.assert_allclose(mirrored, depth_images(mirrored_cloud, present, straight)[0], atol=1e-5)

@@ -7,16 +7,18 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.layout import load_layout
 from handsim.app.cli import main
 from handsim.errors import HandSimError, WeightsError
-from train.config import SetLabelerConfig
-from train.labelers.kinds import new_network
+from train.config import CNNConfig, SetLabelerConfig
+from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
 from train.labelers.storage import load_labeler
+from train.labelers.views import MeanHand
 
 NO_TORCH = """
 import sys
@@ -72,10 +74,18 @@ def test_damaged_files_are_told(exported, tmp_path):
         OnnxLabeler(tmp_path / "none.onnx")
 
 
-def test_another_kind_of_network_is_told(tmp_path):
-    with pytest.raises(HandSimError, match="only labelers of kind 'set' can be exported"):
-        export_onnx(new_network("cnn", SetLabelerConfig()), ("a",) * 19, tmp_path / "cnn.onnx")
-    assert not list(tmp_path.iterdir())
+def test_the_papers_network_labels_alike_in_both_runtimes(tmp_path, rng):
+    torch.manual_seed(0)
+    network = new_network(CNNConfig(num_labels=4, reject=0.03))
+    hands = rng.normal(scale=0.05, size=(50, 4, 3))
+    network.mean_hand.set(MeanHand.of_clouds(hands, hands, np.ones((50, 4), dtype=bool)))
+    export_onnx(network, tuple("abcd"), tmp_path / "cnn.onnx")
+    frames = [hands[0], hands[1, :3]]
+    by_torch = labeler_of(network, tuple("abcd")).label_frames(frames)
+    found = OnnxLabeler(tmp_path / "cnn.onnx").label_frames(frames)
+    for labeling, expected in zip(found, by_torch, strict=True):
+        assert labeling.labels.tolist() == expected.labels.tolist()
+        np.testing.assert_allclose(labeling.confidence, expected.confidence, atol=1e-4)
 
 
 @pytest.mark.parametrize("missing", ["onnx", "onnxruntime"])
@@ -85,6 +95,6 @@ def test_what_is_not_installed_is_told(exported, tmp_path, monkeypatch, missing)
         HandSimError, match=rf"needs {missing}; install it with: pip install 'handsim\[onnx\]'"
     ):
         if missing == "onnx":
-            export_onnx(new_network("set", SetLabelerConfig()), ("a",) * 19, tmp_path / "x.onnx")
+            export_onnx(new_network(SetLabelerConfig()), ("a",) * 19, tmp_path / "x.onnx")
         else:
             OnnxLabeler(exported)

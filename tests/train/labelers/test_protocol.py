@@ -7,21 +7,29 @@ import pytest
 import torch
 
 from handsim.errors import ArgumentError
-from train.config import SetLabelerConfig
+from train.config import CNNConfig, SetLabelerConfig
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
 
 NAMES = tuple(f"marker{number}" for number in range(19))
 
 
-@pytest.fixture(scope="module", params=["set", "cnn", "onnx"])
+CONFIGS = {
+    "set": SetLabelerConfig(),
+    "cnn": CNNConfig(),
+    "cnn, random views": CNNConfig(views="random"),
+}
+
+
+@pytest.fixture(scope="module", params=[*CONFIGS, "set, onnx", "cnn, onnx"])
 def labeler(request, tmp_path_factory):
     torch.manual_seed(0)
-    if request.param == "onnx":
+    network = new_network(CONFIGS[request.param.removesuffix(", onnx")])
+    if "onnx" in request.param:
         path = tmp_path_factory.mktemp("onnx") / "labeler.onnx"
-        export_onnx(new_network("set", SetLabelerConfig()), NAMES, path)
+        export_onnx(network, NAMES, path)
         return OnnxLabeler(path)
-    return labeler_of(new_network(request.param, SetLabelerConfig()), NAMES)
+    return labeler_of(network, NAMES)
 
 
 def check(labeling, count):

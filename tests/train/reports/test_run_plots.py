@@ -27,8 +27,8 @@ pytestmark = pytest.mark.filterwarnings("error")
     "history",
     [
         History(),
-        History([(256, 3.0, 0.1)], [(256, 0.5)]),
-        History([(256, 3.0, 0.1), (512, 0.02, 0.1), (768, 1e-4, 0.0)], [(512, 1.0), (768, 1.0)]),
+        History([(256, 3.0, 0.1)], [(256, 0.1, 0.5)]),
+        History([(256, 3.0, 0.1), (512, 0.02, 0.1), (768, 1e-4, 0.0)], [(512, 0.1, 1.0), (768, 0.2, 1.0)]),
     ],
 )
 def test_curves_of_any_length_are_drawn(history):
