@@ -150,12 +150,12 @@ def default_config(labeler: Kind) -> TrainConfig:
         return TrainConfig()
     return TrainConfig(
         labeler="cnn",
-        samples=1_500_000,
-        batch=64,
+        samples=300_000,
+        batch=32,
         learning_rate=1e-3,
         average=0.99,
         average_every=16,
         precision="auto",
         jitter=0.003,
-        rig_share=0.0,
+        rig_share=0.2,
     )

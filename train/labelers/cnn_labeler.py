@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _REJECT: Final = 0.04  # cost of a point without a label before one is chosen [m]
 _SPREAD: Final = 0.005  # of the confidence before one is chosen [m]
-_ACCEPTED: Final = 0.008  # mean cost of a point from which no further view is tried [m]
+_ACCEPTED: Final = 0.01  # mean cost of a point from which no further view is tried [m]
 _TOGETHER: Final = (1, 2, 5)  # first views of a cloud that are tried at once
 _TURNS: Final = 2  # of each first view toward the mean hand
 _IMAGES: Final = 128  # that go through the network at once
