@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 _REJECT: Final = 0.04  # cost of a point without a label before one is chosen [m]
 _SPREAD: Final = 0.005  # of the confidence before one is chosen [m]
-_ACCEPTED: Final = 0.01  # mean cost of a point from which no further view is tried [m]
+_ACCEPTED: Final = 0.01  # mean distance of labeled points from which no further view is tried [m]
+_GHOSTS: Final = 2  # most points without a label then
 _TOGETHER: Final = (1, 2, 5)  # first views of a cloud that are tried at once
 _TURNS: Final = 2  # of each first view toward the mean hand
 _IMAGES: Final = 128  # that go through the network at once
@@ -34,6 +35,11 @@ class _Match(NamedTuple):
     """Of the points from the predicted markers [m]."""
     cost: float
     """Mean cost of a point [m], that of equation 1."""
+    accepted: bool
+    """Whether it fits so well that no further view is tried."""
+
+
+_NONE: Final = _Match(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.inf, False)
 
 
 class CNNLabeler:
@@ -71,15 +77,17 @@ class CNNLabeler:
         padded, present = pad_clouds(clouds)
         points = padded.astype(np.float64)
         views = self._first_views(points, present)
-        best: list[_Match | None] = [None] * len(clouds)
+        best = [_NONE] * len(clouds)
         pending = np.arange(len(clouds))
         for tried in np.split(np.arange(views.shape[1]), np.cumsum(_TOGETHER)):
             rows = np.repeat(pending, len(tried))
             predicted = self.predict(points[rows], present[rows], views[pending][:, tried].reshape(-1, 3, 3))
             for row, markers in zip(rows, predicted, strict=True):
                 best[row] = self._better(best[row], markers, points[row, present[row]])
-            pending = np.array([row for row in pending if _cost(best[row]) > _ACCEPTED], dtype=np.int64)
-        return [self._labeling(match) for match in best if match is not None]
+            pending = pending[[not best[row].accepted for row in pending]]
+            if not len(pending):
+                break
+        return [self._labeling(match) for match in best]
 
     def _first_views(
         self, points: NDArray[np.float64], present: NDArray[np.bool_]
@@ -116,15 +124,16 @@ class CNNLabeler:
             parts.append(frames.restore(self._positions(images[:, None]).astype(np.float64)))
         return np.concatenate(parts)
 
-    def _better(
-        self, best: _Match | None, markers: NDArray[np.float64], points: NDArray[np.float64]
-    ) -> _Match:
+    def _better(self, best: _Match, markers: NDArray[np.float64], points: NDArray[np.float64]) -> _Match:
         """The cheaper of a match and the best one with these predicted markers (M, 3) [m]."""
         distances = np.linalg.norm(points[:, None] - markers, axis=-1)
         labels = match_distances(distances, self._reject)
         costs = np.where(labels >= 0, distances[np.arange(len(points)), labels], self._reject)
-        match = _Match(labels, distances, float(costs.mean()) if len(costs) else 0.0)
-        return match if match.cost < _cost(best) else best or match
+        labeled = labels >= 0
+        near = len(points) == 0 or (labeled.any() and float(costs[labeled].mean()) <= _ACCEPTED)
+        accepted = bool(near and (~labeled).sum() <= _GHOSTS)
+        match = _Match(labels, distances, float(costs.mean()) if len(costs) else 0.0, accepted)
+        return match if match.cost < best.cost else best
 
     def _labeling(self, match: _Match) -> Labeling:
         """Labels, and the weight of each as a share of the weights of all labels of its point."""
@@ -133,7 +142,3 @@ class CNNLabeler:
         weights = np.exp(-(costs - costs.min(axis=1, keepdims=True)) / self._spread)
         taken = weights[np.arange(len(weights)), match.labels]  # GHOST, -1, is the last column
         return Labeling(match.labels, taken / weights.sum(axis=1))
-
-
-def _cost(match: _Match | None) -> float:
-    return np.inf if match is None else match.cost
