@@ -213,7 +213,7 @@ def test_an_interrupt_writes_what_there_is(capture, tmp_path):
 
 
 def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("track.commands.track.open_stream", functools.partial(open_stream, silence=0.2))
+    monkeypatch.setattr("track.commands.live.open_stream", functools.partial(open_stream, silence=0.2))
     take = load_take(capture.with_suffix(".truth.npz"))
     with ReplayServer(take.points[:1], take.ids[:1], 120.0) as server:
         arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]

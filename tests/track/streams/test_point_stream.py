@@ -223,9 +223,7 @@ def test_multicast_is_heard_on_loopback():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind((LOOPBACK, 0))
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind((LOOPBACK, 0))
-            port = probe.getsockname()[1]
+        port = sender.getsockname()[1]  # servers send from their data port
         with Puppet(ServerInfo("puppet", (4, 1), port, group)) as server:
             try:
                 stream = open_stream(server.url, silence=0.5)
