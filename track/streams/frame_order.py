@@ -1,7 +1,8 @@
 """Order and time of a stream's frames: what came late, twice or with a wild time is left out and counted.
 
 A frame goes on at once when it continues the stream: its time is later than that of the frame before by no
-more than its number or its arrival explains. Any other frame is held until the next one shows what it was:
+more than its number or its arrival explains, and its number by no more than its time. Any other frame is held
+until the next one shows what it was:
 
 - after a gap in the numbers the missing frame may still arrive, and goes first;
 - a wild time is followed by frames that continue the stream, and the held frame is left out;
@@ -23,6 +24,7 @@ _REORDERED: Final = 1.0  # [s]: a frame that is older by more belongs to a recor
 _BURST: Final = 0.5  # [s] from the last frame, within which frames of the same recording may arrive late
 _FIRST_SLACK: Final = 0.05  # [s]: tolerance of a frame's time while the interval is unknown
 _SLACK: Final = 0.001  # [s]: tolerance of time stamps beside half an interval
+_FASTEST: Final = 2000.0  # [Hz], of any stream
 _FIRST_WAIT: Final = 0.05  # [s] for which the first frame is held
 _GAP_INTERVALS: Final = 2.5  # for which a frame after a gap is held
 _GAP_WAIT: Final = 0.1  # [s], the most of it
@@ -50,7 +52,7 @@ class FrameOrder:
         self.late = 0
         """Number of frames that came twice or too late, which were left out."""
         self.wild = 0
-        """Number of frames with a wild time, which were left out."""
+        """Number of frames with a wild time or number, which were left out."""
         self.missed = 0
         """Number of frames that never arrived, by the frame numbers."""
         self.restarts = 0
@@ -125,7 +127,8 @@ class FrameOrder:
         """The stream continues: doubtful frames between the two were right, all others were wild."""
         doubtful, self._doubtful = self._doubtful, []
         for one in sorted(doubtful, key=lambda arrival: arrival.frame.time):
-            if last.frame.time < one.frame.time < new.frame.time:
+            ordered = last.frame.time < one.frame.time < new.frame.time
+            if ordered and last.frame.number <= one.frame.number <= new.frame.number:
                 yield self._pass(one)
             else:
                 self.wild += 1
@@ -171,17 +174,20 @@ class FrameOrder:
         return span == 0.0 or (-_REORDERED < span < 0.0 and new.at - last.at < _BURST)
 
     def _continues(self, last: Arrival, new: Arrival) -> bool:
-        """Whether the time of a frame follows that of another by no more than number or arrival explains."""
+        """Whether a frame follows another: time and number go on, by no more than they explain each other.
+
+        A longer time may also be explained by when the frame arrived.
+        """
         span, waited = new.frame.time - last.frame.time, new.at - last.at
+        steps = new.frame.number - last.frame.number
         if self._interval is None:
-            return 0.0 < span <= waited + _FIRST_SLACK
-        steps = max(new.frame.number - last.frame.number, 1)
-        return 0.0 < span <= max(waited, steps * self._interval) + 0.5 * self._interval + _SLACK
+            return 0.0 < span <= waited + _FIRST_SLACK and 0 <= steps <= _FASTEST * span + 1.0
+        longest = max(waited, max(steps, 1) * self._interval) + 0.5 * self._interval + _SLACK
+        return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
 
     def _missing(self, last: Arrival, new: Arrival) -> int:
         """The number of frames between two, as far as their times agree with their numbers."""
         steps = new.frame.number - last.frame.number
-        if self._interval is None:
-            return max(steps - 1, 0) if steps < _GAP_WAIT / _SLACK else 0
-        span = new.frame.time - last.frame.time
-        return max(min(steps, round(1.5 * span / self._interval)) - 1, 0)
+        if self._interval is not None:
+            steps = min(steps, round(1.5 * (new.frame.time - last.frame.time) / self._interval))
+        return max(steps - 1, 0)

@@ -30,6 +30,7 @@ SILENCE: Final = 2.0
 _PATIENCE: Final = 3.0  # [s] to wait for a server
 _RETRY: Final = 0.5  # [s] between requests to a server that does not answer
 _KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
+_DRAIN: Final = 1.0  # [s] for which packets that have arrived are read at the end, at most
 _STOP: Final = 0.2  # [s] between two looks at whether the stream shall end
 _BUFFER: Final = 1 << 20  # bytes of frames that may wait for the reader
 
@@ -103,6 +104,8 @@ class PointStream(Iterator[StreamedFrame]):
     ) -> None:
         self.server = server
         """The server's description of itself."""
+        self.packets = 0
+        """Number of packets that came."""
         self.damaged = 0
         """Number of damaged packets, which were left out."""
         self.foreign = 0
@@ -114,6 +117,7 @@ class PointStream(Iterator[StreamedFrame]):
         self._last: StreamedFrame | None = None
         self._ready: deque[Arrival] = deque()
         self._kept_alive = self._heard = time.monotonic()
+        self._drained = math.inf
 
     @property
     def late(self) -> int:
@@ -124,12 +128,12 @@ class PointStream(Iterator[StreamedFrame]):
         """Wait for the next frame; after each period of silence a silent frame."""
         quiet = time.monotonic() + self._silence
         while self._sockets:
-            if self._ended():
-                self._ready.extend(self.order.expire(math.inf))
             if self._ready:
                 self._last = _streamed(self._ready.popleft())
                 return self._last
             if self._ended():
+                if self._drain():
+                    continue
                 break
             self._receive(self._keep_alive(quiet))
             now = time.monotonic()
@@ -166,13 +170,26 @@ class PointStream(Iterator[StreamedFrame]):
         due = min(quiet, self._kept_alive + _KEEP_ALIVE, self.order.deadline, now + _STOP)
         return max(0.0, due - now)
 
-    def _receive(self, seconds: float) -> None:
-        """Wait for a packet, and line up the frames that go on with it."""
+    def _drain(self) -> bool:
+        """Take another of the packets that have arrived; return whether there may be more frames."""
+        now = time.monotonic()
+        self._drained = min(self._drained, now + _DRAIN)
+        if now < self._drained and self._receive(0.0):
+            return True
+        self._ready.extend(self.order.expire(math.inf))
+        return bool(self._ready)
+
+    def _receive(self, seconds: float) -> bool:
+        """Wait for a packet, and line up the frames that go on with it; return whether one came."""
         ready, _, _ = select.select(self._sockets, [], [], seconds)
         received = _receive(ready[0]) if ready else None
-        if received is None:
-            return
-        packet, sender = received
+        if received is not None:
+            self._take(*received)
+        return received is not None
+
+    def _take(self, packet: bytes, sender: tuple[str, int]) -> None:
+        """Line up the frames that go on with a packet."""
+        self.packets += 1
         if sender[0] != self._address[0] or sender[1] not in (self._address[1], self.server.data_port):
             self.foreign += 1
             return
