@@ -17,7 +17,7 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from gloves.optics.identities import number_runs
-from gloves.takes.tracked_take import LOST, STATUSES, TrackedTake
+from gloves.takes.tracked_take import STATUSES, TrackedTake, usual_rate
 from handsim.errors import CaptureError
 from handsim.hand.topology import NUM_QPOS
 from track.streams.point_stream import StreamedFrame
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 _LOOP_GAP: Final = 0.01
 """Time between the last frame of a recording and its first, when it starts again [s]."""
 _HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
+_MISSING: Final = {"points": np.nan, "ids": -1, "labels": -1, "confidence": np.nan}
+"""The arrays with an entry per point, and what stands where there is no point."""
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
@@ -75,7 +77,7 @@ def track_stream(
     """Track frames as they arrive, also from a live stream.
 
     During a silence of the stream the tracker gets frames without points, at the time that has passed. When
-    the stream's time runs back, as in a recording that starts again, the tracker's time continues.
+    the stream's time begins anew, as in a recording that starts again, the tracker's time continues.
 
     Args:
         frames: Frames in order of arrival.
@@ -91,13 +93,13 @@ def track_stream(
         if frame.silent:
             now += time.monotonic() - heard
         else:
-            heard = time.monotonic()
-            if now <= last:
-                ahead += last - now + _LOOP_GAP
-                now = last + _LOOP_GAP
+            waited, heard = time.monotonic() - heard, time.monotonic()
+            if now <= last or frame.restarted:
+                begin = last + max(_LOOP_GAP, waited) if last > -np.inf else 0.0
+                ahead += begin - now
+                now = begin
             last = now
-        timed = StreamedFrame(frame.number, now, frame.points, frame.ids, frame.silent)
-        yield timed, tracker.step(frame.points, frame.ids, now)
+        yield dataclasses.replace(frame, time=now), tracker.step(frame.points, frame.ids, now)
 
 
 def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
@@ -134,22 +136,22 @@ class TakeRecorder:
         self._hands = tracker.hands
         self._config = tracker.config
         self._bodies = tracker.bodies
-        self._frames: list[tuple[StreamedFrame, TrackedFrame]] = []
+        self._rows: list[dict[str, NDArray[Any]]] = []
 
     @property
     def num_frames(self) -> int:
         """Number of recorded frames."""
-        return len(self._frames)
+        return len(self._rows)
 
     @property
     def duration(self) -> float:
         """Time from the first frame to the last [s]."""
-        return self._frames[-1][0].time - self._frames[0][0].time if self._frames else 0.0
+        return float(self._rows[-1]["times"] - self._rows[0]["times"]) if self._rows else 0.0
 
     def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
         """Record a frame, unless it stands for a silence of the stream."""
         if not frame.silent:
-            self._frames.append((frame, tracked))
+            self._rows.append(frame_values(frame, tracked))
 
     def take(self, capture: Capture | None = None) -> TrackedTake:
         """The tracked take so far.
@@ -161,46 +163,52 @@ class TakeRecorder:
         Raises:
             CaptureError: There are too few frames to determine the rate of a stream.
         """
-        frames = [frame for frame, _ in self._frames]
-        tracked = [one for _, one in self._frames]
-        if not frames or (capture is None and len(frames) < 2):
-            raise CaptureError(f"{len(frames)} frames came, expected two or more")
-        times = np.array([frame.time for frame in frames])
-        counts = np.array([len(frame.points) for frame in frames])
+        rows = self._rows
+        if not rows or (capture is None and len(rows) < 2):
+            raise CaptureError(f"{len(rows)} frames came, expected two or more")
+        counts = np.array([len(row["points"]) for row in rows])
         present = np.arange(counts.max(initial=0)) < counts[:, None]
         if capture is not None:
-            present = np.isfinite(capture.positions[: len(frames), :, 0])
-        hands = [one.hands for one in tracked]
-        filled = np.zeros((len(frames), len(self._hands), hands[0][0].markers.shape[0]), dtype=bool)
-        for number, row in enumerate(hands):
-            for index, hand in enumerate(row):
-                filled[number, index, hand.filled] = True
+            present = np.isfinite(capture.positions[: len(rows), :, 0])
+        per_frame = {name: np.array([row[name] for row in rows]) for name in rows[0] if name not in _MISSING}
+        numbers = per_frame.pop("numbers")
         return TrackedTake(
-            rate=1.0 / float(np.median(np.diff(times))) if capture is None else capture.rate,
-            times=times,
+            rate=usual_rate(per_frame["times"]) if capture is None else capture.rate,
             hands=self._hands,
-            qpos=np.array([[hand.qpos for hand in row] for row in hands]),
-            status=np.array([[_NUMBERS[hand.status] for hand in row] for row in hands], dtype=np.int8),
-            rms=np.array([[hand.rms for hand in row] for row in hands]),
-            markers=np.array([[hand.markers for hand in row] for row in hands]),
-            filled=filled,
-            points=_spread(present, [frame.points for frame in frames], np.nan),
-            ids=_spread(present, [frame.ids for frame in frames], -1).astype(np.int32),
-            labels=_spread(present, [one.labels for one in tracked], -1).astype(np.int16),
-            confidence=_spread(present, [one.confidence for one in tracked], np.nan),
-            **self._body_tracks(tracked),
+            **per_frame,
+            **{
+                name: _spread(present, [row[name] for row in rows], missing)
+                for name, missing in _MISSING.items()
+            },
+            bodies=self._bodies,
             settings={"tracker": dataclasses.asdict(self._config)},
+            numbers=numbers if capture is None else None,
         )
 
-    def _body_tracks(self, tracked: Sequence[TrackedFrame]) -> dict[str, Any]:
-        shape = len(tracked), len(self._bodies)
-        poses, rms = np.full((*shape, 7), np.nan), np.full(shape, np.nan)
-        status = np.full(shape, LOST, dtype=np.int8)
-        for number, frame in enumerate(tracked):
-            for index, body in enumerate(frame.bodies):
-                poses[number, index] = np.concatenate([body.translation, body.rotation])
-                status[number, index], rms[number, index] = _NUMBERS[body.status], body.rms
-        return {"bodies": self._bodies, "body_poses": poses, "body_status": status, "body_rms": rms}
+
+def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
+    """A frame's entries of the arrays of a tracked take, by their names; those of points for its N points."""
+    hands, bodies = tracked.hands, tracked.bodies
+    filled = np.zeros((len(hands), len(hands[0].markers)), dtype=bool)
+    for row, hand in zip(filled, hands, strict=True):
+        row[hand.filled] = True
+    poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
+    return {
+        "times": np.array(frame.time),
+        "numbers": np.array(frame.number),
+        "qpos": np.array([hand.qpos for hand in hands]),
+        "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
+        "rms": np.array([hand.rms for hand in hands]),
+        "markers": np.array([hand.markers for hand in hands]),
+        "filled": filled,
+        "body_poses": np.array(poses).reshape(len(bodies), 7),
+        "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
+        "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
+        "points": frame.points,
+        "ids": frame.ids.astype(np.int32),
+        "labels": tracked.labels.astype(np.int16),
+        "confidence": tracked.confidence,
+    }
 
 
 def _spread(present: Bool[np.ndarray, "T N"], rows: list[NDArray[Any]], missing: float) -> NDArray[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -11,6 +12,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from gloves.takes.growing import GrownArchive, growing_path, is_growing
 from handsim.errors import CaptureError, HandSimError
 from handsim.files.atomic import atomic_write
 
@@ -27,6 +29,10 @@ _DAMAGE: Final = (
     RuntimeError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """Exceptions that reading a damaged file may raise."""
+
+
+class CutOffWarning(UserWarning):
+    """A recording was cut off: it is read up to its last whole half second."""
 
 
 def write_archive(
@@ -91,6 +97,13 @@ def archive_kind(path: Path) -> str:
 
 def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of any kind."""
+    if is_growing(path):
+        return _read_cut_off(path, kind)
+    if not path.exists() and growing_path(path).exists():
+        raise CaptureError(
+            f"{path}: no such file, but {growing_path(path)} is a recording that was cut off or is still "
+            "running, and can be read"
+        )
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
@@ -102,6 +115,24 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]
     except _DAMAGE as error:
         raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
     return header, arrays
+
+
+def _read_cut_off(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a recording that was not finished."""
+    try:
+        grown = GrownArchive(path)
+        arrays = grown.read()
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (*_DAMAGE, RecursionError) as error:
+        raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
+    if grown.num_frames < 2:
+        raise CaptureError(
+            f"{path}: a recording that was cut off with {grown.num_frames} frames, expected two or more"
+        )
+    told = f"{path}: a recording that was cut off or is still running; it has {grown.num_frames} frames"
+    warnings.warn(told, CutOffWarning, stacklevel=4)
+    return grown.header, arrays
 
 
 def check_shapes(expected: Iterable[tuple[np.ndarray, tuple[int, ...]]]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -13,6 +14,7 @@ from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import check_shapes, read_archive, write_archive
+from gloves.takes.growing import Column
 from handsim.errors import ArgumentError, choices
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, bridge_gaps
@@ -92,7 +94,9 @@ class TrackedTake:
     body_rms: Float[np.ndarray, "T B"]
     """3D RMS distance of the labeled markers from the pose's [m]; NaN without a fit."""
     settings: dict[str, Any]
-    """Settings that made it, as JSON."""
+    """Settings that made it, as JSON; of a stream, also how many frames are missing and were left out."""
+    numbers: Int[np.ndarray, "T"] | None = None
+    """The server's number of each frame of a stream, which shows where frames are missing; None otherwise."""
 
     def __post_init__(self) -> None:
         try:
@@ -150,24 +154,69 @@ class TrackedTake:
         Raises:
             OSError: The file cannot be written.
         """
-        header = {
-            "units": "metres, radians, seconds, wxyz, world frame",
-            "rate": self.rate,
-            "layouts": [dataclasses.asdict(hand.layout) for hand in self.hands],
-            "statuses": STATUSES,
-            "bodies": [{"name": body.name, "marker_names": body.marker_names} for body in self.bodies],
-            "settings": self.settings,
-        }
         arrays = {name: np.asarray(getattr(self, name), dtype) for name, dtype in _ARRAYS.items()}
-        arrays["hands"] = np.array([pack_hand(hand.shape) for hand in self.hands], dtype=HAND_DTYPE)
-        for name in _ATTACHMENT:
-            arrays[f"attachment_{name}"] = np.stack([getattr(hand.attachment, name) for hand in self.hands])
-        arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.positions for body in self.bodies)])
+        arrays |= {} if self.numbers is None else {NUMBERS: self.numbers}
+        arrays |= worn_arrays(self.hands, self.bodies)
+        header = take_header(self.hands, self.bodies, self.rate, self.settings)
         write_archive(path, KIND, SCHEMA, header, arrays)
+
+
+def take_header(
+    hands: Sequence[GloveFit], bodies: Sequence[MarkedBody], rate: float | None, settings: dict[str, Any]
+) -> dict[str, Any]:
+    """The header of a file, as JSON; without a rate that of a recording, whose rate is its usual one."""
+    return {
+        "units": "metres, radians, seconds, wxyz, world frame",
+        "rate": rate,
+        "layouts": [dataclasses.asdict(hand.layout) for hand in hands],
+        "statuses": STATUSES,
+        "bodies": [{"name": body.name, "marker_names": body.marker_names} for body in bodies],
+        "settings": settings,
+    }
+
+
+def worn_arrays(hands: Sequence[GloveFit], bodies: Sequence[MarkedBody]) -> dict[str, NDArray[Any]]:
+    """The arrays of a file that are no motion: hands, gloves and the bodies' markers."""
+    arrays: dict[str, NDArray[Any]] = {
+        "hands": np.array([pack_hand(hand.shape) for hand in hands], dtype=HAND_DTYPE)
+    }
+    for name in _ATTACHMENT:
+        arrays[f"attachment_{name}"] = np.stack([getattr(hand.attachment, name) for hand in hands])
+    arrays["body_places"] = np.concatenate([np.zeros((0, 3)), *(body.positions for body in bodies)])
+    return arrays
+
+
+def take_columns(hands: int, markers: int, bodies: int) -> tuple[Column, ...]:
+    """The columns of a recording of so many hands, markers of each glove, and bodies."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "times": (),
+        "qpos": (hands, NUM_QPOS),
+        "status": (hands,),
+        "rms": (hands,),
+        "markers": (hands, markers, 3),
+        "filled": (hands, markers),
+        "body_poses": (bodies, 7),
+        "body_status": (bodies,),
+        "body_rms": (bodies,),
+        "points": (3,),
+    }
+    missing = {"points": np.nan, "ids": -1, "labels": -1, "confidence": np.nan}
+    columns = [
+        Column(name, f"<{dtype}", shapes.get(name, ()), missing.get(name)) for name, dtype in _ARRAYS.items()
+    ]
+    return (*columns, Column(NUMBERS, "<i8", ()))
+
+
+def usual_rate(times: Float[np.ndarray, "T"]) -> float:
+    """Frames per second of a stream: the median one of its first quarter of an hour."""
+    return 1.0 / float(np.median(np.diff(times[:RATED_FRAMES])))
 
 
 def load_tracked_take(path: Path) -> TrackedTake:
     """Read the `.npz` that `handsim track` or `TrackedTake.save` wrote; nothing is unpickled.
+
+    The `.npz.part` of a live recording that was cut off, or is still running, is read up to its last whole
+    half second; a `CutOffWarning` says so.
 
     Args:
         path: The file.
@@ -178,9 +227,13 @@ def load_tracked_take(path: Path) -> TrackedTake:
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
     """
-    return read_archive(path, KIND, SCHEMA, _unpack)
+    return read_archive(path, KIND, SCHEMA, unpack_take)
 
 
+NUMBERS: Final = "numbers"
+"""The name of the frame numbers, which only the takes of streams have."""
+RATED_FRAMES: Final = 100_000
+"""Frames of a stream that its rate is measured on."""
 _ARRAYS: Final = {
     "times": "f8",
     "qpos": "f8",
@@ -200,7 +253,8 @@ _ARRAYS: Final = {
 _ATTACHMENT: Final = ("points", "normals", "bone_indices", "bone_weights")
 
 
-def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTake:
+def unpack_take(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTake:
+    """A take from the header and the arrays of a file; any exception means that they are damaged."""
     if tuple(header["statuses"]) != STATUSES:
         raise ValueError("other statuses")
     hands = []
@@ -215,10 +269,11 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTak
     if any(arrays[name].dtype != dtype for name, dtype in _ARRAYS.items()):
         raise ValueError("numbers of another type")
     return TrackedTake(
-        rate=float(header["rate"]),
+        rate=usual_rate(arrays["times"]) if header["rate"] is None else float(header["rate"]),
         hands=tuple(hands),
         bodies=tuple(MarkedBody(*name, markers) for name, markers in zip(names, positions, strict=True)),
         settings=header["settings"],
+        numbers=arrays.get(NUMBERS),
         **{name: arrays[name] for name in _ARRAYS},
     )
 
@@ -248,6 +303,7 @@ def _check(take: TrackedTake) -> None:
             (take.body_poses, (frames, bodies, 7)),
             (take.body_status, (frames, bodies)),
             (take.body_rms, (frames, bodies)),
+            *([] if take.numbers is None else [(take.numbers, (frames,))]),
         ]
     )
     if not 0.0 < take.rate < np.inf or not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():

@@ -5,7 +5,8 @@
 - presets: commands whose defaults come from a preset
 - demo: what the steps of `handsim demo` share
 - progress: the progress bar of all commands
-- interrupts: Ctrl-C as a flag that a loop reads
+- live_status: one line of status, renewed in place
+- interrupts: Ctrl-C and other ends as a flag that a loop reads
 - workers: numbered jobs in worker processes
 - system_packages: names of system packages that pip cannot install
 - page: one HTML page of pictures and figures

@@ -4,6 +4,7 @@
 `body`: `handsim body`, a rigid body's markers as a file.
 `calibrate`: `handsim calibrate`, the user's hands and gloves from a capture.
 `track`: `handsim track`, a tracked take from a capture or a live stream.
+`live`: its live part.
 `reproduce`: `handsim reproduce`, the paper's tables.
 `demo`: the step of `handsim demo` that tracks.
 """

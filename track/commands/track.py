@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 import tyro
@@ -18,17 +18,16 @@ from gloves.captures.formats import WRITABLE, check_suffix, read_capture, write_
 from gloves.captures.markers import labeled_capture
 from gloves.fit import GloveFit
 from gloves.takes.take import SUFFIX
-from gloves.takes.tracked_take import TrackedTake
-from handsim.app.interrupts import interrupt_flag
+from gloves.takes.tracked_take import TrackedTake, load_tracked_take
 from handsim.app.progress import progress_bar
-from handsim.errors import ArgumentError, CaptureError
+from handsim.errors import ArgumentError
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import TakeRecorder, track_capture, track_stream, warm_up
+from track.capture_tracking import track_capture, warm_up
+from track.commands.live import TrackedSource, track_live
 from track.commands.user_options import BOTH, Size, calibrated_users, uncalibrated_users
 from track.evaluation.take_summary import print_line, summarize
-from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
@@ -37,7 +36,7 @@ from train.labelers.storage import labeler_for_glove
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_REFRESH: Final = 0.2  # [s] between updates of a live stream's status
+_TIMED: Final = 100_000  # frames whose computing time is kept
 
 
 def track(
@@ -60,7 +59,7 @@ def track(
         capture: A .trc, .c3d or Motive .csv file; its names are not used.
         out: The tracked take, a .npz file.
         live: Address of a NatNet server instead of a capture: natnet://host or natnet://host:port. Ctrl-C
-            ends it, and the frames until then are written.
+            or the end of the terminal ends it. Frames are written as they come, to OUT.part until then.
         seconds: How long to record a live stream [s].
         glove: Marker layout: a shipped name or the path of a .toml file; its labeler is used.
         size: Size of the hands; M when neither this nor --shape is given.
@@ -83,19 +82,25 @@ def track(
     with Console(stderr=True).status("getting ready"):
         warm_up(user, network)
         timed = TimedTracker(user, network, bodies)
-    take, notes = _track_live(str(live), seconds, timed) if source is None else _track_file(source, timed)
     settings = {
         "capture": live if capture is None else capture.name,
         "glove": glove,
         "user": size or "M" if shape is None else shape.name,
         "labeler": labeler or glove,
     }
-    take = dataclasses.replace(take, settings={**take.settings, **settings})
-    take.save(out)
+    if source is None:
+        tracked = track_live(str(live), seconds, timed, out, settings)
+    else:
+        tracked = _track_file(source, timed, out, settings)
     if labeled is not None:
-        write_capture(labeled, labeled_points(take))
-    print_line(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
-    for line in (*summarize(take), *notes, f"{1e3 * np.median(timed.seconds):.2f} ms per frame"):
+        write_capture(labeled, labeled_points(tracked.take if tracked.whole else load_tracked_take(out)))
+    rate, frames = tracked.take.rate, tracked.num_frames
+    print_line(f"{out}: {frames} frames, {frames / rate:.1f} s at {rate:.4g} Hz")
+    for line in (
+        *tracked.notes,
+        *summarize(tracked.take),
+        f"{1e3 * np.median(timed.seconds):.2f} ms per frame",
+    ):
         print_line(line)
 
 
@@ -112,8 +117,8 @@ class TimedTracker(Tracker):
         self, hands: Sequence[GloveFit], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
     ) -> None:
         super().__init__(hands, labeler, bodies)
-        self.seconds: list[float] = []
-        """Computing time of each frame [s]."""
+        self.seconds: deque[float] = deque(maxlen=_TIMED)
+        """Computing time of each of the last frames [s]."""
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
         """Track the next frame, see `Tracker.step`."""
@@ -149,47 +154,14 @@ def _check_options(
         check_suffix(labeled, WRITABLE)
 
 
-def _track_file(source: Capture, timed: TimedTracker) -> tuple[TrackedTake, tuple[str, ...]]:
-    """The take of a capture, and no notes."""
+def _track_file(source: Capture, timed: TimedTracker, out: Path, settings: dict[str, Any]) -> TrackedSource:
+    """Track a capture and write the take."""
     with progress_bar("frames") as (bar, task):
         take = track_capture(
             source,
             timed,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    return take, ()
-
-
-def _track_live(url: str, seconds: float | None, timed: TimedTracker) -> tuple[TrackedTake, tuple[str, ...]]:
-    """The take of a stream until it ends, time is up or the user interrupts; notes on frames left out."""
-    recorder = TakeRecorder(timed)
-    console = Console(stderr=True)
-    with (
-        closing(open_stream(url)) as stream,
-        console.status("waiting for the first frame") as status,
-        interrupt_flag() as interrupted,  # the frames so far are kept
-    ):
-        start, shown = perf_counter(), 0.0
-        for frame, tracked in track_stream(stream, timed):
-            recorder.add(frame, tracked)
-            elapsed = perf_counter() - start if frame.silent else recorder.duration
-            if interrupted() or (seconds is not None and elapsed >= seconds):
-                break
-            if frame.silent or perf_counter() > shown + _REFRESH:
-                shown = perf_counter()
-                status.update(_status_line(frame, tracked))
-    if recorder.num_frames < 2:
-        raise CaptureError(f"{url}: {recorder.num_frames} frames came, expected two or more")
-    notes = []
-    if stream.late or stream.damaged:
-        notes.append(f"left out: {stream.late} frames that came late or twice, {stream.damaged} damaged ones")
-    return recorder.take(), tuple(notes)
-
-
-def _status_line(frame: StreamedFrame, tracked: TrackedFrame) -> str:
-    """Status of a live stream, in one line."""
-    if frame.silent:
-        return "no frames arrive; is the server playing?"
-    words = [f"{hand.side} {hand.status.value}" for hand in tracked.hands]
-    words += [f"{body.name} {body.status.value}" for body in tracked.bodies]
-    return f"frame {frame.number}: {', '.join(words)}; Ctrl-C ends it and writes the take"
+    take = dataclasses.replace(take, settings={**take.settings, **settings})
+    take.save(out)
+    return TrackedSource(take, take.num_frames)

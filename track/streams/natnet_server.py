@@ -75,6 +75,8 @@ class ReplayServer:
         self._socket.setblocking(False)
         self._port: int = self._socket.getsockname()[1]
         self._clients: dict[tuple[str, int], float] = {}  # and the time of their last packets
+        self.sent = 0
+        """Number of frames that were sent so far."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="natnet replay", daemon=True)
         self._thread.start()
@@ -110,15 +112,16 @@ class ReplayServer:
         self.close()
 
     def _serve(self) -> None:
-        start, number = 0.0, 0
+        start = 0.0
         while not self._ended.is_set():
+            number = self.sent
             if not self._clients:
                 start = time.monotonic() - number / self._rate  # continue at this frame
             due = start + number / self._rate if number < len(self._points) else np.inf
             self._answer(min(0.05, max(0.0, due - time.monotonic())))
             if self._clients and time.monotonic() >= due:
                 self._send_all(natnet.pack_frame(self._frame(number), self._version))
-                number += 1
+                self.sent += 1
 
     def _frame(self, number: int) -> MarkerFrame:
         there = np.isfinite(self._points[number]).all(axis=1)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ipaddress
+import math
 import os
 import select
 import socket
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
@@ -17,6 +19,7 @@ import numpy as np
 
 from handsim.errors import CaptureError
 from track.streams import natnet
+from track.streams.frame_order import Arrival, FrameOrder
 from track.streams.natnet import COMMAND_PORT, DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
 
 if TYPE_CHECKING:
@@ -27,7 +30,8 @@ SILENCE: Final = 2.0
 _PATIENCE: Final = 3.0  # [s] to wait for a server
 _RETRY: Final = 0.5  # [s] between requests to a server that does not answer
 _KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
-_REORDERED: Final = 1.0  # [s]: when time runs back by more, a recording has started again
+_DRAIN: Final = 1.0  # [s] for which packets that have arrived are read at the end, at most
+_STOP: Final = 0.2  # [s] between two looks at whether the stream shall end
 _BUFFER: Final = 1 << 20  # bytes of frames that may wait for the reader
 
 
@@ -45,15 +49,24 @@ class StreamedFrame:
     """The server's ID of each point, -1 where it gives none."""
     silent: bool = False
     """No frame arrived for a while: there are no points, and number and time are those of the last frame."""
+    restarted: bool = False
+    """The server's time began anew: it does not continue that of the frame before."""
 
 
-def open_stream(url: str, *, local: str | None = None, silence: float = SILENCE) -> PointStream:
+def open_stream(
+    url: str,
+    *,
+    local: str | None = None,
+    silence: float = SILENCE,
+    ended: Callable[[], bool] = lambda: False,
+) -> PointStream:
     """Connect to a NatNet server.
 
     Args:
         url: `natnet://host` or `natnet://host:port`, with the port for commands.
         local: Address of the network card to listen at; the one that leads to the host when not given.
         silence: Time without a frame after which the stream yields a silent frame [s].
+        ended: The stream ends when this is true; it is asked several times a second.
 
     Raises:
         CaptureError: The address is invalid, no server answers, or its NatNet is older than 3.0.
@@ -71,38 +84,61 @@ def open_stream(url: str, *, local: str | None = None, silence: float = SILENCE)
     except BaseException:
         commands.close()
         raise
-    return PointStream(sockets, address, info, silence)
+    return PointStream(sockets, address, info, silence, ended)
 
 
 class PointStream(Iterator[StreamedFrame]):
     """Iterator of the frames of a stream; the end of a `with` block or `close` ends it.
 
-    When frames are read more slowly than they arrive, up to a megabyte of them waits.
+    Packets are taken from the server's address, and its ports for commands and for data, only. When frames
+    are read more slowly than they arrive, up to a megabyte of them waits.
     """
 
     def __init__(
-        self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo, silence: float
+        self,
+        sockets: list[socket.socket],
+        address: tuple[str, int],
+        server: ServerInfo,
+        silence: float,
+        ended: Callable[[], bool],
     ) -> None:
         self.server = server
         """The server's description of itself."""
+        self.packets = 0
+        """Number of packets that came."""
         self.damaged = 0
         """Number of damaged packets, which were left out."""
-        self.late = 0
-        """Number of frames that came twice or after a newer one, which were left out."""
-        self._sockets, self._address, self._silence = sockets, address, silence
+        self.foreign = 0
+        """Number of packets of other senders, which were left out."""
+        self.order = FrameOrder()
+        """Counts frames that are missing, came late or had a wild time."""
+        self._sockets, self._address, self._silence, self._ended = sockets, address, silence, ended
         self._version = min(server.version, natnet.NEWEST)
         self._last: StreamedFrame | None = None
+        self._ready: deque[Arrival] = deque()
         self._kept_alive = self._heard = time.monotonic()
+        self._drained = math.inf
+
+    @property
+    def late(self) -> int:
+        """Number of frames that came twice or after newer ones, which were left out."""
+        return self.order.late
 
     def __next__(self) -> StreamedFrame:
         """Wait for the next frame; after each period of silence a silent frame."""
         quiet = time.monotonic() + self._silence
         while self._sockets:
-            frame = self._receive(self._keep_alive(quiet))
-            if frame is not None:
-                self._last, self._heard = frame, time.monotonic()
-                return frame
-            if time.monotonic() >= quiet:
+            if self._ready:
+                self._last = _streamed(self._ready.popleft())
+                return self._last
+            if self._ended():
+                if self._drain():
+                    continue
+                break
+            self._receive(self._keep_alive(quiet))
+            now = time.monotonic()
+            self._ready.extend(self.order.expire(now))
+            if now >= quiet and not self._ready:
                 number, last = (self._last.number, self._last.time) if self._last else (0, 0.0)
                 return StreamedFrame(number, last, np.empty((0, 3)), np.empty(0, dtype=np.int64), silent=True)
         raise StopIteration
@@ -131,28 +167,45 @@ class PointStream(Iterator[StreamedFrame]):
             if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
                 _send(self._sockets[0], natnet.pack_connect(), self._address)
             self._kept_alive = now
-        return max(0.0, min(quiet, self._kept_alive + _KEEP_ALIVE) - now)
+        due = min(quiet, self._kept_alive + _KEEP_ALIVE, self.order.deadline, now + _STOP)
+        return max(0.0, due - now)
 
-    def _receive(self, seconds: float) -> StreamedFrame | None:
-        """The frame of the next packet; None without a packet or without a valid frame in it."""
+    def _drain(self) -> bool:
+        """Take another of the packets that have arrived; return whether there may be more frames."""
+        now = time.monotonic()
+        self._drained = min(self._drained, now + _DRAIN)
+        if now < self._drained and self._receive(0.0):
+            return True
+        self._ready.extend(self.order.expire(math.inf))
+        return bool(self._ready)
+
+    def _receive(self, seconds: float) -> bool:
+        """Wait for a packet, and line up the frames that go on with it; return whether one came."""
         ready, _, _ = select.select(self._sockets, [], [], seconds)
-        packet = _receive(ready[0], self._address[0]) if ready else None
-        if packet is None:
-            return None
+        received = _receive(ready[0]) if ready else None
+        if received is not None:
+            self._take(*received)
+        return received is not None
+
+    def _take(self, packet: bytes, sender: tuple[str, int]) -> None:
+        """Line up the frames that go on with a packet."""
+        self.packets += 1
+        if sender[0] != self._address[0] or sender[1] not in (self._address[1], self.server.data_port):
+            self.foreign += 1
+            return
         try:
             kind, payload = natnet.unpack(packet)
-            if kind == Kind.SERVER_INFO:
-                self._version = min(natnet.parse_server_info(payload).version, natnet.NEWEST)
+            if kind == Kind.SERVER_INFO and sender == self._address:
+                self.server = natnet.parse_server_info(payload)
+                self._version = min(self.server.version, natnet.NEWEST)
             if kind != Kind.FRAME:
-                return None
+                return
             frame = self._parse(payload)
         except DamagedPacket:
             self.damaged += 1
-            return None
-        if self._last is not None and 0.0 <= self._last.time - frame.time < _REORDERED:
-            self.late += 1
-            return None
-        return StreamedFrame(frame.number, frame.time, frame.points, frame.ids)
+            return
+        self._heard = time.monotonic()
+        self._ready.extend(self.order.add(frame, self._heard))
 
     def _parse(self, payload: bytes) -> MarkerFrame:
         """A frame of the server's version, or of the other layout: some servers send an older one."""
@@ -163,6 +216,11 @@ class PointStream(Iterator[StreamedFrame]):
             frame = natnet.parse_frame(payload, other)
             self._version = other
             return frame
+
+
+def _streamed(arrival: Arrival) -> StreamedFrame:
+    frame = arrival.frame
+    return StreamedFrame(frame.number, frame.time, frame.points, frame.ids, restarted=arrival.restarted)
 
 
 def _split(url: str) -> tuple[str, int]:
@@ -208,7 +266,7 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
         until = time.monotonic() + _RETRY
         while (seconds := until - time.monotonic()) > 0.0:
             ready, _, _ = select.select([commands], [], [], seconds)
-            info = _server_info(_receive(commands, server[0])) if ready else None
+            info = _server_info(_receive(commands), server) if ready else None
             if info is None:
                 continue
             if info.version < natnet.OLDEST:
@@ -221,9 +279,13 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
     )
 
 
-def _server_info(packet: bytes | None) -> ServerInfo | None:
+def _server_info(
+    received: tuple[bytes, tuple[str, int]] | None, server: tuple[str, int]
+) -> ServerInfo | None:
+    if received is None or received[1] != server:
+        return None
     try:
-        kind, payload = natnet.unpack(packet or b"")
+        kind, payload = natnet.unpack(received[0])
         return natnet.parse_server_info(payload) if kind == Kind.SERVER_INFO else None
     except DamagedPacket:
         return None
@@ -253,10 +315,10 @@ def _send(one: socket.socket, packet: bytes, address: tuple[str, int]) -> None:
         pass  # the network is down for now: the stream yields silent frames
 
 
-def _receive(one: socket.socket, host: str) -> bytes | None:
-    """A packet from the host; None if there is none."""
+def _receive(one: socket.socket) -> tuple[bytes, tuple[str, int]] | None:
+    """A packet and its sender; None if there is none."""
     try:
-        packet, (sender, _) = one.recvfrom(natnet.LARGEST)
+        packet, (host, port) = one.recvfrom(natnet.LARGEST)
     except OSError:  # no packet, or a message that a port is closed
         return None
-    return packet if sender == host else None
+    return packet, (host, port)

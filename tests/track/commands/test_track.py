@@ -6,6 +6,8 @@ import functools
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -18,6 +20,8 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
+from gloves.takes.archives import CutOffWarning
+from gloves.takes.growing import GrownArchive
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import LOST, load_tracked_take
 from handsim.app.cli import main
@@ -191,29 +195,56 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys):
     take = load_tracked_take(out)
     assert take.num_frames == 37 and take.rate == pytest.approx(120.0, rel=1e-3)
     assert take.settings["capture"] == server.url
+    assert set(take.settings["stream"].values()) == {0}
+    np.testing.assert_array_equal(take.numbers, np.arange(37))
     assert (take.status[-1] != LOST).all()
-    assert "right hand: tracked" in capsys.readouterr().out
+    told = capsys.readouterr()
+    assert "right hand: tracked" in told.out and "missing" not in told.out
+    assert (
+        told.err.splitlines()[0] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
+    )
 
 
-def test_an_interrupt_writes_what_there_is(capture, tmp_path):
-    out, before = tmp_path / "live.npz", signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupt_writes_what_there_is(number, capture, tmp_path):
+    out, before = tmp_path / "live.npz", signal.getsignal(number)
     with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
 
         def interrupt() -> None:
-            while not server._clients or signal.getsignal(signal.SIGINT) is before:
+            while not server._clients or signal.getsignal(number) is before:
                 time.sleep(0.01)
             time.sleep(0.3)
-            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), number)
 
         thread = threading.Thread(target=interrupt, daemon=True)
         thread.start()
         assert main(["track", "--live", server.url, "--out", str(out)]) == 0
         thread.join()
     assert 2 <= load_tracked_take(out).num_frames <= FRAMES
+    assert signal.getsignal(number) is before and os.listdir(tmp_path) == ["live.npz"]
+
+
+def test_a_kill_leaves_all_but_the_last_second(capture, tmp_path):
+    out, take = tmp_path / "live.npz", load_take(capture.with_suffix(".truth.npz"))
+    points, ids = np.tile(take.points, (40, 1, 1)), np.tile(take.ids, (40, 1))
+    with ReplayServer(points, ids, 120.0) as server:
+        run = "import sys; from handsim.app.cli import main; main(sys.argv[1:])"
+        live = ["track", "--live", server.url, "--out", str(out)]
+        process = subprocess.Popen([sys.executable, "-c", run, *live], stderr=subprocess.DEVNULL)
+        part = tmp_path / "live.npz.part"
+        while process.poll() is None and not (part.exists() and GrownArchive(part).num_frames > 60):
+            time.sleep(0.05)
+        sent = server.sent
+        process.kill()
+        process.wait()
+    assert os.listdir(tmp_path) == ["live.npz.part"]
+    with pytest.warns(CutOffWarning):
+        numbers = load_tracked_take(part).numbers
+    assert (numbers[0], len(numbers)) == (0, numbers[-1] + 1) and len(numbers) > sent - 120
 
 
 def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("track.commands.track.open_stream", functools.partial(open_stream, silence=0.2))
+    monkeypatch.setattr("track.commands.live.open_stream", functools.partial(open_stream, silence=0.2))
     take = load_take(capture.with_suffix(".truth.npz"))
     with ReplayServer(take.points[:1], take.ids[:1], 120.0) as server:
         arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]

@@ -223,9 +223,7 @@ def test_multicast_is_heard_on_loopback():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.bind((LOOPBACK, 0))
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind((LOOPBACK, 0))
-            port = probe.getsockname()[1]
+        port = sender.getsockname()[1]  # servers send from their data port
         with Puppet(ServerInfo("puppet", (4, 1), port, group)) as server:
             try:
                 stream = open_stream(server.url, silence=0.5)
@@ -288,3 +286,49 @@ def test_what_cannot_be_replayed_is_told():
         port = int(server.url.rpartition(":")[2])
         with pytest.raises(CaptureError, match=f"port {port} cannot be listened at"):
             ReplayServer(points, ids, 100.0, port=port)
+
+
+def test_only_the_server_s_ports_are_heard():
+    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=0.3) as stream:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.bind((LOOPBACK, 0))
+            for number in range(5):
+                stranger.sendto(frame(900 + number, (4, 1)), server.client)
+        for number in range(3):
+            server.say(frame(number, (4, 1)))
+        assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
+        assert stream.foreign == 5
+
+
+def test_the_port_for_data_is_the_server_s_too():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as data:
+        data.bind((LOOPBACK, 0))
+        info = ServerInfo("puppet", (4, 1), data.getsockname()[1], None)
+        with Puppet(info) as server, open_stream(server.url, silence=0.3) as stream:
+            for number in range(3):
+                data.sendto(frame(number, (4, 1)), server.client)
+            assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
+
+
+def test_one_wild_time_does_not_end_a_stream():
+    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=0.3) as stream:
+        for number in range(20):
+            for wild in (1e9, 1e17, -5e3) if number % 5 == 2 else ():
+                server.say(natnet.pack_frame(MarkerFrame(number, wild, np.zeros((1, 3)), np.ones(1)), (4, 1)))
+            server.say(frame(number, (4, 1)))
+        got = list(itertools.islice(stream, 20))
+        assert [one.number for one in got] == list(range(20))
+        assert (stream.order.wild, stream.order.restarts, stream.order.missed) == (12, 0, 0)
+
+
+def test_a_stream_ends_when_it_is_told_to():
+    ended = threading.Event()
+    with Puppet(unicast((4, 1))) as server, open_stream(server.url, ended=ended.is_set) as stream:
+        for number in (0, 1, 3):  # the last one is held, because one is missing before it
+            server.say(frame(number, (4, 1)))
+        time.sleep(0.05)
+        got = [next(stream), next(stream)]
+        start = time.monotonic()
+        threading.Timer(0.3, ended.set).start()
+        got += list(stream)
+        assert [one.number for one in got] == [0, 1, 3] and time.monotonic() - start < 1.0

@@ -1,0 +1,372 @@
+"""Archives that grow: what has been added is on disk half a second later, however the recording ends.
+
+Such a file is the unfinished form of an archive (`gloves.takes.archives`). It begins with a JSON header and
+the arrays that do not grow. Then come blocks, each with some frames, their number and a checksum; a block
+that was cut off is left out. `finish_archive` turns it into the usual .npz, block by block, so that its
+memory does not grow with the recording.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import struct
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+
+import numpy as np
+
+from handsim.errors import CaptureError
+from handsim.files.atomic import atomic_write
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SUFFIX: Final = ".part"
+"""Added to the name of the archive."""
+_MAGIC: Final = b"handsim recording 1\n"
+_SIZE: Final = struct.Struct("<I")
+_BLOCK: Final = struct.Struct("<4s4I")  # mark, number of the block, frames, points, CRC-32 of its columns
+_MARK: Final = b"blk\n"
+_INTERVAL: Final = 0.5  # [s] between two blocks
+_LARGEST_HEADER: Final = 1 << 26  # bytes
+_MOST_FRAMES, _MOST_POINTS = 1 << 16, 1 << 22  # of a block; a block of half a second is far below
+_MOST_EXPANSION: Final = 32  # memory of a recording as a multiple of the file's size,
+_EXPANSION_ALLOWANCE: Final = 1 << 26  # beside so many bytes: columns are as many as points in any frame
+
+
+class Column(NamedTuple):
+    """A column that grows by an entry per frame, or per point of each frame."""
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    """Of one entry."""
+    missing: float | None = None
+    """Of a point: what stands where a frame has fewer points than another. None: an entry per frame."""
+
+    @property
+    def of_points(self) -> bool:
+        """Whether there is an entry per point."""
+        return self.missing is not None
+
+    @property
+    def size(self) -> int:
+        """Bytes of an entry."""
+        return np.dtype(self.dtype).itemsize * math.prod(self.shape)
+
+
+_COUNTS: Final = Column("counts", "<u4", ())  # points of each frame
+
+
+def growing_path(archive: Path) -> Path:
+    """Where an archive grows until it is finished."""
+    return archive.with_name(archive.name + SUFFIX)
+
+
+class GrowingArchive:
+    """Writes an archive while it grows; the end of a `with` block or `close` writes what still waits.
+
+    Args:
+        path: The file, which must not exist; `growing_path` names it.
+        header: The header, as JSON.
+        arrays: The arrays that do not grow, by name.
+        columns: Those that do.
+
+    Raises:
+        CaptureError: The file exists: a recording that was cut off is never overwritten.
+        OSError: It cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        header: Mapping[str, Any],
+        arrays: Mapping[str, NDArray[Any]],
+        columns: Sequence[Column],
+    ) -> None:
+        self.path = path
+        self.num_frames = 0
+        """Number of added frames."""
+        self._columns = (_COUNTS, *columns)
+        self._waiting: list[list[bytes]] = [[] for _ in self._columns]
+        self._frames = self._points = self._block = 0
+        self._due = math.inf
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self._file = open(path, "xb", buffering=0)
+        except FileExistsError as error:
+            raise CaptureError(
+                f"{path} exists: a recording that was cut off, or one that is still running; give it another "
+                "name or remove it, or name another output"
+            ) from error
+        text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
+        parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
+        self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in parts))
+
+    def add(self, values: Mapping[str, NDArray[Any] | float], num_points: int) -> None:
+        """Add a frame.
+
+        Args:
+            values: By column; those of points with an entry per point.
+            num_points: The number of its points.
+
+        Raises:
+            OSError: The disk is full, or the file cannot be written.
+        """
+        rows: Mapping[str, Any] = {**values, _COUNTS.name: num_points}
+        packed = []
+        for column in self._columns:
+            row = np.asarray(rows[column.name], column.dtype)
+            if row.shape != ((num_points,) if column.of_points else ()) + column.shape:
+                raise ValueError(f"{column.name} has shape {row.shape}")
+            packed.append(row.tobytes())
+        for waiting, one in zip(self._waiting, packed, strict=True):
+            waiting.append(one)
+        self._frames, self._points = self._frames + 1, self._points + num_points
+        self.num_frames += 1
+        self._due = min(self._due, time.monotonic() + _INTERVAL)
+        self.flush_due()
+
+    def flush_due(self) -> None:
+        """Write the frames that wait, if they have waited long enough."""
+        if time.monotonic() >= self._due or self._frames == _MOST_FRAMES or self._points > _MOST_POINTS // 2:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the frames that wait."""
+        if not self._frames:
+            return
+        content = b"".join(one for waiting in self._waiting for one in waiting)
+        head = _BLOCK.pack(_MARK, self._block, self._frames, self._points, zlib.crc32(content))
+        frames, self._block = self._frames, self._block + 1
+        self._waiting = [[] for _ in self._columns]
+        self._frames, self._points, self._due = 0, 0, math.inf
+        try:
+            self._write(head + content)
+        except OSError:
+            self.num_frames -= frames
+            raise
+
+    def close(self) -> None:
+        """Write what waits, and close the file."""
+        try:
+            self.flush()
+        finally:
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _write(self, content: bytes) -> None:
+        rest = memoryview(content)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+
+
+class _Block(NamedTuple):
+    """A block of a file."""
+
+    at: int
+    """Where its columns begin [bytes]."""
+    frames: int
+    points: int
+
+
+class GrownArchive:
+    """Reads an archive that grew, or still grows, up to its last whole block.
+
+    Args:
+        path: The file.
+        check: Whether checksums are compared.
+
+    Raises:
+        ValueError: It is damaged before its first block, or it would take far more memory than it has bytes.
+        OSError: It cannot be read.
+    """
+
+    def __init__(self, path: Path, *, check: bool = True) -> None:
+        self.path = path
+        self._size = os.path.getsize(path)
+        with path.open("rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                raise ValueError("not a recording")
+            self.header: dict[str, Any] = json.loads(_take_part(file))
+            """The header, as JSON."""
+            self._arrays = {str(name): _unpack_array(_take_part(file)) for name in self.header.pop("arrays")}
+            self._columns = (_COUNTS, *map(_column, self.header.pop("columns")))
+            self._blocks = list(self._scan(file, check))
+        self.num_frames = sum(block.frames for block in self._blocks)
+        """Number of whole frames."""
+        self._most_points = max(
+            (int(self._column(_COUNTS, block).max()) for block in self._blocks), default=0
+        )
+        memory = sum(column.size for column in self._columns if column.of_points)
+        if memory * self.num_frames * self._most_points > _MOST_EXPANSION * self._size + _EXPANSION_ALLOWANCE:
+            raise ValueError(f"{self._most_points} points in {self.num_frames} frames")
+
+    def read(self, step: int = 1) -> dict[str, NDArray[Any]]:
+        """All arrays, with the frames of every `step`-th block; columns of points have shape (T, N, ...)."""
+        blocks = self._blocks[::step]
+        grown = {
+            column.name: np.concatenate([self._empty(column), *self._parts(column, blocks)])
+            for column in self._columns[1:]
+        }
+        return {**self._arrays, **grown}
+
+    def first(self, name: str, most: int) -> NDArray[Any]:
+        """At least the first `most` entries of a column of frames, or all."""
+        column = next(column for column in self._columns if column.name == name)
+        parts, count = [self._empty(column)], 0
+        for part in self._parts(column, self._blocks):
+            parts.append(part)
+            count += len(part)
+            if count >= most:
+                break
+        return np.concatenate(parts)
+
+    def step_for(self, most: int) -> int:
+        """The `step` of `read` with which about `most` frames are read."""
+        return max(1, -(-self.num_frames // most))
+
+    def members(self) -> Iterator[tuple[str, np.dtype[Any], tuple[int, ...], Iterator[bytes]]]:
+        """Name, type and shape of every array, and its bytes, part by part."""
+        for name, array in self._arrays.items():
+            yield name, array.dtype, array.shape, iter([array.tobytes()])
+        for column in self._columns[1:]:
+            shape = (self.num_frames, *self._empty(column).shape[1:])
+            parts = (part.tobytes() for part in self._parts(column, self._blocks))
+            yield column.name, np.dtype(column.dtype), shape, parts
+
+    def _scan(self, file: io.BufferedReader, check: bool) -> Iterator[_Block]:
+        """The whole blocks."""
+        number = 0
+        while len(head := file.read(_BLOCK.size)) == _BLOCK.size:
+            mark, index, frames, points, checksum = _BLOCK.unpack(head)
+            if mark != _MARK or index != number or frames > _MOST_FRAMES or points > _MOST_POINTS:
+                return
+            block = _Block(file.tell(), frames, points)
+            size = sum(column.size * (points if column.of_points else frames) for column in self._columns)
+            if not frames or size > self._size - block.at:
+                return
+            if check and zlib.crc32(file.read(size)) != checksum:
+                return
+            file.seek(block.at + size)
+            if int(self._column(_COUNTS, block).sum(dtype=np.int64)) != points:
+                return
+            number += 1
+            yield block
+
+    def _empty(self, column: Column) -> NDArray[Any]:
+        wide = (self._most_points,) if column.of_points else ()
+        return np.empty((0, *wide, *column.shape), column.dtype)
+
+    def _parts(self, column: Column, blocks: Sequence[_Block]) -> Iterator[NDArray[Any]]:
+        """A column block by block; a column of points with NaN or -1 where there is no point."""
+        for block in blocks:
+            values = self._column(column, block)
+            if column.of_points:
+                present = np.arange(self._most_points) < self._column(_COUNTS, block)[:, None]
+                table = np.full((*present.shape, *column.shape), column.missing, column.dtype)
+                table[present] = values
+                values = table
+            yield values
+
+    def _column(self, column: Column, block: _Block) -> NDArray[Any]:
+        """A column of one block as it is in the file."""
+        at = block.at
+        for other in self._columns:
+            count = block.points if other.of_points else block.frames
+            if other.name == column.name:
+                break
+            at += other.size * count
+        with self.path.open("rb") as file:
+            file.seek(at)
+            content = file.read(column.size * count)
+        return np.frombuffer(content, column.dtype).reshape(count, *column.shape)
+
+
+def is_growing(path: Path) -> bool:
+    """Whether a file is an archive that grew and was not finished."""
+    try:
+        with path.open("rb") as file:
+            return file.read(len(_MAGIC)) == _MAGIC
+    except OSError:
+        return False
+
+
+def finish_archive(
+    grown: GrownArchive, path: Path, header: Mapping[str, Any], *, told: Callable[[], None] = lambda: None
+) -> None:
+    """Write an archive that grew in its usual form, whole or not at all; its memory does not grow with it.
+
+    Args:
+        grown: The archive.
+        path: The .npz file.
+        header: The header, as JSON.
+        told: Called after every part.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    text = np.array(json.dumps(header))
+    with atomic_write(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        first = [("header", text.dtype, text.shape, iter([text.tobytes()]))]
+        for name, dtype, shape, parts in (*first, *grown.members()):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                form = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(member, form)
+                for part in parts:
+                    member.write(part)
+                    told()
+
+
+def _take_part(file: io.BufferedReader) -> bytes:
+    (size,) = _SIZE.unpack(file.read(_SIZE.size).ljust(_SIZE.size, b"\xff"))
+    if size > _LARGEST_HEADER:
+        raise ValueError("a header that is too large")
+    content = file.read(size)
+    if len(content) < size:
+        raise ValueError("a header that was cut off")
+    return content
+
+
+def _pack_array(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _unpack_array(content: bytes) -> NDArray[Any]:
+    """An array of the .npy format, whose size is that of its bytes."""
+    buffer = io.BytesIO(content)
+    np.lib.format.read_magic(buffer)
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(buffer)
+    if dtype.hasobject or fortran:
+        raise ValueError("objects")
+    return np.frombuffer(content, dtype, offset=buffer.tell()).reshape(shape)
+
+
+def _column(stored: Mapping[str, Any]) -> Column:
+    column = Column(
+        str(stored["name"]), str(stored["dtype"]), tuple(map(int, stored["shape"])), stored["missing"]
+    )
+    if (
+        np.dtype(column.dtype).hasobject
+        or not 0 <= column.size <= _LARGEST_HEADER
+        or min(column.shape, default=0) < 0
+    ):
+        raise ValueError("a column of no size")
+    return column

@@ -1,0 +1,191 @@
+"""Archives that grow: whole blocks are read whatever follows them, and the finished file holds the same."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+
+from gloves.takes import growing
+from gloves.takes.growing import (
+    Column,
+    GrowingArchive,
+    GrownArchive,
+    finish_archive,
+    growing_path,
+    is_growing,
+)
+from handsim.errors import CaptureError
+
+COLUMNS = (
+    Column("times", "<f8", ()),
+    Column("nothing", "<f8", (0, 7)),
+    Column("points", "<f8", (3,), np.nan),
+    Column("ids", "<i4", (), -1),
+)
+FIXED = {"places": np.arange(12.0).reshape(4, 3), "none": np.zeros((0, 3))}
+
+
+def record(path, rng, counts, *, every: int = 4) -> list[dict]:
+    """A recording of frames with so many points, in blocks of `every` frames."""
+    rows = []
+    with GrowingArchive(path, {"kind": "test"}, FIXED, COLUMNS) as archive:
+        for number, count in enumerate(counts):
+            rows.append(
+                {
+                    "times": np.array(0.01 * number),
+                    "nothing": np.zeros((0, 7)),
+                    "points": rng.normal(size=(count, 3)),
+                    "ids": np.arange(count),
+                }
+            )
+            archive.add(rows[-1], count)
+            if number % every == every - 1:
+                archive.flush()
+        assert archive.num_frames == len(counts)
+    return rows
+
+
+def check(arrays, rows) -> None:
+    most = max((len(row["ids"]) for row in rows), default=0)
+    np.testing.assert_array_equal(arrays["times"], [row["times"] for row in rows])
+    assert arrays["points"].shape == (len(rows), most, 3) and arrays["nothing"].shape == (len(rows), 0, 7)
+    for number, row in enumerate(rows):
+        count = len(row["ids"])
+        np.testing.assert_array_equal(arrays["points"][number, :count], row["points"])
+        np.testing.assert_array_equal(arrays["ids"][number, :count], row["ids"])
+        assert (
+            np.isnan(arrays["points"][number, count:]).all() and (arrays["ids"][number, count:] == -1).all()
+        )
+    for name, array in FIXED.items():
+        np.testing.assert_array_equal(arrays[name], array)
+
+
+def test_what_was_added_is_read_and_finished(rng, tmp_path):
+    path = growing_path(tmp_path / "take.npz")
+    rows = record(path, rng, [3, 0, 5, 1, 2, 2, 7, 0, 1, 4])
+    assert path.name == "take.npz.part" and is_growing(path)
+    grown = GrownArchive(path)
+    assert (grown.num_frames, grown.header) == (10, {"kind": "test"})
+    check(grown.read(), rows)
+    np.testing.assert_array_equal(grown.first("times", 5), 0.01 * np.arange(8))
+    assert grown.read(2)["times"].tolist() == [0.01 * n for n in (0, 1, 2, 3, 8, 9)]
+    finish_archive(grown, tmp_path / "take.npz", {"kind": "test", "rate": 100.0})
+    with np.load(tmp_path / "take.npz", allow_pickle=False) as stored:
+        check(stored, rows)
+        assert json.loads(str(stored["header"])) == {"kind": "test", "rate": 100.0}
+
+
+def test_an_empty_recording_is_one(tmp_path):
+    with GrowingArchive(tmp_path / "x.part", {}, FIXED, COLUMNS):
+        pass
+    check(GrownArchive(tmp_path / "x.part").read(), [])
+
+
+def test_every_cut_leaves_whole_blocks(rng, tmp_path):
+    path, cut = tmp_path / "x.part", tmp_path / "cut.part"
+    rows, content = record(path, rng, [3, 0, 5, 1, 2, 2, 7, 0, 1, 4]), path.read_bytes()
+    begin = content.index(b"blk\n")
+    frames = set()
+    for length in range(0, len(content), 5):
+        cut.write_bytes(content[:length])
+        if length < begin:
+            with pytest.raises(ValueError):
+                GrownArchive(cut)
+            continue
+        grown = GrownArchive(cut)
+        check(grown.read(), rows[: grown.num_frames])
+        frames.add(grown.num_frames)
+    assert frames == {0, 4, 8}
+    for rest in (bytes(10_000), rng.bytes(10_000), content[begin:]):
+        cut.write_bytes(content + rest)
+        check(GrownArchive(cut).read(), rows)
+
+
+def test_damage_ends_a_recording_before_it(rng, tmp_path):
+    path = tmp_path / "x.part"
+    rows, content = record(path, rng, [3] * 12), path.read_bytes()
+    second = content.index(b"blk\n", content.index(b"blk\n") + 4)
+    for at in range(second, second + 80):
+        damaged = bytearray(content)
+        damaged[at] ^= 0x41
+        path.write_bytes(damaged)
+        check(GrownArchive(path).read(), rows[:4])
+
+
+def test_a_recording_is_never_overwritten(rng, tmp_path):
+    record(tmp_path / "x.part", rng, [1])
+    before = (tmp_path / "x.part").read_bytes()
+    with pytest.raises(CaptureError, match=r"x\.part exists: a recording that was cut off"):
+        record(tmp_path / "x.part", rng, [1])
+    assert (tmp_path / "x.part").read_bytes() == before
+
+
+def test_frames_wait_no_longer_than_half_a_second(rng, tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(growing.time, "monotonic", lambda: now[0])
+    row = {"times": 0.0, "nothing": np.zeros((0, 7)), "points": np.zeros((0, 3)), "ids": np.zeros(0)}
+    with GrowingArchive(tmp_path / "x.part", {}, FIXED, COLUMNS) as archive:
+        archive.add(row, 0)
+        assert GrownArchive(archive.path).num_frames == 0
+        now[0] += 0.51
+        archive.flush_due()
+        assert GrownArchive(archive.path).num_frames == 1, "read while it grows"
+        for _ in range(60):
+            now[0] += 0.01
+            archive.add(row, 0)
+        assert GrownArchive(archive.path).num_frames > 45
+
+
+def test_a_full_disk_keeps_what_was_written(rng, tmp_path):
+    if not os.path.exists("/dev/full"):
+        pytest.skip("this machine has no /dev/full")
+    path = tmp_path / "x.part"
+    row = {"times": 0.0, "nothing": np.zeros((0, 7)), "points": np.zeros((0, 3)), "ids": np.zeros(0)}
+    archive = GrowingArchive(path, {}, FIXED, COLUMNS)
+    archive.add(row, 0)
+    archive.flush()
+    archive.add(row, 0)
+    archive._file.close()
+    archive._file = open("/dev/full", "wb", buffering=0)
+    with pytest.raises(OSError) as error:
+        archive.flush()
+    assert error.value.errno == errno.ENOSPC and archive.num_frames == 1
+    archive.close()
+    assert GrownArchive(path).num_frames == 1
+
+
+def test_headers_that_lie_take_no_memory(rng, tmp_path):
+    path = tmp_path / "x.part"
+    record(path, rng, [2] * 4)
+    content = path.read_bytes()
+    huge = content.replace(b'"shape": [3]', b'"shape": [99999999]')
+    assert len(huge) > len(content)
+    for damaged in (
+        b"handsim recording 1\n" + b"\xff\xff\xff\x7f" + bytes(100),
+        huge,
+        content.replace(b"<f8", b"|O8"),
+        content.replace(b"(4, 3)", b"(9, 9)"),
+        content.replace(b'"columns"', b'"kolumns"'),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises((ValueError, KeyError, TypeError)):
+            GrownArchive(path)
+    # One frame with many points makes all columns wide.
+    counts = [0] * 20_000 + [3000]
+    with GrowingArchive(tmp_path / "wide.part", {}, {}, COLUMNS) as archive:
+        for count in counts:
+            archive.add(
+                {
+                    "times": 0.0,
+                    "nothing": np.zeros((0, 7)),
+                    "points": np.zeros((count, 3)),
+                    "ids": np.zeros(count),
+                },
+                count,
+            )
+    with pytest.raises(ValueError, match="3000 points in 20001 frames"):
+        GrownArchive(tmp_path / "wide.part")

@@ -1,0 +1,115 @@
+"""Which frames of a stream go on: all that were sent, in their order, and none with a wild time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from track.streams.frame_order import FrameOrder
+from track.streams.natnet import MarkerFrame
+
+INTERVAL = 1.0 / 120.0
+
+
+def frame(number: int, time: float) -> MarkerFrame:
+    return MarkerFrame(number, time, np.empty((0, 3)), np.empty(0, dtype=np.int64))
+
+
+def passed(order: FrameOrder, packets: list[tuple[int, float, float]]) -> list[tuple[int, float]]:
+    """Number and time of the frames that go on, of packets (number, time, arrival)."""
+    gone = []
+    for number, time, at in packets:
+        gone += [*order.expire(at), *order.add(frame(number, time), at)]
+    gone += order.expire(packets[-1][2] + 1.0)
+    return [(one.frame.number, one.frame.time) for one in gone]
+
+
+def regular(numbers: range, *, start: float = 0.0) -> list[tuple[int, float, float]]:
+    return [(number, number * INTERVAL, start + number * INTERVAL) for number in numbers]
+
+
+@pytest.mark.parametrize("time", [1e17, 1e9, 40.0, 0.3, -1e9, 1e300])
+@pytest.mark.parametrize("place", [0, 1, 5, 19])
+def test_a_wild_time_is_left_out_and_takes_nothing_with_it(time, place):
+    packets, order = regular(range(20)), FrameOrder()
+    packets.insert(place, (place, time, packets[place][2]))
+    gone = passed(order, packets)
+    assert [number for number, told in gone if told != time] == list(range(20))
+    assert (order.wild, order.missed, order.restarts) == (1, 0, 0)
+    assert len(gone) == 20
+
+
+def test_missing_frames_are_counted():
+    order = FrameOrder()
+    sent = [packet for packet in regular(range(50)) if packet[0] not in (3, 20, 21, 22)]
+    assert passed(order, sent) == [packet[:2] for packet in sent]
+    assert (order.missed, order.late, order.wild, order.restarts) == (4, 0, 0, 0)
+
+
+def test_a_frame_that_was_overtaken_goes_first():
+    order, packets = FrameOrder(), regular(range(30))
+    for at in (0, 7, 15):
+        packets[at], packets[at + 1] = packets[at + 1], packets[at]
+    assert [number for number, _ in passed(order, packets)] == list(range(30))
+    assert (order.missed, order.late) == (0, 0)
+
+
+def test_a_gap_holds_a_frame_for_a_moment_only():
+    order = FrameOrder()
+    passed(order, regular(range(5)))
+    assert list(order.add(frame(6, 6 * INTERVAL), 6 * INTERVAL)) == []
+    assert 0.0 < order.deadline - 6 * INTERVAL < 0.03
+    assert [one.frame.number for one in order.expire(order.deadline)] == [6]
+
+
+def test_a_server_that_starts_again_is_followed():
+    order = FrameOrder()
+    packets = regular(range(40)) + [(n, n * INTERVAL, 3.0 + n * INTERVAL) for n in range(20)]
+    packets += [(n, 5e8 + n * INTERVAL, 6.0 + n * INTERVAL) for n in range(20)]
+    gone = passed(order, packets)
+    assert [number for number, _ in gone] == [*range(40), *range(20), *range(20)]
+    assert (order.restarts, order.wild, order.late) == (2, 0, 0)
+
+
+def test_a_pause_a_burst_and_another_rate_lose_nothing():
+    order, packets = FrameOrder(), regular(range(20))
+    packets += [(n, 5.0 + n * INTERVAL, 5.0 + n * INTERVAL) for n in range(20, 40)]  # the server paused
+    packets += [(n, 5.0 + n * INTERVAL, 7.0) for n in range(40, 80)]  # the network paused
+    packets += [(80 + n, 5.0 + 80 * INTERVAL + n / 30.0, 7.0 + n / 30.0) for n in range(20)]
+    assert [number for number, _ in passed(order, packets)] == list(range(100))
+    assert (order.wild, order.late, order.restarts) == (0, 0, 0)
+
+
+def test_servers_without_frame_numbers_are_heard():
+    order = FrameOrder()
+    packets = [(0, n * INTERVAL, n * INTERVAL) for n in range(50)]
+    assert passed(order, packets) == [packet[:2] for packet in packets]
+    assert order.missed == 0
+
+
+FATES = st.sampled_from(["good"] * 15 + ["drop", "double", "swap", "wild"])
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.lists(FATES, min_size=3, max_size=300), st.randoms(use_true_random=False))
+def test_whatever_happens_to_some_packets_the_others_go_on(fates, random):
+    order, packets, expected = FrameOrder(), [], []
+    fates = ["good", "good", "good", *fates, "good", "good"]
+    swapped = False
+    for number, fate in enumerate(fates):
+        packet = (number, number * INTERVAL, 0.0)
+        if fate == "drop":
+            continue
+        if fate == "wild":
+            time = random.choice([1e17, 1e9, number * INTERVAL + 100.0, random.uniform(-1e6, 1e6)])
+            packets.append((number, time, 0.0))
+            continue
+        expected.append(number)
+        swapped = fate == "swap" and not swapped and fates[number - 1] == "good" and number > 3
+        packets.insert(len(packets) - swapped, packet)
+        packets += [packet] * (fate == "double")
+    timed = [(number, time, at * INTERVAL) for at, (number, time, _) in enumerate(packets)]
+    gone = [number for number, _ in passed(order, timed)]
+    assert gone == expected

@@ -1,0 +1,137 @@
+"""The live part of `handsim track`: a stream is tracked and recorded until it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+from gloves.takes.tracked_take import TrackedTake
+from handsim.app.interrupts import ENDING, interrupt_flag
+from handsim.app.live_status import LiveStatus
+from track.capture_tracking import track_stream
+from track.live_recording import LiveRecorder
+from track.streams.point_stream import PointStream, StreamedFrame, open_stream
+from track.tracked_frame import TrackedFrame
+from track.tracker import Tracker
+
+
+class TrackedSource(NamedTuple):
+    """What was made of a capture or a stream, and written."""
+
+    take: TrackedTake
+    """The take; of a long stream, parts of it."""
+    num_frames: int
+    """Number of all frames."""
+    notes: tuple[str, ...] = ()
+    """What is to be told, one line each."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether `take` is all of it."""
+        return self.take.num_frames == self.num_frames
+
+
+def track_live(
+    url: str, seconds: float | None, tracker: Tracker, out: Path, settings: dict[str, Any]
+) -> TrackedSource:
+    """Track and record a stream until time is up or a signal ends it.
+
+    Args:
+        url: The address of a NatNet server.
+        seconds: How long to record [s]; None for as long as it comes.
+        tracker: A tracker that has not seen a frame.
+        out: The take's file; until its end the recording is beside it.
+        settings: What makes the take, as JSON.
+
+    Raises:
+        CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
+    """
+    with (
+        interrupt_flag(ENDING) as interrupted,  # the frames so far are kept
+        closing(open_stream(url, ended=interrupted)) as stream,
+        LiveRecorder(tracker, out, settings) as recorder,
+        LiveStatus() as status,
+    ):
+        status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
+        try:
+            _record(track_stream(stream, tracker), seconds, recorder, stream, status)
+            status.show(f"writing {out}", now=True)
+            take, step = recorder.finish(
+                stream_counts(stream),
+                told=lambda: status.show(f"writing {out}; {recorder.part} is kept until then"),
+            )
+        except KeyboardInterrupt:
+            status.say(f"the recording is kept in {recorder.part}")
+            raise
+        return TrackedSource(take, recorder.num_frames, _notes(stream, step))
+
+
+def _record(
+    frames: Iterator[tuple[StreamedFrame, TrackedFrame]],
+    seconds: float | None,
+    recorder: LiveRecorder,
+    stream: PointStream,
+    status: LiveStatus,
+) -> None:
+    """Record frames until the stream ends or time is up."""
+    status.show("waiting for the first frame")
+    start = perf_counter()
+    for frame, tracked in frames:
+        recorder.add(frame, tracked)
+        elapsed = perf_counter() - start if frame.silent else recorder.duration
+        if seconds is not None and elapsed >= seconds:
+            break
+        if frame.silent or status.due:
+            status.show(_status_line(frame, tracked, stream), now=frame.silent)
+
+
+def stream_counts(stream: PointStream) -> dict[str, int]:
+    """What became of the frames of a stream, as a take records it."""
+    order = stream.order
+    return {
+        "missing_frames": order.missed,
+        "late_frames": order.late,
+        "frames_with_wild_times": order.wild,
+        "restarts": order.restarts,
+        "damaged_packets": stream.damaged,
+        "foreign_packets": stream.foreign,
+    }
+
+
+def _notes(stream: PointStream, step: int) -> tuple[str, ...]:
+    """What is to be told of a stream at its end."""
+    order, notes = stream.order, []
+    if order.missed:
+        notes.append(f"{order.missed} frames are missing by their numbers")
+    left_out = {
+        "that came late or twice": order.late,
+        "with a wild time": order.wild,
+        "damaged": stream.damaged,
+        "of other senders": stream.foreign,
+    }
+    told = [f"{count} {what}" for what, count in left_out.items() if count]
+    if told:
+        notes.append(f"packets left out: {', '.join(told)}")
+    if order.restarts:
+        notes.append(f"the time of the stream began anew {order.restarts} times")
+    if step > 1:
+        notes.append(f"the following figures are of one half second in {step}")
+    return tuple(notes)
+
+
+def _status_line(frame: StreamedFrame, tracked: TrackedFrame, stream: PointStream) -> str:
+    """Status of a live stream, in one line."""
+    if frame.silent:
+        if stream.foreign:
+            return f"no frames arrive, but {stream.foreign} packets of other senders; is this the right port?"
+        return "no frames arrive; is the server playing?"
+    words = [f"{hand.side} {hand.status.value}" for hand in tracked.hands]
+    words += [f"{body.name} {body.status.value}" for body in tracked.bodies]
+    order = stream.order
+    left_out = order.late + order.wild + stream.damaged
+    counts = [f"{order.missed} missing"] if order.missed else []
+    counts += [f"{left_out} left out"] if left_out else []
+    return f"frame {frame.number}: {', '.join((*words, *counts))}; Ctrl-C ends it"
