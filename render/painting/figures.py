@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -62,14 +62,14 @@ class Drawn:
 
 
 def sample_people(
-    count: int, glove: bool, *, tones: tuple[float, float], rng: np.random.Generator
+    count: int, glove: bool, *, tones: Sequence[float], rng: np.random.Generator
 ) -> tuple[Appearance, ...]:
     """Hands of one person: both have the same skin and the same sleeves.
 
     Args:
         count: Number of hands.
         glove: Whether the hands wear marker gloves.
-        tones: Range of typology angles of the skin [deg]; see `render.skin.look`.
+        tones: Ranges of typology angles of the skin [deg]; see `render.skin.look.sample_skin_look`.
         rng: Source of the random choices.
     """
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)

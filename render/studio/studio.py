@@ -128,6 +128,11 @@ class Studio:
             choices=self._record(choices),
         )
 
+    def is_clear(self, frame: int, cameras: Sequence[Camera]) -> bool:
+        """Whether all cameras are outside of hands and objects in a frame, so that it can be drawn."""
+        drawn = self._drawn(frame, 0.0)
+        return all(_clearance(camera, drawn) >= 2.0 * NEAR for camera in cameras)
+
     def _pose(self, hand: GlovedHand, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
         """Qpos (27,) of a hand `shift` seconds after a frame; None where the hand has no pose."""
         pose = _between(hand.qpos, frame, shift * self.take.rate)
@@ -247,15 +252,20 @@ def _between(rows: Float[np.ndarray, "T ..."], frame: int, shift: float) -> NDAr
     return mixed
 
 
-def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
+def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
+    """Distance of a camera from the nearest vertex [m]."""
     center = camera.T_world_camera[:3, 3]
-    for one in drawn:
-        nearest = np.linalg.norm(one.triangles.vertices - center, axis=1).min()
-        if nearest < 2.0 * NEAR:
-            raise HandSimError(
-                f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
-                f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
-            )
+    distances = (np.linalg.norm(one.triangles.vertices - center, axis=1).min() for one in drawn)
+    return float(min(distances, default=np.inf))
+
+
+def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
+    nearest = _clearance(camera, drawn)
+    if nearest < 2.0 * NEAR:
+        raise HandSimError(
+            f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
+            f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
+        )
 
 
 @functools.lru_cache(maxsize=2)
