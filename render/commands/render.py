@@ -116,8 +116,8 @@ def render(
     lost = left_out_frames(out)
     if lost:
         console.print(
-            f"{out}: {len(lost)} frames left out (the first is {lost[0]}): a camera would be inside a hand or "
-            "an object",
+            f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a hand "
+            "or an object",
             soft_wrap=True,
             markup=False,
         )
@@ -161,5 +161,5 @@ def _sensors(names: tuple[str, ...]) -> DepthNoiseConfig | Literal["auto"] | Non
         return None
     for name in names:
         if name not in SENSORS:
-            raise HandSimError(choices(name, (*SENSORS, _AUTO_SENSOR, _NO_SENSOR), noun="depth sensor"))
+            raise HandSimError(choices(name, (*SENSORS, _NO_SENSOR), noun="depth sensor"))
     return DepthNoiseConfig(sensors=names)

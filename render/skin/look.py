@@ -96,14 +96,13 @@ def check_tones(tones: Sequence[float]) -> None:
     """Check the ranges of typology angles that `sample_skin_look` draws from.
 
     Raises:
-        ArgumentError: They are no ranges within what is measured of skin, one after the other.
+        ArgumentError: They are no ranges of angles, one after the other.
     """
-    low, high = ALL_TONES
-    limits = np.array([low, *tones, high], dtype=np.float64)
+    limits = np.array([-90.0, *tones, 90.0], dtype=np.float64)
     if len(tones) < 2 or len(tones) % 2 or not (np.diff(limits) >= 0.0).all():
         raise ArgumentError(
-            f"tones are {tuple(tones)}, expected the low and high ends of ranges in ascending order, "
-            f"from {low:g} to {high:g} degrees"
+            f"tones are {tuple(tones)}, expected the low and high ends of one range or more in ascending order "
+            "[deg]"
         )
 
 

@@ -109,6 +109,10 @@ def _random_offsets(
     """Random offsets in balls around the sources of the second axis, of these radii [m]."""
     offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
     length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
-    scale = radii.astype(np.float32)[:, None] * np.cbrt(rng.random(shape, dtype=np.float32)) / np.maximum(length, 1e-12)
+    scale = (
+        radii.astype(np.float32)[:, None]
+        * np.cbrt(rng.random(shape, dtype=np.float32))
+        / np.maximum(length, 1e-12)
+    )
     offsets *= scale[..., None]
     return offsets

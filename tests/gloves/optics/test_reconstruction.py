@@ -90,9 +90,7 @@ def test_large_markers_merge_where_small_ones_do_not(rng: np.random.Generator) -
     sources = _grid(200, 2, 0.0055)  # 7 mm apart
     count = {}
     for radius in (0.0016, 0.0032, 0.008):
-        found = reconstruct(
-            sources, _all_seen(sources), RIG, STILL, radii=radius, continuous=False, rng=rng
-        )
+        found = reconstruct(sources, _all_seen(sources), RIG, STILL, radii=radius, continuous=False, rng=rng)
         count[radius] = np.isfinite(found.positions[..., 0]).sum(axis=1).mean()
     assert count[0.0016] == 2.0 and count[0.008] == 1.0
     mixed = reconstruct(
@@ -108,9 +106,7 @@ def test_the_noise_falls_with_the_root_of_the_radius() -> None:
     off = []
     for radius in (0.0032, 4 * 0.0032):
         rng = np.random.default_rng(1)
-        found = reconstruct(
-            sources, _all_seen(sources), RIG, config, radii=radius, continuous=False, rng=rng
-        )
+        found = reconstruct(sources, _all_seen(sources), RIG, config, radii=radius, continuous=False, rng=rng)
         off.append(found.positions - sources)
     np.testing.assert_allclose(off[1], 0.5 * off[0], atol=1e-7)
 
