@@ -205,8 +205,8 @@ def draw_shard(
         config: What to draw.
         shard: Number of the shard.
         frames: Numbers of the frames.
-        leave_out: Told of a frame with a camera inside a hand or an object, which no camera draws then; without
-            it such a frame is an error.
+        leave_out: Told of a frame with a camera inside a hand or an object, which no camera draws then;
+            without it such a frame is an error.
     """
     seeds = np.random.SeedSequence(config.seed, spawn_key=(_SHARDS, shard)).spawn(1 + len(frames))
     rng = np.random.default_rng(seeds[0])

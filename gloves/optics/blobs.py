@@ -25,7 +25,8 @@ def draw_blobs(
         sizes: Radius of each (S,) [m].
         seen: Which cameras have a free view of each (S, C).
         T_world_camera: Camera poses (C, 4, 4).
-        camera: Focal length [px], noise of a source of `MARKER_RADIUS` [px], chance to lose a blob, roundness.
+        camera: Focal length [px], noise of a source of `MARKER_RADIUS` [px], chance to lose a blob,
+            roundness.
         rng: Source of all randomness; the draws go by camera, then source.
         centers: Where the centers go (C, S, 2) [px].
         radii: Where the radii go (C, S) [px].

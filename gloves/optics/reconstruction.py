@@ -88,7 +88,11 @@ class OpticsConfig:
 
     def worn(self, radius: float) -> OpticsConfig:
         """The same for a glove whose spheres have this radius [m], unless `marker_radius` is given."""
-        return self if self.marker_radius is not None else dataclasses.replace(self, marker_radius=radius)
+        return dataclasses.replace(self, marker_radius=self.radius_of(radius))
+
+    def radius_of(self, radius: float) -> float:
+        """`marker_radius`, or in its absence a layout's [m]."""
+        return radius if self.marker_radius is None else self.marker_radius
 
 
 class Reconstruction(NamedTuple):

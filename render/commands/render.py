@@ -40,8 +40,8 @@ class RenderOptions:
     dress: Literal["skin", "glove"] = _DEFAULT.dress
     """Bare skin, or the marker glove with its markers."""
     tones: tuple[str, ...] = ()
-    """Classes of skin tone to draw from, and no others: very-light, light, intermediate, tan, brown, dark; all
-    when not given."""
+    """Classes of skin tone to draw from, and no others: very-light, light, intermediate, tan, brown, dark;
+    all when not given."""
     background: tuple[BackgroundKind, ...] = ()
     """Kinds of background: plain, gradient, noise, clutter, room, photo; a mixture when not given."""
     photos: Path | None = None
@@ -116,8 +116,8 @@ def render(
     lost = left_out_frames(out)
     if lost:
         console.print(
-            f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a hand "
-            "or an object",
+            f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a "
+            "hand or an object",
             soft_wrap=True,
             markup=False,
         )

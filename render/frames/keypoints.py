@@ -58,7 +58,8 @@ def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[n
 def keypoint_flesh(model: HandModel) -> Float[np.ndarray, "21"]:
     """How deep each keypoint lies in the flat hand, below its back or its palm, whichever is more [m].
 
-    A tip lies on the skin, but counts as deep as its digit's last joint: its pulp is in front of it in most views.
+    A tip lies on the skin, but counts as deep as its digit's last joint: its pulp is in front of it in most
+    views.
 
     Args:
         model: The hand.

@@ -101,8 +101,8 @@ def check_tones(tones: Sequence[float]) -> None:
     limits = np.array([-90.0, *tones, 90.0], dtype=np.float64)
     if len(tones) < 2 or len(tones) % 2 or not (np.diff(limits) >= 0.0).all():
         raise ArgumentError(
-            f"tones are {tuple(tones)}, expected the low and high ends of one range or more in ascending order "
-            "[deg]"
+            f"tones are {tuple(tones)}, expected the low and high ends [deg] of one range or more in "
+            "ascending order"
         )
 
 

@@ -79,8 +79,7 @@ def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, 
         optics: May give the radius of all gloves' markers.
     """
     radii = [
-        np.full(hand.fit.layout.num_markers, optics.worn(hand.fit.layout.radius).marker_radius)
-        for hand in scene.hands
+        np.full(hand.fit.layout.num_markers, optics.radius_of(hand.fit.layout.radius)) for hand in scene.hands
     ]
     if scene.moving_object is not None:
         radii.append(np.full(len(scene.moving_object.rigid_object.markers), MARKER_RADIUS))
