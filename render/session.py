@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.painting.figures import sample_people
 from render.painting.painter import choose_painter
+from render.scenery.enclosures import enclose
 from render.scenery.photographs import photo_files
 from render.scenery.surroundings import sample_surroundings
 from render.sensors.depth_noise import sample_depth_noise
@@ -34,6 +35,9 @@ from render.sensors.shutter import sample_shutter
 from render.shown_take import ShownTake, load_shown_take, show_take
 from render.skin.look import SkinLook
 from render.studio.studio import FrameChoices, Studio
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 Progress = Callable[[int, int], None]
 """Called with the numbers of finished pictures and of all pictures."""
@@ -78,7 +82,7 @@ def render_take(
     if config.background.photo > 0.0:
         photo_files(Path(str(config.background.photos)))
     shards = _shards(take, config)
-    views = len(_viewpoints(take, config).cameras(0))
+    views = _viewpoints(take, config).num_cameras
     settings = {"take": path.name, "frames": take.num_frames, "formats": list(formats)}
     claim(out / CONFIG, settings | dataclasses.asdict(config), noun="rendering", error=HandSimError)
     job = functools.partial(_render_shard, path, out, tuple(formats), config)
@@ -215,10 +219,11 @@ def draw_shard(
     painter = choose_painter(config.with_chosen_painter().painter)
     studio = Studio(take, people, colors, config.passes, painter=painter)
     skin = people[0].skin if config.dress == "skin" else None
-    kept = _choices(config, skin, rng)
+    around = viewpoints.positions() if viewpoints.num_cameras > 1 else None
+    kept = _choices(config, skin, around, rng)
     for frame, seed in zip(frames, seeds[1:], strict=True):
         own = np.random.default_rng(seed)
-        chosen = _choices(config, skin, own) if config.vary == "frame" else kept
+        chosen = _choices(config, skin, around, own) if config.vary == "frame" else kept
         cameras = viewpoints.cameras(frame)
         if leave_out is not None and not studio.is_clear(frame, cameras):
             leave_out(frame)
@@ -228,7 +233,10 @@ def draw_shard(
             yield studio.photograph(frame, camera, fresh)
 
 
-def _choices(config: RenderConfig, skin: SkinLook | None, rng: np.random.Generator) -> FrameChoices:
+def _choices(
+    config: RenderConfig, skin: SkinLook | None, around: NDArray[np.float64] | None, rng: np.random.Generator
+) -> FrameChoices:
+    """Random choices; a background that several cameras share is around these positions (N, 3) [m]."""
     background, lighting = sample_surroundings(config.background, skin, rng=rng)
     sensor = config.chosen_depth_sensor
     return FrameChoices(
@@ -238,6 +246,7 @@ def _choices(config: RenderConfig, skin: SkinLook | None, rng: np.random.Generat
         shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
         depth_noise=None if sensor is None else sample_depth_noise(sensor, rng=rng),
         seed=0,
+        enclosure=None if around is None else enclose(around, background.seed),
     )
 
 
