@@ -32,7 +32,12 @@ from handsim.space.cameras import named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.light_sources import mirror_images, sample_light_sources, stray_reflections
+from train.simulation.light_sources import (
+    marker_radii,
+    mirror_images,
+    sample_light_sources,
+    stray_reflections,
+)
 from train.simulation.people import sample_hands
 from train.simulation.room import pack_take
 from train.simulation.room_settings import TWINS
@@ -113,19 +118,22 @@ def room_of(kind: str, frames: int, seed: int, watch: Stopwatch) -> None:
     layout, optics = load_layout("dense19"), config.optics
     scene = watch("people, gloves, motions", lambda: sample_scene(kind, layout, frames, rng=rng))
     sight = watch("bones, markers", lambda: _prepared(SceneSight(scene, rig)))
-    radius = optics.partial * optics.marker_radius
-    watch("all lines of sight", lambda: sight.visible_markers(radius, rng=rng))
+    radii = marker_radii(scene, optics)
+    watch("all lines of sight", lambda: sight.visible_markers(optics.partial * radii, rng=rng))
     watch(
         "mirrors and strays",
         lambda: (
-            mirror_images(sight, config.reflectance, rng=rng),
+            mirror_images(sight, radii, config.reflectance, rng=rng),
             stray_reflections(sight, config, rng=rng),
         ),
     )
     state = rng.bit_generator.state
     sources = sample_light_sources(sight, config, rng=rng)
-    positions, visible = sources.positions, sources.visible
-    watch("optics", lambda: reconstruct(positions, visible, rig, optics, continuous=True, rng=rng))
+    positions, visible, sizes = sources.positions, sources.visible, sources.radii
+    watch(
+        "optics",
+        lambda: reconstruct(positions, visible, rig, optics, radii=sizes, continuous=True, rng=rng),
+    )
     rng.bit_generator.state = state
     start = time.process_time()
     pack_take(scene, sample_light_sources(sight, config, rng=rng), rig, config, {}, rng=rng)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from handsim.errors import ArgumentError, choices
 from render.cameras.viewpoints import ViewConfig
@@ -14,7 +14,12 @@ from render.scenery.backgrounds import BackgroundConfig
 from render.sensors.depth_noise import DepthNoiseConfig
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
-from render.skin.look import ALL_TONES
+from render.skin.look import ALL_TONES, check_tones
+
+NEAR_SENSOR: Final = "d435"
+"""Depth sensor at the user's eyes, 0.4 to 0.6 m from the hands: it measures from 0.2 m on."""
+FAR_SENSOR: Final = "kinect2"
+"""Depth sensor of all other placements; it measures from 0.5 m on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +36,16 @@ class RenderConfig:
     """Cameras, and where they stand."""
     dress: Literal["skin", "glove"] = "skin"
     """Bare hands, or the marker glove with its markers."""
-    tones: tuple[float, float] = ALL_TONES
-    """Range of individual typology angles that skins are drawn from [deg]; see `render.skin.look.TONES`."""
+    tones: tuple[float, ...] = ALL_TONES
+    """Ranges of individual typology angles that skins are drawn from [deg], the ends of each one after the
+    other; see `render.skin.look.TONES`."""
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     """Shares of the kinds of background."""
     vary: Literal["shard", "frame"] = "shard"
     """Whether light and background change with every shard or every frame; people change with every shard."""
-    depth_sensor: DepthNoiseConfig | None = field(default_factory=DepthNoiseConfig)
-    """Sensors that add noise to depth; None: perfect depth alone."""
+    depth_sensor: DepthNoiseConfig | Literal["auto"] | None = "auto"
+    """Sensors that add noise to depth; auto: one whose range fits the placement, see `NEAR_SENSOR`; None:
+    perfect depth alone."""
     color_sensor: ExposureConfig | None = field(default_factory=ExposureConfig)
     """Exposure and noise of colors; None: perfect colors alone."""
     painter: PainterChoice = "auto"
@@ -53,6 +60,7 @@ class RenderConfig:
     """Seed of all random choices."""
 
     def __post_init__(self) -> None:
+        check_tones(self.tones)
         for name in self.passes:
             if name not in PASSES:
                 raise ArgumentError(choices(name, PASSES, noun="pass"))
@@ -61,6 +69,17 @@ class RenderConfig:
                 f"passes are {self.passes}, every is {self.every}, frames_per_shard is "
                 f"{self.frames_per_shard}, expected at least one pass, and numbers of at least 1"
             )
+
+    @property
+    def chosen_depth_sensor(self) -> DepthNoiseConfig | None:
+        """`depth_sensor`, or in the place of auto the one that fits the placement."""
+        if self.depth_sensor != "auto":
+            return self.depth_sensor
+        return DepthNoiseConfig((NEAR_SENSOR if self.view.placement == "head" else FAR_SENSOR,))
+
+    def settled(self) -> RenderConfig:
+        """The same without auto: the painter of this machine, and the depth sensor of the placement."""
+        return dataclasses.replace(self.with_chosen_painter(), depth_sensor=self.chosen_depth_sensor)
 
     def with_chosen_painter(self) -> RenderConfig:
         """The same with compiled or opengl in the place of auto; without colors there is no need to look."""

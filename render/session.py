@@ -7,7 +7,7 @@ import functools
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from gloves.takes.take import Take
 from gloves.takes.tracked_take import TrackedTake
 from handsim.app.workers import in_processes
 from handsim.errors import HandSimError, choices
-from handsim.files.json_files import claim
+from handsim.files.json_files import claim, load_json, save_json
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.formats.annotations.common import without_colors
@@ -26,6 +26,7 @@ from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.painting.figures import sample_people
 from render.painting.painter import choose_painter
+from render.scenery.enclosures import enclose
 from render.scenery.photographs import photo_files
 from render.scenery.surroundings import sample_surroundings
 from render.sensors.depth_noise import sample_depth_noise
@@ -35,10 +36,14 @@ from render.shown_take import ShownTake, load_shown_take, show_take
 from render.skin.look import SkinLook
 from render.studio.studio import FrameChoices, Studio
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 Progress = Callable[[int, int], None]
 """Called with the numbers of finished pictures and of all pictures."""
 CONFIG: Final = "render.json"
 SHEET: Final = "contact_sheet.png"
+_LEFT_OUT: Final = "left_out-{}.json"
 _ON_SHEET: Final = 9
 _PATHS: Final = 1  # spawn keys of choices for the whole take, and for one shard
 _SHARDS: Final = 2
@@ -64,18 +69,20 @@ def render_take(
         progress: Called after every shard.
 
     Returns:
-        Number of pictures. Depth is in [m], pixels are in [px], as the format has them.
+        Number of pictures. Depth is in [m], pixels are in [px], as the format has them. Frames with a camera
+        inside a hand or an object are left out; `left_out_frames` tells which.
 
     Raises:
-        HandSimError: The take or the settings cannot be drawn; finished shards are kept.
+        HandSimError: The take or the settings cannot be drawn, or all frames would be left out; finished
+            shards are kept.
     """
     _check_formats(formats, config)
-    config = config.with_chosen_painter()
+    config = config.settled()
     take = load_shown_take(path)
     if config.background.photo > 0.0:
         photo_files(Path(str(config.background.photos)))
     shards = _shards(take, config)
-    views = len(_viewpoints(take, config).cameras(0))
+    views = _viewpoints(take, config).num_cameras
     settings = {"take": path.name, "frames": take.num_frames, "formats": list(formats)}
     claim(out / CONFIG, settings | dataclasses.asdict(config), noun="rendering", error=HandSimError)
     job = functools.partial(_render_shard, path, out, tuple(formats), config)
@@ -89,8 +96,21 @@ def render_take(
             progress(count, total)
     for name in formats:
         open_writer(name, _folder(out, formats, name)).finish()
-    _write_sheet(out, take, config, shards)
-    return total
+    lost = frozenset(left_out_frames(out))
+    kept = [[frame for frame in shard if frame not in lost] for shard in shards]
+    if not any(kept):
+        raise HandSimError(
+            f"{out}: no pictures: in all {len(lost)} frames a camera would be inside a hand or an object; "
+            "give another placement, distance or seed"
+        )
+    _write_sheet(out, take, config, kept)
+    return total - views * len(lost)
+
+
+def left_out_frames(out: Path) -> list[int]:
+    """Numbers of the frames that a rendering left out: a camera would be inside a hand or an object."""
+    files = sorted(out.glob(_LEFT_OUT.format("*")))
+    return sorted(frame for file in files for frame in load_json(file)["frames"])
 
 
 def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
@@ -135,7 +155,13 @@ def _opened(path: Path, config: RenderConfig) -> tuple[ShownTake, Viewpoints]:
 
 def _render_shard(path: Path, out: Path, formats: tuple[str, ...], config: RenderConfig, shard: int) -> int:
     take, viewpoints = _opened(path, config)
-    frames = draw_shard(take, viewpoints, config, shard, _shards(take, config)[shard])
+    lost: list[int] = []
+
+    def leave_out(frame: int) -> None:
+        lost.append(frame)  # on the disk before the shard is, so that no kill loses it
+        save_json(out / _LEFT_OUT.format(f"{shard:05d}"), {"frames": lost})
+
+    frames = draw_shard(take, viewpoints, config, shard, _shards(take, config)[shard], leave_out=leave_out)
     kept = list(frames) if len(formats) > 1 else frames
     for name in formats:
         writer = open_writer(name, _folder(out, formats, name))
@@ -167,9 +193,25 @@ def draw_frames(
 
 
 def draw_shard(
-    take: ShownTake, viewpoints: Viewpoints, config: RenderConfig, shard: int, frames: Sequence[int]
+    take: ShownTake,
+    viewpoints: Viewpoints,
+    config: RenderConfig,
+    shard: int,
+    frames: Sequence[int],
+    *,
+    leave_out: Callable[[int], None] | None = None,
 ) -> Iterator[RenderedFrame]:
-    """Some frames of a take, seen by all its cameras, with the people of this shard."""
+    """Some frames of a take, seen by all its cameras, with the people of this shard.
+
+    Args:
+        take: The take.
+        viewpoints: Its cameras.
+        config: What to draw.
+        shard: Number of the shard.
+        frames: Numbers of the frames.
+        leave_out: Told of a frame with a camera inside a hand or an object, which no camera draws then;
+            without it such a frame is an error.
+    """
     seeds = np.random.SeedSequence(config.seed, spawn_key=(_SHARDS, shard)).spawn(1 + len(frames))
     rng = np.random.default_rng(seeds[0])
     people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
@@ -177,24 +219,34 @@ def draw_shard(
     painter = choose_painter(config.with_chosen_painter().painter)
     studio = Studio(take, people, colors, config.passes, painter=painter)
     skin = people[0].skin if config.dress == "skin" else None
-    kept = _choices(config, skin, rng)
+    around = viewpoints.positions() if viewpoints.num_cameras > 1 else None
+    kept = _choices(config, skin, around, rng)
     for frame, seed in zip(frames, seeds[1:], strict=True):
         own = np.random.default_rng(seed)
-        chosen = _choices(config, skin, own) if config.vary == "frame" else kept
-        for camera in viewpoints.cameras(frame):
+        chosen = _choices(config, skin, around, own) if config.vary == "frame" else kept
+        cameras = viewpoints.cameras(frame)
+        if leave_out is not None and not studio.is_clear(frame, cameras):
+            leave_out(frame)
+            continue
+        for camera in cameras:
             fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
             yield studio.photograph(frame, camera, fresh)
 
 
-def _choices(config: RenderConfig, skin: SkinLook | None, rng: np.random.Generator) -> FrameChoices:
+def _choices(
+    config: RenderConfig, skin: SkinLook | None, around: NDArray[np.float64] | None, rng: np.random.Generator
+) -> FrameChoices:
+    """Random choices; a background that several cameras share is around these positions (N, 3) [m]."""
     background, lighting = sample_surroundings(config.background, skin, rng=rng)
+    sensor = config.chosen_depth_sensor
     return FrameChoices(
         lighting=lighting,
         background=background,
         exposure=None if config.color_sensor is None else sample_exposure(config.color_sensor, rng=rng),
         shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
-        depth_noise=None if config.depth_sensor is None else sample_depth_noise(config.depth_sensor, rng=rng),
+        depth_noise=None if sensor is None else sample_depth_noise(sensor, rng=rng),
         seed=0,
+        enclosure=None if around is None else enclose(around, background.seed),
     )
 
 
@@ -203,10 +255,11 @@ def _write_sheet(out: Path, take: ShownTake, config: RenderConfig, shards: list[
     if not {"rgb", "depth"} & set(config.passes):
         return
     viewpoints, frames = _viewpoints(take, config), []
-    for shard in np.unique(np.linspace(0, len(shards) - 1, _ON_SHEET).round().astype(int)):
+    filled = [number for number, shard in enumerate(shards) if shard]
+    for shard in np.array(filled)[np.unique(np.linspace(0, len(filled) - 1, _ON_SHEET).round().astype(int))]:
         chosen_frames = (
             shards[shard][:1]
-            if len(shards) >= _ON_SHEET
+            if len(filled) >= _ON_SHEET
             else shards[shard][:: max(1, len(shards[shard]) // 3)][:3]
         )
         frames += list(draw_shard(take, viewpoints, config, int(shard), chosen_frames))

@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numba
 import numpy as np
 
+MARKER_RADIUS: Final = 0.0032
+"""Radius of the spheres of Han et al. 2018 (section 3) [m]: of markers on objects, and of strays."""
+
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def draw_blobs(
-    sources: Any, seen: Any, T_world_camera: Any, camera: Any, rng: Any, centers: Any, radii: Any
+    sources: Any, sizes: Any, seen: Any, T_world_camera: Any, camera: Any, rng: Any, centers: Any, radii: Any
 ) -> None:
     """Write noisy blob centers and radii of one frame; radius 0 where there is no blob.
 
+    The error of a disc's centroid comes from the pixels of its border, whose number grows with the radius,
+    and is divided by the disc's area, which grows with its square: it falls with the radius's root.
+
     Args:
         sources: Positions of everything that shines (S, 3) [m]; NaN where there is none.
+        sizes: Radius of each (S,) [m].
         seen: Which cameras have a free view of each (S, C).
         T_world_camera: Camera poses (C, 4, 4).
-        camera: Focal length [px], noise [px], chance to lose a blob, marker radius [m], roundness.
+        camera: Focal length [px], noise of a source of `MARKER_RADIUS` [px], chance to lose a blob,
+            roundness.
         rng: Source of all randomness; the draws go by camera, then source.
         centers: Where the centers go (C, S, 2) [px].
         radii: Where the radii go (C, S) [px].
     """
-    focal, noise, loss, radius = camera[0], camera[1], camera[2], camera[3]
+    focal, loss = camera[0], camera[2]
     for c in range(len(T_world_camera)):
         pose = T_world_camera[c]
         for s in range(len(sources)):
@@ -36,7 +44,8 @@ def draw_blobs(
                 continue
             right = pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z
             down = pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z
-            radii[c, s] = focal * radius / depth
+            radii[c, s] = focal * sizes[s] / depth
+            noise = camera[1] * np.sqrt(MARKER_RADIUS / sizes[s])
             centers[c, s, 0] = focal * right / depth + noise * rng.standard_normal()
             centers[c, s, 1] = focal * down / depth + noise * rng.standard_normal()
 
@@ -56,7 +65,7 @@ def cast_rays(
         directions: Where the rays go (S, C, 3), in the world.
         usable: Output (S, C), whether a camera has a ray to a source.
     """
-    focal, roundness = camera[0], camera[4]
+    focal, roundness = camera[0], camera[3]
     count = seen.shape[0]
     for c in range(len(T_world_camera)):
         pose = T_world_camera[c]

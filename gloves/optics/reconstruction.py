@@ -7,11 +7,13 @@ chance.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.triangulation import reconstruct_frames
 from handsim.errors import ArgumentError
 from handsim.space.cameras import CameraRig
@@ -32,12 +34,13 @@ class OpticsConfig:
     """
 
     noise: float = 0.12
-    """Standard deviation of a blob's center per axis [px]."""
+    """Standard deviation of a blob's center per axis [px], for a sphere of 3.2 mm radius; it falls with the
+    root of the radius."""
     partial: float = 0.5
     """Each line of sight goes to a random point of the marker within this share of its radius, so markers
     behind an edge flicker."""
-    marker_radius: float = 0.0032
-    """Radius of the spheres [m]; Han et al. 2018, section 3."""
+    marker_radius: float | None = None
+    """Radius of the glove's spheres [m]; the layout's when not given."""
     roundness: float = 0.5
     """Two blobs that touch merge: they count as a marker while their centers are nearer than this share of
     the sum of their radii, and are discarded as not round beyond it."""
@@ -61,18 +64,35 @@ class OpticsConfig:
     """Points nearer to each other than this are one: the one with more rays [m]."""
 
     def __post_init__(self) -> None:
-        for name in ("noise", "partial", "marker_radius", "max_residual", "min_distance", "roundness"):
+        if self.marker_radius is not None and not 0.0 < self.marker_radius < np.inf:
+            raise ArgumentError(f"marker_radius is {self.marker_radius:g}, expected a positive finite number")
+        for name in ("noise", "partial", "max_residual", "min_distance", "roundness"):
             value = getattr(self, name)
             if not 0.0 <= value < np.inf:
                 raise ArgumentError(f"{name} is {value:g}, expected a finite number that is not negative")
         for name in ("blob_loss", "dropout"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ArgumentError(f"{name} is {getattr(self, name):g}, expected a chance from 0 to 1")
+        if not 1.0 <= self.dropout_length < np.inf or self.dropout_cameras < 0:
+            raise ArgumentError(
+                f"dropout_length is {self.dropout_length:g} and dropout_cameras {self.dropout_cameras}, "
+                "expected at least 1 picture, and 0 cameras or more"
+            )
+        if not 0.0 <= self.min_angle <= 90.0:
+            raise ArgumentError(f"min_angle is {self.min_angle:g}, expected 0 to 90 degrees")
         if not 2 <= self.min_rays <= self.min_rays_to_start:
             raise ArgumentError(
                 f"min_rays is {self.min_rays} and min_rays_to_start {self.min_rays_to_start}, "
                 "expected 2 <= min_rays <= min_rays_to_start"
             )
+
+    def worn(self, radius: float) -> OpticsConfig:
+        """The same for a glove whose spheres have this radius [m], unless `marker_radius` is given."""
+        return dataclasses.replace(self, marker_radius=self.radius_of(radius))
+
+    def radius_of(self, radius: float) -> float:
+        """`marker_radius`, or in its absence a layout's [m]."""
+        return radius if self.marker_radius is None else self.marker_radius
 
 
 class Reconstruction(NamedTuple):
@@ -93,6 +113,7 @@ def reconstruct(
     rig: CameraRig,
     config: OpticsConfig,
     *,
+    radii: Float[np.ndarray, "S"] | float = MARKER_RADIUS,
     continuous: bool,
     rng: np.random.Generator,
 ) -> Reconstruction:
@@ -103,6 +124,7 @@ def reconstruct(
         seen: Which cameras have a free view of each.
         rig: The cameras.
         config: Noise, gates and losses.
+        radii: Radius of each source, or of all [m].
         continuous: Frames follow each other in time; otherwise each stands alone, and `min_rays` is enough.
         rng: Source of all randomness.
     """
@@ -113,9 +135,10 @@ def reconstruct(
     lost = _dropouts(frames, len(rig.positions), config, rng)
     reconstruct_frames(
         np.ascontiguousarray(sources, dtype=np.float64),
+        np.broadcast_to(np.asarray(radii, dtype=np.float64), count).copy(),
         np.ascontiguousarray(seen & ~lost[:, None]),
         np.ascontiguousarray(rig.T_world_camera),
-        (rig.focal_length, config.noise, config.blob_loss, config.marker_radius, config.roundness),
+        (rig.focal_length, config.noise, config.blob_loss, config.roundness),
         (config.max_residual, np.sin(np.deg2rad(config.min_angle)), config.min_distance),
         (config.min_rays, config.min_rays_to_start if continuous else config.min_rays),
         rng,

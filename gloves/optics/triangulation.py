@@ -15,16 +15,17 @@ _FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last fr
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def reconstruct_frames(
-    sources: Any, seen: Any, T_world_camera: Any, camera: Any, gates: Any, min_rays: Any, rng: Any,
-    positions: Any, rays: Any, false_points: Any,
+    sources: Any, sizes: Any, seen: Any, T_world_camera: Any, camera: Any, gates: Any, min_rays: Any,
+    rng: Any, positions: Any, rays: Any, false_points: Any,
 ) -> None:  # fmt: skip
     """Write the points of every frame; see `reconstruct`.
 
     Args:
         sources: True positions (T, S, 3) [m]; NaN where there is none.
+        sizes: Radius of each source (S,) [m].
         seen: Which cameras have a free view of each (T, S, C).
         T_world_camera: Camera poses (C, 4, 4).
-        camera: Focal length [px], noise [px], chance to lose a blob, marker radius [m], roundness.
+        camera: As for `gloves.optics.blobs.draw_blobs`.
         gates: Largest residual of a ray [m], sine of the smallest angle, smallest distance of two points [m].
         min_rays: Rays that must meet for a point to go on, and to begin.
         rng: Source of all randomness.
@@ -37,7 +38,7 @@ def reconstruct_frames(
     directions = np.empty((count, cameras, 3))
     usable = np.empty((count, cameras), dtype=np.bool_)
     for t in range(len(sources)):
-        draw_blobs(sources[t], seen[t], T_world_camera, camera, rng, centers, radii)
+        draw_blobs(sources[t], sizes, seen[t], T_world_camera, camera, rng, centers, radii)
         cast_rays(seen[t], T_world_camera, camera, centers, radii, directions, usable)
         for s in np.argsort(-usable.sum(axis=1), kind="mergesort"):
             enough = min_rays[0] if t > 0 and rays[t - 1, s] > 0 else min_rays[1]

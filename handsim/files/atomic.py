@@ -31,18 +31,41 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         OSError: The folder cannot be made, `path` is a folder or a device, the disk is full, or the block
             wrote nothing.
     """
-    final = Path(path)
-    # Renaming onto a device (/dev/null) would replace it, and a folder would be noticed only after the work.
-    if final.exists() and not final.is_file():
-        raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
-    final.parent.mkdir(parents=True, exist_ok=True)
-    temporary = final.with_name(f".{final.stem}.tmp-{os.getpid()}{final.suffix}")
-    try:
+    with atomic_writes(path) as (temporary,):
         yield temporary
-        _flush(temporary)
-        os.replace(temporary, final)
+
+
+@contextmanager
+def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
+    """Temporary paths of files that belong together: all take their names when the block ends well, or none.
+
+    Args:
+        paths: Where the finished files shall be; see `atomic_write`.
+
+    Yields:
+        The paths to write to, in the same order.
+
+    Raises:
+        OSError: As `atomic_write`.
+    """
+    finals = [Path(path) for path in paths]
+    for final in finals:
+        # Renaming onto a device (/dev/null) would replace it; a folder would be noticed only after the work.
+        if final.exists() and not final.is_file():
+            raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
+        final.parent.mkdir(parents=True, exist_ok=True)
+    temporaries = [final.with_name(f".{final.stem}.tmp-{os.getpid()}{final.suffix}") for final in finals]
+    renamed: list[Path] = []
+    try:
+        yield tuple(temporaries)
+        for temporary in temporaries:
+            _flush(temporary)
+        for temporary, final in zip(temporaries, finals, strict=True):
+            os.replace(temporary, final)
+            renamed.append(final)
     except BaseException:  # also an interrupt must leave nothing behind
-        temporary.unlink(missing_ok=True)
+        for file in (*temporaries, *renamed):
+            file.unlink(missing_ok=True)
         raise
 
 

@@ -77,6 +77,16 @@ class Viewpoints:
     def __init__(self, config: ViewConfig, take: ShownTake, *, rng: np.random.Generator) -> None:
         self._camera = preset(config.camera)
         self._poses = _PATHS[config.placement](config, take, rng)
+        self._centers = hand_centers(take)
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras."""
+        return len(self._poses)
+
+    def positions(self) -> Float[np.ndarray, "P 3"]:
+        """All positions of the cameras, and of the hands' centers, over the whole take [m]."""
+        return np.concatenate([self._centers, *(path[:, :3, 3] for path in self._poses)])
 
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..."""

@@ -20,10 +20,11 @@ from render.scenery.photographs import photo_files
 from render.sensors.depth_noise import SENSORS, DepthNoiseConfig
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
-from render.session import SHEET, render_take
-from render.skin.look import ALL_TONES, TONES
+from render.session import SHEET, left_out_frames, render_take
+from render.skin.look import ALL_TONES, TONES, named_tones
 
 _NO_SENSOR: Final = "none"
+_AUTO_SENSOR: Final = "auto"
 _DEFAULT: Final = RenderConfig()
 _AS_IN_CONFIG: Final = ("passes", "view", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
 
@@ -39,15 +40,17 @@ class RenderOptions:
     dress: Literal["skin", "glove"] = _DEFAULT.dress
     """Bare skin, or the marker glove with its markers."""
     tones: tuple[str, ...] = ()
-    """Classes of skin tone: very-light, light, intermediate, tan, brown, dark; all when not given."""
+    """Classes of skin tone to draw from, and no others: very-light, light, intermediate, tan, brown, dark;
+    all when not given."""
     background: tuple[BackgroundKind, ...] = ()
     """Kinds of background: plain, gradient, noise, clutter, room, photo; a mixture when not given."""
     photos: Path | None = None
     """Folder of photographs, for backgrounds of the kind photo."""
     vary: Literal["shard", "frame"] = _DEFAULT.vary
     """Whether light and background change with every shard or with every frame."""
-    depth_sensor: tuple[str, ...] = ("kinect2",)
-    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only."""
+    depth_sensor: tuple[str, ...] = (_AUTO_SENSOR,)
+    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only, or auto: d435 for
+    the placement head, where hands are too near for a kinect2, which is taken elsewhere."""
     color_sensor: bool = True
     """Whether noisy colors are written beside the perfect ones."""
     motion_blur: bool = False
@@ -69,7 +72,7 @@ class RenderOptions:
         """
         return RenderConfig(
             **{name: getattr(self, name) for name in _AS_IN_CONFIG},
-            tones=_tone_range(self.tones),
+            tones=_tone_ranges(self.tones),
             background=_backgrounds(self.background, self.photos),
             depth_sensor=_sensors(self.depth_sensor),
             color_sensor=ExposureConfig() if self.color_sensor else None,
@@ -110,21 +113,28 @@ def render(
         )
     seconds = time.perf_counter() - start
     console = Console()
+    lost = left_out_frames(out)
+    if lost:
+        console.print(
+            f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a "
+            "hand or an object",
+            soft_wrap=True,
+            markup=False,
+        )
     console.print(f"{out}: {count} images in {seconds:.0f} s", soft_wrap=True, markup=False)
     if {"rgb", "depth"} & set(config.passes):
         console.print(f"{out / SHEET}: some of them at one glance", soft_wrap=True, markup=False)
 
 
-def _tone_range(tones: tuple[str, ...]) -> tuple[float, float]:
-    """Typology angles [deg] from the darkest to the lightest of the classes."""
+def _tone_ranges(tones: tuple[str, ...]) -> tuple[float, ...]:
+    """Typology angles [deg] of the classes."""
     if not tones:
         return ALL_TONES
-    known = {name.replace(" ", "-"): angles for name, angles in TONES.items()}
+    known = {name.replace(" ", "-"): name for name in TONES}
     for name in tones:
         if name not in known:
             raise HandSimError(choices(name, known, noun="skin tone"))
-    chosen = [known[name] for name in tones]
-    return min(low for low, _ in chosen), max(high for _, high in chosen)
+    return named_tones([known[name] for name in tones])
 
 
 def _backgrounds(kinds: tuple[BackgroundKind, ...], photos: Path | None) -> BackgroundConfig:
@@ -144,7 +154,9 @@ def _print_left_out(photos: Path) -> None:
         )
 
 
-def _sensors(names: tuple[str, ...]) -> DepthNoiseConfig | None:
+def _sensors(names: tuple[str, ...]) -> DepthNoiseConfig | Literal["auto"] | None:
+    if names == (_AUTO_SENSOR,):
+        return "auto"
     if names == (_NO_SENSOR,) or not names:
         return None
     for name in names:

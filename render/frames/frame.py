@@ -54,7 +54,7 @@ class HandTruth:
     pixels: Float[np.ndarray, "21 2"]
     """Pixels of the keypoints, inside the picture or not [px]; NaN where the lens cannot see them."""
     visible: Bool[np.ndarray, "21"]
-    """Whether each keypoint is in the picture, with nothing in front of its own digit."""
+    """Whether each keypoint is in the picture, with nothing in front of it but the flesh around it."""
     box: Float[np.ndarray, "4"]
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     vertices: Float32[np.ndarray, "V 3"]

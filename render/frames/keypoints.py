@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from handsim.hand.model import HandModel
-from handsim.hand.topology import DIGITS, PALM, bones_of
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import DIGITS, NUM_JOINTS, PALM, bones_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -31,6 +31,7 @@ SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
     for part in range(4)
 )
 """Pairs of keypoints that are joined by a line."""
+_ACROSS, _ALONG = 0.004, 0.035  # [m] around and along a joint's normal, within which skin is its own
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
@@ -52,3 +53,24 @@ def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[n
         last = transforms[:, bones[-1]]
         points[:, 4 * number + 4] = last[:, :3, 3] + model.skeleton.lengths[bones[-1]] * last[:, :3, 0]
     return points
+
+
+def keypoint_flesh(model: HandModel) -> Float[np.ndarray, "21"]:
+    """How deep each keypoint lies in the flat hand, below its back or its palm, whichever is more [m].
+
+    A tip lies on the skin, but counts as deep as its digit's last joint: its pulp is in front of it in most
+    views.
+
+    Args:
+        model: The hand.
+    """
+    qpos = join_qpos(np.zeros((1, NUM_JOINTS)))
+    keypoints, skin = hand_keypoints(model, qpos)[0], model.skin(qpos)[0]
+    bones = [PALM, *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1]))]
+    rotations = model.forward_kinematics(qpos)[0, bones, :3, :3]
+    local = np.einsum("kvi,kij->kvj", skin - keypoints[:, None], rotations)
+    height = np.abs(local[..., 2])
+    own = (np.linalg.norm(local[..., :2], axis=-1) < _ACROSS) & (height < _ALONG)
+    flesh: NDArray[np.float64] = np.where(own, height, 0.0).max(axis=1)
+    flesh[4::4] = flesh[3::4]
+    return flesh

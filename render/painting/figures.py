@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from gloves.fit import GloveFit
 from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONES, NUM_BONES
 from render.frames.frame import PARTS_A_HAND
+from render.frames.keypoints import keypoint_flesh
 from render.painting.materials import (
     MARKER_COLOR,
     Material,
@@ -62,14 +62,14 @@ class Drawn:
 
 
 def sample_people(
-    count: int, glove: bool, *, tones: tuple[float, float], rng: np.random.Generator
+    count: int, glove: bool, *, tones: Sequence[float], rng: np.random.Generator
 ) -> tuple[Appearance, ...]:
     """Hands of one person: both have the same skin and the same sleeves.
 
     Args:
         count: Number of hands.
         glove: Whether the hands wear marker gloves.
-        tones: Range of typology angles of the skin [deg]; see `render.skin.look`.
+        tones: Ranges of typology angles of the skin [deg]; see `render.skin.look.sample_skin_look`.
         rng: Source of the random choices.
     """
     skin, forearm = sample_skin_look(tones, rng=rng), sample_forearm(rng=rng)
@@ -92,6 +92,10 @@ class HandFigure:
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
+        self.flesh: Float[np.ndarray, "21"] = keypoint_flesh(fit.model)
+        """Depth of each keypoint under the back or the palm, whichever is more, markers included [m]."""
+        if look.glove is not None:
+            self.flesh = self.flesh + 2.0 * fit.layout.radius
 
     def drawn(self, qpos: Float[np.ndarray, "27"], number: int) -> list[Drawn]:
         """Skin, and markers where a glove is worn.
@@ -184,11 +188,3 @@ def _drawn_balls(
     colors = np.ones((len(balls.vertices), 4), dtype=np.float32)
     colors[:, :3] = linear(MARKER_COLOR)
     return Drawn(triangles, colors, None, ball_material)
-
-
-def digit_of_part(parts: UInt8[np.ndarray, "*shape"], number: int) -> NDArray[np.int64]:
-    """Digit of each pixel that is hand `number`'s; -1 for its palm and forearm, -2 for all else."""
-    digits = np.array([bone.digit for bone in BONES] + [-1] * (PARTS_A_HAND - NUM_BONES))
-    index = parts.astype(np.int64) - 1 - PARTS_A_HAND * number
-    mine = (index >= 0) & (index < PARTS_A_HAND)
-    return np.where(mine, digits[np.clip(index, 0, PARTS_A_HAND - 1)], -2)

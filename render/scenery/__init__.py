@@ -3,6 +3,7 @@
 - rooms: ray-cast pictures of random rooms.
 - photographs: a user's own photographs.
 - backgrounds: plain, gradient, noise, clutter, room and photograph.
+- enclosures: backgrounds with depth, for several cameras.
 - lights: lamps and ambient light.
 - surroundings: a background together with light that has its colors.
 """

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 if TYPE_CHECKING:
-    from jaxtyping import Float32
+    from jaxtyping import Float, Float32, Int8
     from numpy.typing import NDArray
 
 _REDUCED: Final = 2
@@ -34,6 +34,17 @@ class _Walls(NamedTuple):
     frames: NDArray[np.float64]
     """Pictures and windows (6, 3, 11): left, low, width, height, colors of frame and glass, slope; width 0:
     none."""
+
+
+class RoomLight(NamedTuple):
+    """What N rays meet in a room."""
+
+    light: Float32[np.ndarray, "N 3"]
+    """Linear."""
+    distances: Float32[np.ndarray, "N"]
+    """[m]."""
+    axes: Int8[np.ndarray, "N"]
+    """Axis of the surface's normal, which faces the ray."""
 
 
 class _Boxes(NamedTuple):
@@ -62,13 +73,56 @@ def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.
     rays = _rays(width, height, rng)
     # Lamps and windows leave some parts darker than others.
     lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
-    light = np.empty((height * width, 3), dtype=np.float32)
-    _cast(rays, eye, room, *_paint_walls(room, rng), *_place_boxes(room, eye, rng), lamp, strength, light)
+    walls = _paint_walls(room, rng)
+    light = _cast_all(rays, eye, room, walls, _place_boxes(room, eye, rng), lamp, strength).light
     small = light.reshape(height, width, 3)
     small *= 1.0 + np.float32(0.05) * rng.standard_normal((height, width, 1), dtype=np.float32)
     small = cv2.GaussianBlur(small, (0, 0), 0.7)  # or edges would show the coarse pixels
     drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
     return drawn
+
+
+def cast_room(
+    rays: Float32[np.ndarray, "N 3"],
+    eye: Float[np.ndarray, "3"],
+    room: Float[np.ndarray, "3"],
+    free: Float[np.ndarray, "2 3"],
+    *,
+    rng: np.random.Generator,
+) -> RoomLight:
+    """A random room of a given size, seen from a given position.
+
+    Args:
+        rays: Unit directions in the room's axes, z up, no component 0.
+        eye: Where they begin [m], the room's low corner at the origin.
+        room: The room's far corner [m].
+        free: Low and high corner of a box without furniture [m].
+        rng: Source of the room; the same one gives the same room from another position.
+    """
+    lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
+    walls, boxes = _paint_walls(room, rng), _place_boxes(room, np.full(3, -np.inf), rng)
+    outside = (boxes.corners[:, 1] < free[0]) | (boxes.corners[:, 0] > free[1])
+    kept = outside.any(axis=1)
+    return _cast_all(rays, eye, room, walls, _Boxes(*(part[kept] for part in boxes)), lamp, strength)
+
+
+def _cast_all(
+    rays: NDArray[np.float32],
+    eye: NDArray[np.float64],
+    room: NDArray[np.float64],
+    walls: _Walls,
+    boxes: _Boxes,
+    lamp: NDArray[np.float64],
+    strength: float,
+) -> RoomLight:
+    count = len(rays)
+    seen = RoomLight(
+        np.empty((count, 3), dtype=np.float32),
+        np.empty(count, dtype=np.float32),
+        np.empty(count, dtype=np.int8),
+    )
+    _cast(rays, eye, room, *walls, *boxes, lamp, strength, *seen)
+    return seen
 
 
 def _rays(width: int, height: int, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -137,8 +191,10 @@ def _cast(
     lamp: NDArray[np.float64],
     strength: float,
     picture: NDArray[np.float32],
+    distances: NDArray[np.float32],
+    axes: NDArray[np.int8],
 ) -> None:
-    """Light (N, 3) that comes along each ray."""
+    """Light (N, 3) that comes along each ray, from how far (N,) [m], and the normal's axis (N,) there."""
     position, color = np.empty(3), np.empty(3)
     for ray in range(len(rays)):
         distance, wall = np.inf, 0
@@ -148,6 +204,7 @@ def _cast(
             if way < distance:
                 distance, wall = way, 2 * axis + int(far)
         box, side, distance = _nearest_box(rays, ray, eye, corners, distance)
+        distances[ray], axes[ray] = distance, side if box >= 0 else wall // 2
         light = 0.35
         for axis in range(3):
             position[axis] = eye[axis] + distance * rays[ray, axis]

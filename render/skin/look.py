@@ -8,12 +8,13 @@ so that dark hands have palms much lighter than their backs.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from handsim.errors import HandSimError
+from handsim.errors import ArgumentError, HandSimError
 
 TONES: Final[dict[str, tuple[float, float]]] = {
     "very light": (55.0, 64.0),
@@ -91,14 +92,39 @@ class SkinLook:
         return float(np.interp(self.lightness, (25.0, 75.0), (0.45, 0.6)))
 
 
-def sample_skin_look(tones: tuple[float, float] = ALL_TONES, *, rng: np.random.Generator) -> SkinLook:
+def check_tones(tones: Sequence[float]) -> None:
+    """Check the ranges of typology angles that `sample_skin_look` draws from.
+
+    Raises:
+        ArgumentError: They are no ranges of angles, one after the other.
+    """
+    limits = np.array([-90.0, *tones, 90.0], dtype=np.float64)
+    if len(tones) < 2 or len(tones) % 2 or not (np.diff(limits) >= 0.0).all():
+        raise ArgumentError(
+            f"tones are {tuple(tones)}, expected the low and high ends [deg] of one range or more in "
+            "ascending order"
+        )
+
+
+def named_tones(names: Sequence[str]) -> tuple[float, ...]:
+    """Ranges of typology angles [deg] of some classes of `TONES`; classes side by side are one range."""
+    ranges: list[float] = []
+    for low, high in sorted({TONES[name] for name in names}):
+        if ranges and low <= ranges[-1]:
+            ranges[-1] = high
+        else:
+            ranges += [low, high]
+    return tuple(ranges)
+
+
+def sample_skin_look(tones: Sequence[float] = ALL_TONES, *, rng: np.random.Generator) -> SkinLook:
     """A random person's skin.
 
     Args:
-        tones: Range of typology angles [deg], drawn uniformly; see `TONES`.
+        tones: Ends of ranges of typology angles [deg], drawn from uniformly; see `named_tones`.
         rng: Source of the random choices.
     """
-    angle = rng.uniform(*tones)
+    angle = _draw_angle(tones, rng)
     yellowness = float(np.interp(angle, _ANGLES, _YELLOWNESS)) * float(np.exp(rng.normal(0.0, 0.06)))
     redness = float(np.interp(angle, _ANGLES, _REDNESS)) + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0))
     lightness = 50.0 + yellowness * float(np.tan(np.deg2rad(angle)))
@@ -125,3 +151,14 @@ def sample_skin_look(tones: tuple[float, float] = ALL_TONES, *, rng: np.random.G
         roughness=float(rng.uniform(0.4, 0.62)),
         seed=int(rng.integers(2**31)),
     )
+
+
+def _draw_angle(tones: Sequence[float], rng: np.random.Generator) -> float:
+    """A typology angle [deg], uniform over all ranges."""
+    lows, widths = np.array(tones[::2]), np.diff(tones)[::2]
+    along = rng.uniform(0.0, widths.sum())
+    for low, width in zip(lows[:-1], widths[:-1], strict=True):
+        if along < width:
+            return float(low + along)
+        along -= width
+    return float(lows[-1] + along)

@@ -8,16 +8,17 @@ import numpy as np
 
 from handsim.space.camera import Camera
 from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures
-from render.frames.keypoints import KEYPOINT_DIGITS, NUM_KEYPOINTS, hand_keypoints
-from render.painting.figures import HandFigure, digit_of_part
+from render.frames.keypoints import hand_keypoints
+from render.painting.figures import HandFigure
 from render.skin.forearm import FOREARM
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, UInt8
     from numpy.typing import NDArray
 
-_FIRST_JOINTS: Final = np.arange(NUM_KEYPOINTS) % 4 == 1
-_DEEP: Final = 0.03  # [m] that a keypoint may lie under its own skin; deeper, it is behind another fold
+_SLANTING: Final = (
+    2.0  # lines of sight may pass this many times a joint's flesh: they meet skin at 30 degrees
+)
 
 
 def hand_truth(
@@ -42,7 +43,7 @@ def hand_truth(
         qpos=qpos,
         keypoints=keypoints,
         pixels=pixels,
-        visible=_visible(keypoints, pixels, number, camera, pictures),
+        visible=_visible(keypoints, pixels, figure.flesh, number, camera, pictures),
         box=_box(pictures.parts, number),
         vertices=model.skin(qpos[None])[0].astype(np.float32),
         marker_names=figure.fit.layout.names if worn else (),
@@ -53,22 +54,27 @@ def hand_truth(
 def _visible(
     keypoints: NDArray[np.float64],
     pixels: NDArray[np.float64],
+    flesh: NDArray[np.float64],
     number: int,
     camera: Camera,
     pictures: Pictures,
 ) -> Bool[np.ndarray, "21"]:
-    """Keypoints in the picture with nothing in front of their own digit.
+    """Keypoints in the picture with nothing in front of them but the flesh around them.
 
-    For the wrist that is the palm, and for a digit's first joint, which lies under both, either.
+    Other hands and objects hide whatever is behind them; the hand itself hides what lies deeper under the
+    surface that the pixel shows than the joint's own flesh reaches.
     """
-    assert pictures.parts is not None and pictures.depth is not None
+    assert pictures.instances is not None and pictures.depth is not None
     width, height = camera.size
     inside = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
-    digits = digit_of_part(pictures.parts[rows, columns], number)
-    under = camera.local(keypoints)[:, 2] - pictures.depth[rows, columns]
-    own = (digits == np.array(KEYPOINT_DIGITS)) | (_FIRST_JOINTS & (digits == -1))
-    visible: NDArray[np.bool_] = inside & own & (under < _DEEP)
+    instances, local = pictures.instances[rows, columns], camera.local(keypoints)
+    mine, ahead = instances == 1 + number, local[:, 2] > 0.0
+    slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
+    under = slant * (local[:, 2] - pictures.depth[rows, columns])
+    hidden = (instances > 0) & (under > np.where(mine, _SLANTING * flesh, 0.0))
+    # Fisheyes see sideways and back, where there is no depth: the hand's own surface must do.
+    visible: NDArray[np.bool_] = inside & np.where(ahead, ~hidden, mine)
     return visible
 
 

@@ -21,6 +21,7 @@ from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
 from render.painting.shading import GAMMA
 from render.scenery.backgrounds import Background, draw_background
+from render.scenery.enclosures import Enclosure, draw_surroundings
 from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
 from render.sensors.exposure import Exposure, expose, linear_of
@@ -47,6 +48,8 @@ class FrameChoices:
     """None for a perfect depth sensor."""
     seed: int
     """Seed of the sensors' noise."""
+    enclosure: Enclosure | None = None
+    """The box whose walls have the background, for several cameras; None: a picture without depth."""
 
 
 class Studio:
@@ -99,10 +102,13 @@ class Studio:
         if "rgb" in self.passes:
             rgb = self._colors_of(camera, drawn, choices)
             noisy_rgb = self._exposed(frame, camera, rgb, choices, rng)
-        if noisy and truth.depth is not None:
-            light, sensor = self._infrared(truth, rgb, present), choices.depth_noise
+        seen = truth
+        if choices.enclosure is not None:
+            seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
+        if noisy and seen.depth is not None:
+            light, sensor = self._infrared(seen, rgb, present), choices.depth_noise
             noisy_depth = apply_depth_noise(
-                truth.depth, truth.normals, sensor, camera=camera, reflectance=light, rng=rng
+                seen.depth, seen.normals, sensor, camera=camera, reflectance=light, rng=rng
             )
         hands = tuple(
             hand_truth(self._hands[number], self.take.hands[number].qpos[frame], index, camera, truth)
@@ -120,13 +126,18 @@ class Studio:
             camera=camera,
             hands=hands,
             bodies=bodies,
-            ideal=self._requested(truth, rgb),
+            ideal=self._requested(seen, rgb),
             noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
             points=self.take.points[frame, known],
             labels=self.take.labels[frame, known],
             label_names=self.take.label_names,
             choices=self._record(choices),
         )
+
+    def is_clear(self, frame: int, cameras: Sequence[Camera]) -> bool:
+        """Whether all cameras are outside of hands and objects in a frame, so that it can be drawn."""
+        drawn = self._drawn(frame, 0.0)
+        return all(_clearance(camera, drawn) >= 2.0 * NEAR for camera in cameras)
 
     def _pose(self, hand: GlovedHand, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
         """Qpos (27,) of a hand `shift` seconds after a frame; None where the hand has no pose."""
@@ -194,7 +205,10 @@ class Studio:
         """The perfect color picture."""
         painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
         whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
-        return put_before(whole, _background(choices.background, camera.size))
+        if choices.enclosure is None:
+            return put_before(whole, _background(choices.background, camera.size))
+        behind = draw_surroundings(choices.background, choices.enclosure, camera)
+        return put_before(whole, behind.rgb.astype(np.float32))
 
     def _exposed(
         self,
@@ -231,7 +245,10 @@ class Studio:
         people = [dataclasses.asdict(look) for look in self._people]
         noise = choices.depth_noise
         kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
-        return {"people": people, "body_colors": self._colors, **kind, **dataclasses.asdict(choices)}
+        chosen = dataclasses.asdict(choices)
+        if choices.enclosure is None:
+            del chosen["enclosure"]
+        return {"people": people, "body_colors": self._colors, **kind, **chosen}
 
 
 def _between(rows: Float[np.ndarray, "T ..."], frame: int, shift: float) -> NDArray[np.float64] | None:
@@ -247,15 +264,20 @@ def _between(rows: Float[np.ndarray, "T ..."], frame: int, shift: float) -> NDAr
     return mixed
 
 
-def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
+def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
+    """Distance of a camera from the nearest vertex [m]."""
     center = camera.T_world_camera[:3, 3]
-    for one in drawn:
-        nearest = np.linalg.norm(one.triangles.vertices - center, axis=1).min()
-        if nearest < 2.0 * NEAR:
-            raise HandSimError(
-                f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
-                f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
-            )
+    distances = (np.linalg.norm(one.triangles.vertices - center, axis=1).min() for one in drawn)
+    return float(min(distances, default=np.inf))
+
+
+def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
+    nearest = _clearance(camera, drawn)
+    if nearest < 2.0 * NEAR:
+        raise HandSimError(
+            f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
+            f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
+        )
 
 
 @functools.lru_cache(maxsize=2)

@@ -13,6 +13,7 @@ from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX
+from handsim.files.atomic import atomic_writes
 from train.simulation.takes import TakeConfig, simulate_take
 
 
@@ -26,9 +27,10 @@ def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -
     check_suffix(out, WRITABLE)
     take = simulate_take(config)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
-    write_capture(out, Capture(names, take.points, take.rate))
     truth = out.with_suffix(SUFFIX)
-    take.save(truth)
+    with atomic_writes(out, truth) as (capture_file, truth_file):  # a capture without its truth is no use
+        write_capture(capture_file, Capture(names, take.points, take.rate))
+        take.save(truth_file)
     counts = count_gaps(take.markers_present())
     Console().print(
         f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}",

@@ -69,7 +69,8 @@ def generate_dataset(
             f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
     attach_markers(layout, HandModel.named("M"))  # raises before anything is written
-    settings = {**dataclasses.asdict(config), "layout": dataclasses.asdict(layout)}
+    known = dataclasses.replace(config, optics=config.optics.worn(layout.radius))
+    settings = {**dataclasses.asdict(known), "layout": dataclasses.asdict(layout)}
     if config.rig not in list_rigs():  # a file may change
         settings["cameras"] = {
             "T_world_camera": rig.T_world_camera.tolist(),

@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.mirrors import cameras_by_mirror, reflect
+from gloves.optics.reconstruction import OpticsConfig
 from gloves.optics.strays import sample_strays
 from gloves.optics.visibility import free_rays
 from handsim.hand.topology import PALM
 from handsim.space.cameras import check_outside
+from train.simulation.motion import SceneMotion
 from train.simulation.room_settings import RoomConfig
 from train.simulation.sight import SceneSight
 
@@ -29,6 +32,8 @@ class LightSources(NamedTuple):
     """Cameras with a free view."""
     labels: Int[np.ndarray, "S"]
     """Marker of each source; -1 for a source that is not a marker."""
+    radii: Float[np.ndarray, "S"]
+    """[m]."""
 
 
 def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.random.Generator) -> LightSources:
@@ -50,24 +55,45 @@ def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.rando
         count = len(moving_object.rigid_object.markers)
         if count < _MIN_BODY_MARKERS:
             labels[len(labels) - count :] = -1  # points like any other: ghosts
-    radius = config.optics.partial * config.optics.marker_radius
-    visible = sight.visible_markers(radius, rng=rng)
+    radii = marker_radii(sight.scene, config.optics)
+    visible = sight.visible_markers(config.optics.partial * radii, rng=rng)
     parts = [
-        LightSources(markers, visible, labels),
-        *mirror_images(sight, config.reflectance, rng=rng),
+        LightSources(markers, visible, labels, radii),
+        *mirror_images(sight, radii, config.reflectance, rng=rng),
         *stray_reflections(sight, config, rng=rng),
     ]
-    all_positions, all_visible, all_labels = zip(*parts, strict=True)
+    all_positions, all_visible, all_labels, all_radii = zip(*parts, strict=True)
     return LightSources(
-        np.concatenate(all_positions, 1), np.concatenate(all_visible, 1), np.concatenate(all_labels)
+        np.concatenate(all_positions, 1),
+        np.concatenate(all_visible, 1),
+        np.concatenate(all_labels),
+        np.concatenate(all_radii),
     )
 
 
-def mirror_images(sight: SceneSight, reflectance: float, *, rng: np.random.Generator) -> list[LightSources]:
+def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, "P"]:
+    """Radii of the hands' markers, and then of the object's [m].
+
+    Args:
+        scene: Hands in their gloves, and perhaps an object.
+        optics: May give the radius of all gloves' markers.
+    """
+    radii = [
+        np.full(hand.fit.layout.num_markers, optics.radius_of(hand.fit.layout.radius)) for hand in scene.hands
+    ]
+    if scene.moving_object is not None:
+        radii.append(np.full(len(scene.moving_object.rigid_object.markers), MARKER_RADIUS))
+    return np.concatenate(radii)
+
+
+def mirror_images(
+    sight: SceneSight, radii: Float[np.ndarray, "P"], reflectance: float, *, rng: np.random.Generator
+) -> list[LightSources]:
     """Mirror images of all markers in the object's shiny patches, those that a camera ever sees.
 
     Args:
         sight: The scene and the cameras.
+        radii: Radii of all markers [m].
         reflectance: Share of the images that are bright enough.
         rng: Source of all randomness.
     """
@@ -83,7 +109,8 @@ def mirror_images(sight: SceneSight, reflectance: float, *, rng: np.random.Gener
         images = reflect(markers[:, bright], point[:, None], normal[:, None])
         visible = cameras_by_mirror(images, point, normal, patch[6], sight.rig, *sight.capsules)
         ever = visible.any(axis=(0, 2))
-        parts.append(LightSources(images[:, ever], visible[:, ever], np.full(int(ever.sum()), -1)))
+        labels = np.full(int(ever.sum()), -1)
+        parts.append(LightSources(images[:, ever], visible[:, ever], labels, radii[bright][ever]))
     return parts
 
 
@@ -104,5 +131,6 @@ def stray_reflections(
             pose, middle, config.strays, rate=scene.rate, num_cameras=len(rig.positions), rng=rng
         )
         visible &= rig.in_view(positions) & free_rays(positions, rig.positions, *sight.capsules)
-        parts.append(LightSources(positions, visible, np.full(positions.shape[1], -1)))
+        count = positions.shape[1]
+        parts.append(LightSources(positions, visible, np.full(count, -1), np.full(count, MARKER_RADIUS)))
     return parts

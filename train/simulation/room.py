@@ -63,7 +63,9 @@ def pack_take(
         rng: Source of all randomness.
     """
     optics = config.optics
-    found = reconstruct(sources.positions, sources.visible, rig, optics, continuous=True, rng=rng)
+    found = reconstruct(
+        sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
+    )
     false_labels = label_false_points(found, sources.positions, sources.labels, optics.max_residual)
     labels = np.hstack([np.tile(sources.labels, (scene.num_frames, 1)), false_labels])
     order = rng.permutation(labels.shape[1])  # neither IDs nor columns may tell what a point comes from

@@ -6,6 +6,7 @@ Table 4 (docs/room.md says what was fitted to what).
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, get_args
 
@@ -28,6 +29,47 @@ class RoomConfig:
     """Stray reflections carried by every hand and by the object."""
     reflectance: float = 0.5
     """Share of the mirror images in shiny patches that are bright enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsOptions:
+    """The fields of `OpticsConfig`; those that are not given are the ones fitted to the kind of capture."""
+
+    noise: float | None = None
+    """Standard deviation of a blob's center per axis [px], for a sphere of 3.2 mm radius."""
+    partial: float | None = None
+    """Share of a marker's radius within which its visible spot lies, another one for each camera."""
+    marker_radius: float | None = None
+    """Radius of the glove's spheres [m]; the layout's when not given."""
+    roundness: float | None = None
+    """Share of the sum of their radii within which two blobs that touch count as one marker."""
+    blob_loss: float | None = None
+    """Chance that a camera misses a blob it should see."""
+    dropout: float | None = None
+    """Chance per frame that cameras begin to lose their pictures."""
+    dropout_length: float | None = None
+    """Mean number of pictures that they lose then."""
+    dropout_cameras: int | None = None
+    """Number of cameras that lose them together."""
+    min_rays: int | None = None
+    """Rays that must meet for a point to exist."""
+    min_rays_to_start: int | None = None
+    """Rays that must meet for a point that did not exist in the frame before."""
+    max_residual: float | None = None
+    """Largest distance of a ray from its point [m]."""
+    min_angle: float | None = None
+    """Two rays alone must cross at this angle at least [deg]."""
+    min_distance: float | None = None
+    """Points nearer to each other than this are one [m]."""
+
+    def applied(self, optics: OpticsConfig) -> OpticsConfig:
+        """An optical system with these options in the place of its own.
+
+        Raises:
+            ArgumentError: A number is out of range.
+        """
+        given = {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
+        return dataclasses.replace(optics, **given)
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,11 +69,13 @@ class SceneSight:
         tree = MeshTree(rigid_object.vertices, rigid_object.faces)
         return [(tree, self.scene.moving_object.motion.T_world_body)]
 
-    def visible_markers(self, radius: float, *, rng: np.random.Generator) -> Bool[np.ndarray, "T P C"]:
+    def visible_markers(
+        self, radii: Float[np.ndarray, "P"], *, rng: np.random.Generator
+    ) -> Bool[np.ndarray, "T P C"]:
         """Which cameras have a free view of each marker, past every skin and the object.
 
         Args:
-            radius: Radius around a marker's center in which the visible spot lies [m].
+            radii: Radius around each marker's center in which the visible spot lies [m].
             rng: Source of the spots.
         """
         markers, normals = self.markers
@@ -81,7 +83,7 @@ class SceneSight:
         for first in range(0, self.scene.num_frames, _CHUNK):
             part = slice(first, first + _CHUNK)
             facing = facing_cameras(markers[part], normals[part], self.rig)
-            starts = markers[part, :, None] + _random_offsets(facing.shape, radius, rng)
+            starts = markers[part, :, None] + _random_offsets(facing.shape, radii, rng)
             for begin in range(0, len(facing), SKIN_CHUNK):
                 few = slice(begin, begin + SKIN_CHUNK)
                 frames = slice(first + begin, first + begin + SKIN_CHUNK)
@@ -102,11 +104,15 @@ class SceneSight:
 
 
 def _random_offsets(
-    shape: tuple[int, ...], radius: float, rng: np.random.Generator
+    shape: tuple[int, int, int], radii: Float[np.ndarray, "P"], rng: np.random.Generator
 ) -> Float[np.ndarray, "*shape 3"]:
-    """Random offsets in a ball of this radius [m]."""
+    """Random offsets in balls around the sources of the second axis, of these radii [m]."""
     offsets = rng.standard_normal((*shape, 3), dtype=np.float32)
     length = np.sqrt(np.einsum("...i,...i->...", offsets, offsets))
-    scale = radius * np.cbrt(rng.random(shape, dtype=np.float32)) / np.maximum(length, 1e-12)
+    scale = (
+        radii.astype(np.float32)[:, None]
+        * np.cbrt(rng.random(shape, dtype=np.float32))
+        / np.maximum(length, 1e-12)
+    )
     offsets *= scale[..., None]
     return offsets

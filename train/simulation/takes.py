@@ -6,7 +6,7 @@ A take flows one way: people in gloves, their motion, what cameras see of it, th
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,7 @@ from handsim.space.cameras import ROOM_CENTER, check_outside_volume, load_rig
 from train.simulation.motion import SceneMotion, sample_scene_motion
 from train.simulation.people import sample_adult_hands, wear_gloves
 from train.simulation.room import record_take
-from train.simulation.room_settings import TWINS, Kind
+from train.simulation.room_settings import TWINS, Kind, OpticsOptions
 
 WRIST_VOLUME: Final = 0.5
 """Half side of the cube that wrists stay in [m]; no camera may stand there."""
@@ -38,6 +38,8 @@ class TakeConfig:
     rig: str = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     seed: int = 0
+    optics: OpticsOptions = field(default_factory=OpticsOptions)
+    """The optical system, where it differs from the one fitted to this kind of capture."""
 
     def __post_init__(self) -> None:
         if self.kind not in TWINS:
@@ -46,6 +48,7 @@ class TakeConfig:
             raise ArgumentError(f"num_frames is {self.num_frames}, expected at least 1")
         if self.seed < 0:
             raise ArgumentError(f"seed is {self.seed}, expected 0 or more")
+        self.optics.applied(TWINS[self.kind].room.optics)  # raises what is out of range
 
 
 def simulate_take(config: TakeConfig) -> Take:
@@ -68,8 +71,11 @@ def simulate_take(config: TakeConfig) -> Take:
     rig, layout = load_rig(config.rig), load_layout(config.glove)
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
     scene = sample_scene(config.kind, layout, config.num_frames or twin.paper.frames, rng=rng)
-    settings = dataclasses.asdict(config) | {"room": dataclasses.asdict(twin.room)}
-    return record_take(scene, rig, twin.room, settings, rng=rng)
+    optics = config.optics.applied(twin.room.optics).worn(layout.radius)
+    room = dataclasses.replace(twin.room, optics=optics)
+    settings = dataclasses.asdict(config) | {"room": dataclasses.asdict(room)}
+    del settings["optics"]  # the room has all of them
+    return record_take(scene, rig, room, settings, rng=rng)
 
 
 def sample_scene(

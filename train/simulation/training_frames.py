@@ -126,7 +126,9 @@ def observe_scene(
     if scene.rigid_object is not None and scene.T_world_object is not None:
         tree = _mesh_tree(scene.rigid_object.name)
         visible = clear_of_body(tree, scene.T_world_object, markers, rig.positions, visible)
-    found = reconstruct(markers, visible, rig, optics, continuous=False, rng=rng)
+    radii_worn = np.array([optics.radius_of(fit.layout.radius) for fit in fits])
+    sizes = np.repeat(radii_worn, [centers.shape[1] for centers, _ in worn])
+    found = reconstruct(markers, visible, rig, optics, radii=sizes, continuous=False, rng=rng)
     cameras, hands = pack_cameras(visible), []
     for number, (centers, _) in enumerate(worn):
         columns = slice(number * centers.shape[1], (number + 1) * centers.shape[1])

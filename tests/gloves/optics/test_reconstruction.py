@@ -86,6 +86,31 @@ def test_markers_that_nearly_touch_are_one_point(rng: np.random.Generator) -> No
     assert (np.isfinite(found.positions[..., 0]).sum(axis=1) == 2).all()
 
 
+def test_large_markers_merge_where_small_ones_do_not(rng: np.random.Generator) -> None:
+    sources = _grid(200, 2, 0.0055)  # 7 mm apart
+    count = {}
+    for radius in (0.0016, 0.0032, 0.008):
+        found = reconstruct(sources, _all_seen(sources), RIG, STILL, radii=radius, continuous=False, rng=rng)
+        count[radius] = np.isfinite(found.positions[..., 0]).sum(axis=1).mean()
+    assert count[0.0016] == 2.0 and count[0.008] == 1.0
+    mixed = reconstruct(
+        np.concatenate([sources, sources + 0.2], axis=1), _all_seen(np.tile(sources, (1, 2, 1))), RIG, STILL,
+        radii=np.array([0.008, 0.008, 0.0016, 0.0016]), continuous=False, rng=rng,
+    )  # fmt: skip
+    assert np.isfinite(mixed.positions[..., 0]).sum(axis=1).tolist() == [3] * 200
+
+
+def test_the_noise_falls_with_the_root_of_the_radius() -> None:
+    config = OpticsConfig(noise=0.3, blob_loss=0.0, dropout=0.0)
+    sources = np.tile(MIDDLE, (500, 1, 1))
+    off = []
+    for radius in (0.0032, 4 * 0.0032):
+        rng = np.random.default_rng(1)
+        found = reconstruct(sources, _all_seen(sources), RIG, config, radii=radius, continuous=False, rng=rng)
+        off.append(found.positions - sources)
+    np.testing.assert_allclose(off[1], 0.5 * off[0], atol=1e-7)
+
+
 def test_rays_without_a_point_meet_by_chance(rng: np.random.Generator) -> None:
     """Two cameras see one marker each, on rays that cross where no marker is."""
     crossing = MIDDLE + np.array([0.05, 0.0, 0.0])
@@ -122,6 +147,10 @@ def test_the_same_seed_gives_the_same_points() -> None:
         ("noise", -1.0, "noise is -1, expected a finite number"),
         ("blob_loss", 2.0, "blob_loss is 2, expected a chance"),
         ("min_rays", 1, "expected 2 <= min_rays"),
+        ("marker_radius", 0.0, "marker_radius is 0, expected a positive finite number"),
+        ("dropout_length", 0.0, "dropout_length is 0 and dropout_cameras 1, expected at least 1 picture"),
+        ("dropout_cameras", -1, "dropout_cameras -1, expected at least 1 picture, and 0 cameras"),
+        ("min_angle", np.nan, "min_angle is nan, expected 0 to 90 degrees"),
     ],
 )
 def test_nonsense_is_refused(field: str, value: float, sentence: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, atomic_writes
 
 
 def entries(folder: Path) -> list[str]:
@@ -84,3 +84,19 @@ def test_a_write_that_does_not_fit_leaves_nothing(tmp_path: Path) -> None:
     )
     assert result.stdout.strip() == "OSError"
     assert entries(tmp_path) == []
+
+
+def test_files_that_belong_together_come_together(tmp_path: Path) -> None:
+    first, second = tmp_path / "a.trc", tmp_path / "b" / "a.npz"
+    with pytest.raises(OSError, match="full"), atomic_writes(first, second) as (one, two):
+        one.write_text("whole")
+        two.write_text("half")
+        raise OSError("full")
+    assert entries(tmp_path) == ["b"] and entries(tmp_path / "b") == []
+    with pytest.raises(FileNotFoundError), atomic_writes(first, second) as (one, two):
+        one.write_text("whole")  # and nothing else
+    assert entries(tmp_path) == ["b"]
+    with atomic_writes(first, second) as (one, two):
+        one.write_text("whole")
+        two.write_text("whole")
+    assert first.read_text() == second.read_text() == "whole"

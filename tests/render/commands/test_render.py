@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tyro
 
@@ -12,7 +13,10 @@ from handsim.errors import HandSimError
 from render.commands import render as command
 from render.commands.render import RenderOptions
 from render.config import RenderConfig
+from render.painting.figures import sample_people
 from render.scenery.backgrounds import BackgroundConfig
+from render.sensors.depth_noise import DepthNoiseConfig
+from render.skin.look import TONES
 
 
 def parsed(*words: str) -> RenderConfig:
@@ -49,6 +53,34 @@ def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     assert config.shutter is not None
 
 
+@pytest.mark.parametrize(
+    ("names", "tones"),
+    [
+        ("very-light dark", (-52.0, -30.0, 55.0, 64.0)),
+        ("dark brown", (-52.0, 10.0)),
+        ("tan light tan", (10.0, 28.0, 41.0, 55.0)),
+    ],
+)
+def test_named_tones_are_drawn_and_no_others(names: str, tones: tuple[float, ...]) -> None:
+    config = parsed("--tones", *names.split())
+    assert config.tones == tones
+    rng = np.random.default_rng(4)
+    angles = [sample_people(1, False, tones=config.tones, rng=rng)[0].skin.typology_angle for _ in range(200)]
+    ends = [TONES[name.replace("-", " ")] for name in set(names.split())]
+    for low, high in ends:
+        share = np.mean([low <= angle <= high for angle in angles])
+        width = (high - low) / sum(high - low for low, high in ends)
+        assert share == pytest.approx(width, abs=0.12)
+    assert all(any(low - 1e-9 <= angle <= high + 1e-9 for low, high in ends) for angle in angles)
+
+
+def test_the_depth_sensor_fits_the_placement() -> None:
+    assert parsed("--placement", "head").settled().depth_sensor == DepthNoiseConfig(("d435",))
+    assert parsed("--placement", "orbit").settled().depth_sensor == DepthNoiseConfig(("kinect2",))
+    given = parsed("--placement", "head", "--depth-sensor", "kinect2", "kinect1").settled()
+    assert given.depth_sensor == DepthNoiseConfig(("kinect2", "kinect1"))
+
+
 def test_photographs_alone_are_the_only_background() -> None:
     config = parsed("--photos", "folder")
     assert config.background.photos == "folder"
@@ -59,6 +91,7 @@ def test_photographs_alone_are_the_only_background() -> None:
     ("words", "message"),
     [
         (("--tones", "green"), "unknown skin tone 'green'"),
+        (("--depth-sensor", "auto", "d435"), "unknown depth sensor 'auto'"),
         (("--depth-sensor", "sonar"), "unknown depth sensor 'sonar'"),
         (("--passes", "heat"), "unknown pass 'heat'"),
         (("--every", "0"), "every is 0"),

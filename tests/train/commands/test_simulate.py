@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 
 import numpy as np
 import pytest
@@ -57,6 +59,51 @@ def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, 
     np.testing.assert_allclose(trc.positions, truth.points, atol=1e-6)
     present = truth.markers_present()
     assert present.shape == (20, 38) and present.mean() > 0.8
+
+
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("step", ["writing the truth", "renaming the truth"])
+def test_a_full_disk_leaves_no_half_pair(older, step, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "take.c3d"
+    command = ["simulate", "--num-frames", "5", "--out", str(out)]
+    if older:
+        assert main(command) == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    full = OSError(errno.ENOSPC, "No space left on device")
+    replace = os.replace
+
+    def fill(*_arguments, **_rest):
+        raise full
+
+    def rename(source, target):
+        if step.startswith("renaming") and str(target) == str(tmp_path / "take.truth.npz"):
+            raise full
+        replace(source, target)
+
+    if step.startswith("writing"):
+        monkeypatch.setattr(np, "savez_compressed", fill)
+    monkeypatch.setattr(os, "replace", rename)
+    assert main([*command, "--seed", "1"]) == 1
+    said = capsys.readouterr().err
+    assert "the disk is full" in said and said.count("\n") == 1
+    left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    if step.startswith("writing"):
+        assert left == before, "what was there stays"
+    else:
+        assert "take.c3d" not in left, "no capture with the truth of another"
+
+
+def test_the_optics_are_options_of_the_command(tmp_path, capsys):
+    out = tmp_path / "take.c3d"
+    command = ["simulate", "--num-frames", "20", "--out", str(out)]
+    assert main([*command, "--optics.blob-loss", "0.9"]) == 0
+    truth = load_take(out.with_suffix(".truth.npz"))
+    assert truth.settings["room"]["optics"]["blob_loss"] == 0.9
+    assert truth.markers_present().mean() < 0.8
+    capsys.readouterr()
+    assert main([*command, "--optics.noise", "-1"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "noise is -1, expected a finite number that is not negative" in said
 
 
 @pytest.mark.parametrize("name", ["take.csv", "take.npz", "take"])

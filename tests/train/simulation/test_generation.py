@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import signal
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gloves.layout import load_layout, save_layout
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
@@ -129,6 +131,18 @@ def test_another_seed_makes_other_rows(finished, tmp_path):
 
     generate_dataset(dataclasses.replace(CONFIG, seed=4), tmp_path / "other", workers=1)
     assert contents(tmp_path / "other")[rows_name(0)] != contents(finished)[rows_name(0)]
+
+
+def test_the_gloves_radius_reaches_the_optics(tmp_path):
+    lost = {}
+    for radius in (0.0032, 0.008):
+        glove = tmp_path / f"{radius}.toml"
+        save_layout(glove, dataclasses.replace(load_layout("dense19"), radius=radius))
+        config = dataclasses.replace(CONFIG, num_frames=200, glove=str(glove))
+        manifest = generate_dataset(config, tmp_path / f"set{radius}", workers=1)
+        assert manifest.config["optics"]["marker_radius"] == radius
+        lost[radius] = np.isnan(Dataset(tmp_path / f"set{radius}").rows()["observed"][..., 0]).mean()
+    assert lost[0.008] > 1.5 * lost[0.0032]
 
 
 def test_redraws_are_counted_in_the_manifest(tmp_path, monkeypatch):

@@ -100,7 +100,7 @@ def test_labels_follow_the_order_of_the_hands(rng):
 def test_markers_are_seen_as_embree_sees_them(name, rng):
     scene_motion = two_hands(named_object(name))
     sight = SceneSight(scene_motion, RIG)
-    ours = sight.visible_markers(0.0, rng=rng)
+    ours = sight.visible_markers(np.zeros(len(sight.markers[0][0])), rng=rng)
     markers, normals = sight.markers
     thing = scene_motion.moving_object
     to_camera = RIG.positions - markers[:, :, None]

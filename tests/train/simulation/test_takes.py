@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gloves.captures.gaps import count_gaps
+from gloves.layout import load_layout, save_layout
+from gloves.optics.reconstruction import OpticsConfig
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
@@ -19,7 +23,7 @@ from poses.grasps.object_motion import object_penetration
 from poses.shapes.couplings import HIGH, LOW
 from train.simulation import takes
 from train.simulation.motion import RATE
-from train.simulation.room_settings import KINDS, TWINS
+from train.simulation.room_settings import KINDS, TWINS, OpticsOptions
 from train.simulation.takes import WRIST_VOLUME, TakeConfig, simulate_take
 
 FRAMES = 200
@@ -101,6 +105,37 @@ def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
     for name in ("points", "ids", "labels"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert first.hand_labels == (range(13), range(13, 26))
+
+
+def thick_glove(folder: Path, radius_mm: float) -> str:
+    file = folder / f"balls{radius_mm:g}.toml"
+    save_layout(file, dataclasses.replace(load_layout("dense19"), radius=radius_mm * 1e-3))
+    return str(file)
+
+
+def test_the_gloves_radius_reaches_the_optics(tmp_path):
+    """Balls of 16 mm merge where fingers lie side by side, and are told in the take's settings."""
+    missing = {}
+    for radius in (3.2, 8.0):
+        config = TakeConfig(kind="hand-hand", num_frames=120, glove=thick_glove(tmp_path, radius))
+        take = simulate_take(config)
+        assert take.settings["room"]["optics"]["marker_radius"] == radius * 1e-3
+        missing[radius] = 1.0 - take.markers_present().mean()
+    assert missing[8.0] > 2.0 * missing[3.2]
+    own = dataclasses.replace(config, optics=OpticsOptions(marker_radius=0.0032))
+    assert 1.0 - simulate_take(own).markers_present().mean() < missing[8.0]
+
+
+def test_the_optics_have_options():
+    assert [field.name for field in dataclasses.fields(OpticsOptions)] == [
+        field.name for field in dataclasses.fields(OpticsConfig)
+    ]
+    blind = simulate_take(TakeConfig(num_frames=60, optics=OpticsOptions(blob_loss=0.9)))
+    clear = simulate_take(TakeConfig(num_frames=60))
+    assert blind.markers_present().mean() < 0.8 < clear.markers_present().mean()
+    assert blind.settings["room"]["optics"]["blob_loss"] == 0.9 and "optics" not in clear.settings
+    with pytest.raises(ArgumentError, match="blob_loss is 2, expected a chance"):
+        TakeConfig(optics=OpticsOptions(blob_loss=2.0))
 
 
 @pytest.mark.parametrize("kind", KINDS)
