@@ -4,9 +4,9 @@
 - cli: the command `handsim`, its errors and exit codes
 - presets: commands whose defaults come from a preset
 - demo: what the steps of `handsim demo` share
-- progress: the progress bar of all commands
-- interrupts: Ctrl-C as a flag that a loop reads
-- workers: numbered jobs in worker processes
+- progress: the progress bar of all commands, and lines in its place in a log
+- interrupts: signals to end, as a flag that a loop reads or as an exception
+- workers: numbered jobs in worker processes, which end with their parent
 - system_packages: names of system packages that pip cannot install
 - page: one HTML page of pictures and figures
 """
