@@ -1,6 +1,6 @@
 """The one command, `handsim`: a table of names, each loaded when it is called.
 
-Exit codes: 0; 1 for a mistake of the user, explained in one line; 2 for usage; after a signal 128 and its number
+Exit codes: 0; 1 for a mistake of the user, explained in one line; 2 for usage; 128 and more after a signal
 (130 after Ctrl-C).
 """
 

@@ -157,7 +157,7 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def _without_signals() -> Iterator[None]:
-    """Processes that are started within the block do not hear Ctrl-C or hang-ups; this one hears them after."""
+    """Processes started within the block do not hear Ctrl-C or hang-ups; this one hears them after it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

@@ -50,7 +50,7 @@ Progress = Callable[[int, int], None]
 def generate_dataset(
     config: DatasetConfig, out: Path, *, workers: int | None = None, progress: Progress | None = None
 ) -> Manifest:
-    """Make a training set, finish one that was stopped, or let one grow; the bytes depend on the config alone.
+    """Make a training set, finish a stopped one, or let one grow; the bytes depend on the config alone.
 
     Args:
         config: What to make.
