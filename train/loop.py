@@ -141,14 +141,16 @@ class _Run:
     def step(self) -> float:
         """Make a step, whole or not at all, and return its loss."""
         with interrupt_flag() as interrupted:
-            loss = self.state.step(*self._draw())
+            batch, rng = self._draw()
+            loss = self.state.step(batch, rng=rng)
         if interrupted():
             raise Stopped(interrupted.number)
         return loss
 
     def try_step(self) -> None:
         """Do the work of the next step; the state stays as it is."""
-        self.state.try_step(*self._draw())
+        batch, rng = self._draw()
+        self.state.try_step(batch, rng=rng)
 
     def _draw(self) -> tuple[Batch, np.random.Generator]:
         """The batch of the next step, and the generator that the step goes on with."""

@@ -189,7 +189,7 @@ def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
 def test_other_settings_in_the_same_folder_are_told(finished):
     import dataclasses
 
-    with pytest.raises(DatasetError, match=r"begun with other settings \(num_frames, seed\)"):
+    with pytest.raises(DatasetError, match=r"\(num_frames: 700 there, 9 here; seed: 3 there, 9 here\)"):
         generate_dataset(dataclasses.replace(CONFIG, seed=9, num_frames=9), finished)
 
 
