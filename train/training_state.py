@@ -137,14 +137,15 @@ class TrainingState:
         """
         if not path.is_file():
             return
+        stored = io.BytesIO(path.read_bytes())  # torch calls some damage an OSError
         try:
-            content = torch.load(path, weights_only=True, map_location=self.fabric.device)
+            content = torch.load(stored, weights_only=True, map_location=self.fabric.device)
             self._check(content)
             self.network.load_state_dict(content["network"])
             self.optimizer.load_state_dict(content["optimizer"])
             self.mean, self.done = content["mean"], content["done"]
             self.history = History(**content.get("history", {}))  # older checkpoints have none
-        except (OSError, MemoryError):
+        except MemoryError:
             raise
         except Exception as error:  # a file can be damaged in more ways than torch names
             raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
