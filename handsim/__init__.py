@@ -7,6 +7,7 @@ wrist orientation (wxyz), twenty joint angles [rad]. A `CameraRig` is a set of c
 
 from typing import TYPE_CHECKING
 
+from handsim._kernel_cache import ensure_kernel_cache
 from handsim._lazy import lazy_exports
 from handsim._siblings import ShadowedPackageWarning, warn_if_shadowed
 from handsim._version import __version__
@@ -47,4 +48,5 @@ __all__ = [
     "sample_shape",
 ]
 
+ensure_kernel_cache()
 warn_if_shadowed()

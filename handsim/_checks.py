@@ -39,7 +39,8 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
     inside = low <= value <= high and value < np.inf and not (above and value == low)
     if not inside:
         least = f"a number above {low:g}" if above else f"a number of at least {low:g}"
-        expected = least if high == np.inf else f"a number from {low:g} to {high:g}"
+        both = f"{least}, at most {high:g}" if above else f"a number from {low:g} to {high:g}"
+        expected = least if high == np.inf else both
         raise ArgumentError(f"{name} is {value:g}, expected {expected}")
 
 

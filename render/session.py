@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -14,8 +14,11 @@ import numpy as np
 
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import TrackedTake
-from handsim.app.workers import in_processes
+from handsim.app.interrupts import Stopped
+from handsim.app.workers import check_workers, in_processes
 from handsim.errors import HandSimError, choices
+from handsim.files.atomic import remove_leftovers
+from handsim.files.disk import check_free
 from handsim.files.json_files import claim, load_json, save_json
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
@@ -77,6 +80,7 @@ def render_take(
             shards are kept.
     """
     _check_formats(formats, config)
+    processes = check_workers(workers)
     config = config.settled()
     take = load_shown_take(path)
     if config.background.photo > 0.0:
@@ -90,10 +94,17 @@ def render_take(
     count = views * sum(len(shards[number]) for number in done if number < len(shards))
     total = views * sum(map(len, shards))
     todo = [number for number in range(len(shards)) if number not in done]
-    for number in in_processes(job, todo, workers or os.cpu_count() or 1):
-        count += views * len(shards[number])
-        if progress is not None:
-            progress(count, total)
+    try:
+        for drawn, number in enumerate(in_processes(job, todo, processes)):
+            count += views * len(shards[number])
+            if progress is not None:
+                progress(count, total)
+            if drawn == 0:
+                _check_space(out, len(done) + 1, len(todo) - 1)
+    except KeyboardInterrupt as stop:
+        remove_leftovers(out)  # of workers that had no time to
+        kept = f"{count} of {total} images are in {out}, and the same command goes on after them"
+        raise Stopped(stop.number if isinstance(stop, Stopped) else signal.SIGINT, kept) from stop
     for name in formats:
         open_writer(name, _folder(out, formats, name)).finish()
     lost = frozenset(left_out_frames(out))
@@ -121,6 +132,12 @@ def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
             raise without_colors(name)
     if not formats or len(set(formats)) < len(formats):
         raise HandSimError(f"formats are {', '.join(formats) or 'none'}, expected at least one, each once")
+
+
+def _check_space(out: Path, drawn: int, left: int) -> None:
+    """Refuse the other shards if the disk has no space for them; those that are drawn show what they need."""
+    needed = left * sum(file.stat().st_size for file in out.rglob("*") if file.is_file()) // drawn
+    check_free(out, needed, f"the other {left} shards", "draw fewer frames (--every)", error=HandSimError)
 
 
 def _folder(out: Path, formats: Sequence[str], name: str) -> Path:

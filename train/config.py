@@ -6,13 +6,18 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
-from handsim.errors import HandSimError
+import numpy as np
+
+from handsim._checks import check_number
+from handsim.errors import ArgumentError, HandSimError, choices
 
 Kind = Literal["set", "cnn"]
 """`set` is the default labeler (`train.labelers.set_network`), `cnn` the paper's
 (`train.labelers.cnn_network`)."""
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+_MOST_CLOUDS: Final = 1_000_000  # in a batch
+_MOST_POINTS: Final = 100  # to add to a cloud or drop from it
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +35,30 @@ class SetLabelerConfig:
     """Gaussian basis functions that encode a distance."""
     reach: float = 0.24
     """Largest distance [m] with a basis function of its own; a hand's markers span about this much."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _SIZES.items():
+            _check_count(name, getattr(self, name), low, high)
+        if self.width % self.gates:
+            raise ArgumentError(f"gates is {self.gates}, expected a divisor of width, {self.width}")
+        check_number("reach", self.reach, 0.0, 10.0, above=True)
+
+
+_SIZES: Final = {  # least and greatest; a network beyond these would not fit into memory
+    "num_labels": (1, 1000),
+    "width": (1, 4096),
+    "gates": (1, 4096),
+    "depth": (1, 100),
+    "num_distances": (2, 1000),
+}
+
+
+def _check_count(name: str, value: int, low: int, high: float = np.inf) -> None:
+    """Refuse what is not a whole number in a range."""
+    if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
+        least = f"at least {low}" if low else "0 or more"
+        expected = least if high == np.inf else f"a whole number from {low} to {high}"
+        raise ArgumentError(f"{name} is {value!r}, expected {expected}")
 
 
 Views = Literal["aligned", "random"]
@@ -52,8 +81,11 @@ class CNNConfig:
     def __post_init__(self) -> None:
         for name in ("reject", "spread"):
             value = getattr(self, name)
-            if value is not None and not value > 0.0:
+            if value is not None and not 0.0 < value < np.inf:
                 raise HandSimError(f"{name} is {value}, expected more than 0")
+        _check_count("num_labels", self.num_labels, *_SIZES["num_labels"])
+        if self.views not in get_args(Views):
+            raise ArgumentError(choices(str(self.views), get_args(Views), noun="views"))
 
 
 NetworkConfig = SetLabelerConfig | CNNConfig
@@ -111,6 +143,18 @@ class TrainConfig:
         for name in ("samples", "batch", "devices", "average_every"):
             if getattr(self, name) < 1:
                 raise HandSimError(f"{name} is {getattr(self, name)}, expected at least 1")
+        _check_count("seed", self.seed, 0)
+        _check_count("batch", self.batch, 1, _MOST_CLOUDS)
+        _check_count("ghosts", self.ghosts, 0, _MOST_POINTS)
+        if self.occlude is not None:
+            _check_count("occlude", self.occlude, 0, _MOST_POINTS)
+        check_number("learning_rate", self.learning_rate, 0.0, 10.0, above=True)
+        check_number("weight_decay", self.weight_decay, 0.0, 10.0)
+        check_number("average", self.average, 0.0, 1.0)
+        check_number("jitter", self.jitter, 0.0, 0.1)
+        check_number("rig_share", self.rig_share, 0.0, 1.0)
+        check_number("anisotropy", self.anisotropy, 0.0, 1.0)
+        check_number("knee", self.knee, 0.0, above=True)
 
 
 Preset = Literal["han2018"]

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import signal
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,11 +20,12 @@ from lightning_fabric.loggers.tensorboard import TensorBoardLogger
 from torch import nn
 
 from handsim._version import __version__
+from handsim.app.interrupts import Stopped, interrupt_flag
 from handsim.errors import DatasetError, WeightsError
 from handsim.files.json_files import claim
 from train.config import Kind, TrainConfig
 from train.data.augmentation import Corruption
-from train.data.batches import draw_batch, paper_corruption
+from train.data.batches import Batch, draw_batch, paper_corruption
 from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler
 from train.evaluation.matching_costs import choose_costs
@@ -29,6 +33,7 @@ from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import labeler_of
 from train.labelers.storage import save_network
 from train.reports.run_page import write_run_page
+from train.threads import TrainingThreads, check_threads
 from train.training_state import TrainingState, paper_report, passed
 
 if TYPE_CHECKING:
@@ -51,15 +56,20 @@ def train_labeler(
     config: TrainConfig,
     out: Path,
     *,
+    threads: int | None = None,
     progress: Progress | None = None,
     save_every: float = 60.0,
 ) -> dict[str, Any]:
     """Train a labeler and write weights, card, curves and a page to `out`; continues from a checkpoint there.
 
+    A run there may have had fewer samples. The learning rate then goes on as in a run of the new length.
+
     Args:
         dataset: The training set.
         config: How to train.
         out: Folder of the run.
+        threads: Threads on a CPU; one or all when not given, whichever a few steps show to be faster. Weights
+            differ in their last bits with it.
         progress: Called after every step.
         save_every: Time between checkpoints [s].
 
@@ -69,45 +79,114 @@ def train_labeler(
     Raises:
         DatasetError: The set is too small to train on.
         WeightsError: `out` holds a run of other settings.
+        TrainingError: The loss is not finite.
+        Stopped: A signal came; the last step is kept in the checkpoint.
     """
-    names = dataset.marker_names
-    config = dataclasses.replace(
-        config,
-        network=dataclasses.replace(config.network, num_labels=len(names)),
-        cnn=dataclasses.replace(config.cnn, num_labels=len(names)),
-    )
+    config = _for_labels(config, len(dataset.marker_names))
+    check_threads(threads)
     rows, held_out = _split(dataset, config.batch)
     fabric = start_fabric(config, out)
     settings = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
     with fabric.rank_zero_first():
-        claim(out / _CONFIG, settings, noun="training run", error=WeightsError)
+        claim(out / _CONFIG, settings, noun="training run", error=WeightsError, grows="train.samples")
     torch.manual_seed(config.seed)
-    state = TrainingState(config, fabric, rows)
-    state.restore(out / CHECKPOINT)
-    saved = time.monotonic()
-    while state.done < config.samples:
+    run = _Run(TrainingState(config, fabric, rows), rows, held_out, dataset.marker_names)
+    run.state.restore(out / CHECKPOINT)
+    if fabric.device.type != "cpu":
+        threads = threads or torch.get_num_threads()
+    chosen = TrainingThreads(threads, run.try_step)
+    with chosen.in_use(), run.kept(out / CHECKPOINT):
+        saved = time.monotonic()
+        while run.is_unfinished():
+            chosen.renew()
+            loss = run.step()
+            if progress is not None and fabric.is_global_zero:
+                progress(min(run.state.done, config.samples), config.samples, loss)
+            if time.monotonic() - saved > save_every:
+                run.state.save(out / CHECKPOINT)
+                saved = time.monotonic()
+        run.state.save(out / CHECKPOINT)
+        return _finish(run, dataset, out)
+
+
+def _for_labels(config: TrainConfig, num_labels: int) -> TrainConfig:
+    """The same settings for a layout of this many markers."""
+    return dataclasses.replace(
+        config,
+        network=dataclasses.replace(config.network, num_labels=num_labels),
+        cnn=dataclasses.replace(config.cnn, num_labels=num_labels),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """The state of a run and what it learns from."""
+
+    state: TrainingState
+    rows: NDArray[np.void]
+    held_out: NDArray[np.void]
+    names: tuple[str, ...]
+
+    def is_unfinished(self) -> bool:
+        """Whether there are steps to do; an evaluation that is due is done first."""
+        state, config = self.state, self.state.config
+        evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
+        due = state.done > evaluated and passed(state.done, config, _NUM_EVALUATIONS)
+        if due and state.fabric.is_global_zero:
+            state.evaluate(
+                self.held_out[:: -(-len(self.held_out) // _CURVE_FRAMES[config.labeler])], self.names
+            )
+        return state.done < config.samples
+
+    def step(self) -> float:
+        """Make a step, whole or not at all, and return its loss."""
+        with interrupt_flag() as interrupted:
+            batch, rng = self._draw()
+            loss = self.state.step(batch, rng=rng)
+        if interrupted():
+            raise Stopped(interrupted.number)
+        return loss
+
+    def try_step(self) -> None:
+        """Do the work of the next step; the state stays as it is."""
+        batch, rng = self._draw()
+        self.state.try_step(batch, rng=rng)
+
+    def _draw(self) -> tuple[Batch, np.random.Generator]:
+        """The batch of the next step, and the generator that the step goes on with."""
+        state, config, fabric = self.state, self.state.config, self.state.fabric
         # One generator per step, so that a resumed run makes the same draws.
         rng = np.random.default_rng((config.seed, state.done, fabric.global_rank))
         share = dataclasses.replace(config, batch=config.batch // fabric.world_size)
-        loss = state.step(draw_batch(rows, share, rng=rng), rng=rng)
-        if fabric.is_global_zero and passed(state.done, config, _NUM_EVALUATIONS):
-            state.evaluate(held_out[:: -(-len(held_out) // _CURVE_FRAMES[config.labeler])], names)
-        if progress is not None and fabric.is_global_zero:
-            progress(min(state.done, config.samples), config.samples, loss)
-        if time.monotonic() - saved > save_every:
-            state.save(out / CHECKPOINT)
-            saved = time.monotonic()
-    state.save(out / CHECKPOINT)
-    network = state.averaged()
+        return draw_batch(self.rows, share, rng=rng), rng
+
+    @contextmanager
+    def kept(self, checkpoint: Path) -> Iterator[None]:
+        """Write a checkpoint when a signal ends the block, and say so."""
+        try:
+            yield
+        except KeyboardInterrupt as stop:
+            self.state.save(checkpoint)
+            done, expected = self.state.done, self.state.config.samples
+            raise Stopped(
+                stop.number if isinstance(stop, Stopped) else signal.SIGINT,
+                f"{min(done, expected)} of {expected} samples are kept in {checkpoint}, and the same command "
+                "goes on after them",
+            ) from stop
+
+
+def _finish(run: _Run, dataset: Dataset, out: Path) -> dict[str, Any]:
+    """Evaluate the network, write weights, card and page, and return the card."""
+    config, held_out = run.state.config, run.held_out
+    network = run.state.averaged()
     if isinstance(network, DeepLabelCNN):
-        choose_costs(network, names, held_out)
-    card, report = _card(
-        network, held_out[:: -(-len(held_out) // _CARD_FRAMES[config.labeler])], config, dataset
-    )
-    if fabric.is_global_zero:
-        card["curve"] = state.history.accuracies
+        choose_costs(network, run.names, held_out)
+    few = held_out[:: -(-len(held_out) // _CARD_FRAMES[config.labeler])]
+    card, report = _card(network, few, config, dataset)
+    if run.state.fabric.is_global_zero:
+        card["curve"] = run.state.history.accuracies
         save_network(out, network, card)
-        write_run_page(out, card, state.history, report)
+        write_run_page(out, card, run.state.history, report)
     return card
 
 

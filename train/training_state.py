@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
+import io
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
 from torch import nn
 
-from handsim.errors import WeightsError
+from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
 from train.config import TrainConfig
 from train.data.batches import Batch, paper_corruption
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _CURVE: Final = 200  # points of the loss curve
+
+
+class TrainingError(HandSimError):
+    """A training run that does not converge."""
 
 
 class TrainingState:
@@ -43,7 +47,11 @@ class TrainingState:
         self.began = time.monotonic(), 0
 
     def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
-        """Make one gradient step and return the loss before it."""
+        """Make one gradient step and return the loss before it.
+
+        Raises:
+            TrainingError: The loss is not finite; the state is of no use then.
+        """
         began = time.perf_counter()
         rate = self.config.learning_rate * _rate(self.config, self.done / self.config.samples)
         for group in self.optimizer.param_groups:
@@ -57,6 +65,11 @@ class TrainingState:
         self.done += self.config.batch
         self._average()
         value = float(loss.detach())
+        if not np.isfinite(value):
+            raise TrainingError(
+                f"the loss is {value} after {self.done} samples; begin again with a learning rate below "
+                f"{self.config.learning_rate:g}"
+            )
         self.history.add(value)
         self.history.minutes += (time.perf_counter() - began) / 60.0
         if passed(self.done, self.config, _CURVE) or self.done >= self.config.samples:
@@ -109,8 +122,12 @@ class TrainingState:
             "history": dataclasses.asdict(self.history),
         }
         if self.fabric.is_global_zero:
+            # Through memory: torch puts the temporary name into a file that it opens itself, and does not
+            # say that the disk is full.
+            buffer = io.BytesIO()
+            torch.save(content, buffer)
             with atomic_write(path) as temporary:
-                torch.save(content, temporary)
+                temporary.write_bytes(buffer.getbuffer())
 
     def restore(self, path: Path) -> None:
         """Continue from a checkpoint, if there is one.
@@ -120,15 +137,39 @@ class TrainingState:
         """
         if not path.is_file():
             return
+        stored = io.BytesIO(path.read_bytes())  # torch calls some damage an OSError
         try:
-            content = torch.load(path, weights_only=True, map_location=self.fabric.device)
+            content = torch.load(stored, weights_only=True, map_location=self.fabric.device)
+            self._check(content)
             self.network.load_state_dict(content["network"])
             self.optimizer.load_state_dict(content["optimizer"])
             self.mean, self.done = content["mean"], content["done"]
             self.history = History(**content.get("history", {}))  # older checkpoints have none
-        except (RuntimeError, KeyError, TypeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        except MemoryError:
+            raise
+        except Exception as error:  # a file can be damaged in more ways than torch names
             raise WeightsError(f"{path} is damaged; delete it to begin this run again") from error
         self.began = time.monotonic(), self.done
+
+    def _check(self, content: dict[str, Any]) -> None:
+        """Raise a ValueError unless a checkpoint's tensors are this run's, finite, and its count is one."""
+        done, mean = content["done"], content["mean"]
+        if type(done) is not int or done < 0 or done % self.config.batch:
+            raise ValueError("the number of samples is none of this run's")
+        for name, tensor in self.mean.items():
+            if mean[name].shape != tensor.shape or mean[name].dtype != tensor.dtype:
+                raise ValueError(f"{name} has another shape")
+            if not (torch.isfinite(mean[name]).all() and torch.isfinite(content["network"][name]).all()):
+                raise ValueError(f"{name} is not finite")
+
+    def try_step(self, batch: Batch, *, rng: np.random.Generator) -> None:
+        """Do the work of a step, to time it; the state stays as it is."""
+        kept = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
+        try:
+            self.fabric.backward(batch_loss(self.config, self.network, batch, self.fabric.device, rng=rng))
+        finally:
+            self.optimizer.zero_grad()
+            self.network.load_state_dict(kept)  # means of batch normalization move in a forward pass
 
 
 def _optimizer(config: TrainConfig, network: nn.Module) -> torch.optim.Optimizer:

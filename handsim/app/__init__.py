@@ -4,10 +4,10 @@
 - cli: the command `handsim`, its errors and exit codes
 - presets: commands whose defaults come from a preset
 - demo: what the steps of `handsim demo` share
-- progress: the progress bar of all commands
+- progress: the progress bar of all commands, and lines in its place in a log
 - live_status: one line of status, renewed in place
-- interrupts: Ctrl-C and other ends as a flag that a loop reads
-- workers: numbered jobs in worker processes
+- interrupts: signals to end, as a flag that a loop reads or as an exception
+- workers: numbered jobs in worker processes, which end with their parent
 - system_packages: names of system packages that pip cannot install
 - page: one HTML page of pictures and figures
 """

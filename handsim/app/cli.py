@@ -1,20 +1,27 @@
 """The one command, `handsim`: a table of names, each loaded when it is called.
 
-Exit codes: 0; 1 for a mistake of the user, explained in one line; 2 for usage; 130 when interrupted.
+Exit codes: 0; 1 for a mistake of the user, explained in one line; 2 for usage; 128 and more after a signal
+(130 after Ctrl-C).
 """
 
 from __future__ import annotations
 
 import errno
+import io
 import os
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from handsim._version import __version__
 from handsim.app.command_table import COMMANDS, load
+from handsim.app.interrupts import Stopped, signals_raise
 from handsim.app.presets import PresetCommand
 from handsim.errors import HandSimError, choices
+
+_BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -29,23 +36,91 @@ def main(args: Sequence[str] | None = None) -> int:
 def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
     """Run one command of a table; `main` is this with the table of the release."""
     program = f"handsim {args[0]}" if args and args[0] in commands else "handsim"
+    _prepare_streams()
+    # One core solves its small systems faster than several do; a worker has a core of its own.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        code = _dispatch(commands, args)
+        with signals_raise():
+            code = _dispatch(commands, args)
         sys.stdout.flush()  # a full disk or a closed pipe must show here, not while Python shuts down
         return code
     except BrokenPipeError:  # `handsim ... | head` has seen enough
         _abandon_stdout()
-        return 141
-    except KeyboardInterrupt:
-        print(f"{program}: interrupted", file=sys.stderr)
-        return 130
+        return _BROKEN_PIPE
+    except SystemExit as end:
+        return _leave(end)
+    except KeyboardInterrupt as stop:
+        return _say_stopped(program, stop)
     except (HandSimError, OSError, MemoryError, ImportError) as error:
-        print(f"{program}: {sentence(error)}", file=sys.stderr)
-        try:
-            sys.stdout.flush()
-        except OSError:
-            _abandon_stdout()
+        _complain(f"{program}: {sentence(error)}")
         return 1
+    except Exception as error:
+        _complain(f"{program}: {_unexpected(program, error)}")
+        return 1
+
+
+def _prepare_streams() -> None:
+    """Make the standard streams take any text, and nothing where they are closed."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed; the next file that is opened would else take its place
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")  # names of files need not be text
+
+
+def _leave(end: SystemExit) -> int:
+    """Write out what help or usage printed, and leave; rich leaves a closed pipe with code 1."""
+    pipe: BaseException | None = end
+    while pipe is not None and not isinstance(pipe, BrokenPipeError):
+        pipe = pipe.__context__
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError as error:
+        pipe = error
+    if pipe is None:
+        raise end
+    _abandon_stdout()
+    return _BROKEN_PIPE
+
+
+def _say_stopped(program: str, stop: KeyboardInterrupt) -> int:
+    """Say what is kept after a signal; the exit code says which signal it was."""
+    number, kept = (stop.number, stop.kept) if isinstance(stop, Stopped) else (2, "")
+    how = "interrupted" if number == 2 else f"ended by {signal_name(number)}"
+    _complain(f"{program}: {how}{'; ' if kept else ''}{kept}")
+    return 128 + number
+
+
+def signal_name(number: int) -> str:
+    """The name of a signal, such as SIGTERM."""
+    import signal
+
+    return signal.Signals(number).name
+
+
+def _complain(line: str) -> None:
+    """Print a line for the user; nobody may be there to read it."""
+    try:
+        print(line, file=sys.stderr, flush=True)
+        sys.stdout.flush()
+    except OSError:
+        _abandon_stdout()
+
+
+def _unexpected(program: str, error: Exception) -> str:
+    """The sentence of the last resort, with the file that the traceback is in."""
+    what = f"unexpected {type(error).__name__}: {_one_line(error)[:200]}"
+    trace = traceback.format_exc()
+    try:
+        prefix = program.replace(" ", "-") + "-"
+        with tempfile.NamedTemporaryFile(
+            "w", prefix=prefix, suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as log:
+            log.write(f"handsim {__version__}, Python {sys.version}\n{sys.argv}\n\n{trace}")
+    except OSError:
+        return f"{what}; this is a mistake in handsim, please report it with this:\n{trace}"
+    return f"{what}; this is a mistake in handsim, please report it with {log.name}"
 
 
 def sentence(error: Exception) -> str:
@@ -76,7 +151,10 @@ def _one_line(error: Exception) -> str:
 
 def _abandon_stdout() -> None:
     """Give up what could not be written, or Python tries once more at its end and exits with 120."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    try:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (OSError, ValueError):  # a stream without a file
+        return
 
 
 def _dispatch(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""Ctrl-C, and other signals that end a process, as a flag that a loop reads when it has finished a step."""
+"""Signals that ask a command to end: as a flag that a loop reads, or as an exception with what is kept."""
 
 from __future__ import annotations
 
@@ -7,42 +7,82 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 ENDING: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
-"""Signals that end a process: Ctrl-C, of a batch system, of a terminal that was closed."""
+"""Ctrl-C, the end of a batch job, and a terminal that closes."""
+
+
+class Stopped(KeyboardInterrupt):
+    """A command was asked to end.
+
+    Args:
+        number: The signal.
+        kept: What is kept and how to go on, a sentence without a capital and a period.
+    """
+
+    def __init__(self, number: int = signal.SIGINT, kept: str = "") -> None:
+        super().__init__(kept)
+        self.number = number
+        self.kept = kept
+
+
+class InterruptFlag:
+    """Whether a signal to end came; called, it answers."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        """The first signal that came, 0 if none did."""
+
+    def __call__(self) -> bool:
+        """Whether one came."""
+        return self.number != 0
+
+    def note(self, number: int, _frame: FrameType | None) -> None:
+        """Keep the first signal; raise at the second."""
+        if self.number:
+            raise Stopped(number)
+        self.number = number
 
 
 @contextmanager
-def interrupt_flag(signals: Sequence[int] = (signal.SIGINT,)) -> Iterator[Callable[[], bool]]:
-    """Within the block the first interrupt raises nothing; the yielded function returns whether it came.
+def interrupt_flag() -> Iterator[InterruptFlag]:
+    """Within the block the first signal to end raises nothing; the yielded flag says whether it came.
 
     An exception from a signal can be lost: compiled code that calls back into Python swallows it. A second
-    Ctrl-C raises as usual. Only the main thread gets signals; in other threads the function returns False.
-
-    Args:
-        signals: Those that count, such as `ENDING`. A hangup that is ignored, as under nohup, stays so.
+    signal raises. Only the main thread gets signals; in other threads the flag stays down.
     """
-    received = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield received.is_set
-        return
+    flag = InterruptFlag()
+    with _handled(flag.note, ENDING):
+        yield flag
 
-    def note(number: int, _frame: FrameType | None) -> None:
-        if received.is_set() and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        received.set()
 
-    noted = [
-        number
-        for number in signals
-        if number == signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN
-    ]
-    before = {number: signal.signal(number, note) for number in noted}
+@contextmanager
+def signals_raise() -> Iterator[None]:
+    """Within the block SIGTERM and SIGHUP raise `Stopped`, as Ctrl-C raises KeyboardInterrupt.
+
+    So a command that a batch system ends cleans up like one that its user interrupts.
+    """
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        raise Stopped(number)
+
+    with _handled(stop, ENDING[1:]):
+        yield
+
+
+@contextmanager
+def _handled(handler: Callable[[int, FrameType | None], None], numbers: tuple[int, ...]) -> Iterator[None]:
+    """These signals go to a handler within the block; one that is ignored, as under nohup, stays ignored."""
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in numbers:
+            if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                before[number] = signal.signal(number, handler)
     try:
-        yield received.is_set
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, handler_before in before.items():
+            signal.signal(number, handler_before)

@@ -1,9 +1,12 @@
-"""The one progress bar of all commands."""
+"""The one progress bar of all commands; in a batch job's log, a line every ten seconds."""
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Final
 
 from rich.console import Console
 from rich.progress import (
@@ -17,6 +20,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.text import Text
+
+EVERY: Final = 10.0
+"""Time between two lines where there is no terminal [s]."""
 
 
 @contextmanager
@@ -32,7 +38,46 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
     )
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        yield bar, bar.add_task("", total=1)
+        task = bar.add_task("", total=1)
+        if console.is_terminal:
+            yield bar, task
+        else:
+            with _lines(console, bar.tasks[0], unit):
+                yield bar, task
+
+
+@contextmanager
+def _lines(console: Console, task: Task, unit: str, every: float = EVERY) -> Iterator[None]:
+    """Print the state of a task now and then, so that a log shows that it lives."""
+    ended = threading.Event()
+    start = time.monotonic()
+
+    def report() -> None:
+        while not ended.wait(every):
+            line = _line(task, unit, time.monotonic() - start)
+            try:
+                console.print(line, soft_wrap=True, markup=False, highlight=False)
+            except (OSError, SystemExit):  # nobody reads it
+                return
+
+    thread = threading.Thread(target=report, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+
+
+def _line(task: Task, unit: str, seconds: float) -> str:
+    """How far a task is: the share done, its speed and the time that it has taken."""
+    speed = str(_Speed(unit).render(task))
+    total = 0.0 if task.total is None else task.total
+    if total == 1.0 and not task.completed:  # the task does not know its size yet
+        done = f"working on {unit}"
+    else:
+        done = f"{task.completed:,.0f} of {total:,.0f} {unit}"
+    clock = f"{seconds // 3600:.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
+    return ", ".join(part for part in (done, task.description, speed, clock) if part)
 
 
 class _Speed(ProgressColumn):

@@ -14,6 +14,7 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from handsim._kernel_cache import VARIABLE, kernel_cache
 from handsim._siblings import SIBLINGS, shadowed_siblings
 from handsim.app.system_packages import EGL_PACKAGES
 
@@ -83,6 +84,7 @@ def examine() -> list[Finding]:
         *check_names(metadata.packages_distributions(), shadowed_siblings()),
         check_drawing(*_finish(drawing)),
         check_gpu(*_finish(gpu)),
+        check_kernel_cache(),
         *check_room(),
     ]
 
@@ -171,6 +173,15 @@ def check_gpu(code: int, output: str) -> Finding:
     """What torch can compute on; only a torch that cannot be imported is a fault."""
     remedy = "" if code == 0 else "install torch anew; CONTRIBUTING.md says how to get its CPU build"
     return Finding("GPU for training", output, remedy=remedy)
+
+
+def check_kernel_cache() -> Finding:
+    """Where numba keeps compiled kernels; without a lasting place each machine start compiles them anew."""
+    folder, lasts = kernel_cache()
+    writable = os.access(folder if folder.exists() else folder.parent, os.W_OK)
+    remedy = "" if lasts and writable else f"set {VARIABLE} to a folder of yours that lasts"
+    found = str(folder) if writable else f"{folder}, which cannot be written"
+    return Finding("compiled kernels", found, "a folder that lasts", remedy, needed=False)
 
 
 def check_room() -> Iterator[Finding]:

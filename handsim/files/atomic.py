@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import glob
 import os
+import shutil
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +21,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     The temporary file has the same suffix, because some writers add one they miss. If the block raises,
     whatever the reason, the temporary file is removed, an older file at `path` stays as it was, and the error
-    goes on to the caller. Folders that are missing on the way to `path` are made.
+    goes on to the caller. Folders that are missing on the way to `path` are made. The finished file has the
+    mode that the umask asks for, whatever its writer chose. What a killed process left of the same file is
+    removed first.
 
     Args:
         path: Where the finished file shall be; an existing file there is replaced.
@@ -54,11 +58,14 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         if final.exists() and not final.is_file():
             raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
         final.parent.mkdir(parents=True, exist_ok=True)
-    temporaries = [final.with_name(f".{final.stem}.tmp-{os.getpid()}{final.suffix}") for final in finals]
+        _remove_abandoned(final)
+    temporaries = [temporary_beside(final) for final in finals]
+    modes = [_usual_mode(*pair) for pair in zip(temporaries, finals, strict=True)]
     renamed: list[Path] = []
     try:
         yield tuple(temporaries)
-        for temporary in temporaries:
+        for temporary, mode in zip(temporaries, modes, strict=True):
+            os.chmod(temporary, mode)
             _flush(temporary)
         for temporary, final in zip(temporaries, finals, strict=True):
             os.replace(temporary, final)
@@ -67,6 +74,57 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         for file in (*temporaries, *renamed):
             file.unlink(missing_ok=True)
         raise
+
+
+def temporary_beside(path: Path) -> Path:
+    """The hidden name under which this process writes `path`; `remove_leftovers` knows such names."""
+    return path.with_name(f".{path.stem}.tmp-{os.getpid()}{path.suffix}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove every temporary file and folder in a folder and below it that no process writes any more.
+
+    Only for a folder that one job owns: what another living process is writing there would be lost.
+    """
+    for leftover in folder.glob("**/.*.tmp-*"):
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
+            leftover.unlink(missing_ok=True)
+
+
+def _remove_abandoned(final: Path) -> None:
+    """Remove the temporary files of `final` whose process is gone."""
+    prefix = f".{final.stem}.tmp-"
+    for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
+        number = leftover.name.removeprefix(prefix).removesuffix(final.suffix)
+        if number.isdecimal() and leftover.is_file() and not _is_running(int(number)):
+            leftover.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    if os.name != "posix":  # there a signal of zero would end the process
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # another user's
+        return True
+    return True
+
+
+def _usual_mode(temporary: Path, final: Path) -> int:
+    """The mode of a new file here; some writers make theirs readable by the owner alone."""
+    try:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(final)) from error
+    try:
+        return os.fstat(descriptor).st_mode & 0o777
+    finally:
+        os.close(descriptor)
+        temporary.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
-import shutil
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, remove_leftovers
+
+_MOST_SHOWN: Final = 4  # settings that a message lists
+_MISSING: Final = "nothing"
 
 
 def save_json(path: Path, content: dict[str, Any]) -> None:
@@ -25,36 +28,101 @@ def load_json(path: Path) -> dict[str, Any]:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:  # the second: brackets nested thousands deep
         raise DatasetError(f"{path} is damaged: it does not hold JSON") from error
     if not isinstance(content, dict):
         raise DatasetError(f"{path} is damaged: it does not hold a JSON object")
     return content
 
 
-def claim(path: Path, settings: dict[str, Any], *, noun: str, error: type[HandSimError]) -> None:
+def claim(
+    path: Path,
+    settings: dict[str, Any],
+    *,
+    noun: str,
+    error: type[HandSimError],
+    grows: str = "",
+    result: Path | None = None,
+) -> None:
     """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
+
+    Args:
+        path: The settings file; its folder is claimed.
+        settings: What decides the content of the folder.
+        noun: What the folder holds, for messages.
+        error: Class of the error.
+        grows: A setting, written like `train.samples`, that may be larger than in the file; the file then
+            takes the new settings.
+        result: A file that is true for the old settings only; it is removed before they change.
 
     Raises:
         HandSimError: Of class `error`: the `noun` there has other settings, or something else is there.
     """
     out = path.parent
     if path.is_file():
-        found, expected = load_json(path), json.loads(json.dumps(settings))
-        differing = sorted(
-            key for key in found.keys() | expected.keys() if found.get(key) != expected.get(key)
-        )
-        if differing:
-            begun = f"{noun} begun with other settings ({', '.join(differing)})"
-            raise error(f"{out} holds a {begun}; use them or another folder")
-        for leftover in out.glob(".*.tmp-*"):
-            if leftover.is_dir():
-                shutil.rmtree(leftover, ignore_errors=True)
-            else:
-                leftover.unlink(missing_ok=True)
+        found, expected = _flat(load_json(path)), _flat(json.loads(json.dumps(settings)))
+        differing = [key for key in sorted(found.keys() | expected) if not _same(found, expected, key)]
+        grown = differing == [grows] and _is_larger(expected.get(grows), found.get(grows))
+        if differing and not grown:
+            raise error(
+                f"{out} holds a {noun} begun with other settings ({_told(differing, found, expected)}); "
+                f"use them or another folder{_hint(grows, differing)}"
+            )
+        remove_leftovers(out)
+        if grown:
+            if result is not None:
+                result.unlink(missing_ok=True)
+            save_json(path, settings)
     elif out.exists() and not out.is_dir():
         raise error(f"{out} is a file, expected a folder")
-    elif out.is_dir() and any(out.iterdir()):
+    elif out.is_dir() and any(entry.name not in _begun(path) for entry in out.iterdir()):
         raise error(f"{out} is not empty and holds no {noun}; name another folder")
     else:
+        if out.is_dir():
+            remove_leftovers(out)
         save_json(path, settings)
+
+
+def _begun(path: Path) -> set[str]:
+    """What a run leaves that was killed while it wrote its settings file."""
+    return {entry.name for entry in path.parent.glob(f".{path.stem}.tmp-*")}
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by their path of names, `train.network.width`; lists are values."""
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        if isinstance(value, dict) and value:
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _same(found: dict[str, Any], expected: dict[str, Any], key: str) -> bool:
+    return key in found and key in expected and bool(found[key] == expected[key])
+
+
+def _is_larger(new: object, old: object) -> bool:
+    return isinstance(new, int) and isinstance(old, int) and new > old
+
+
+def _told(differing: Collection[str], found: dict[str, Any], expected: dict[str, Any]) -> str:
+    """The settings that differ, with both values."""
+
+    def pairs() -> Iterator[str]:
+        for key in list(differing)[:_MOST_SHOWN]:
+            yield f"{key}: {_shown(found, key)} there, {_shown(expected, key)} here"
+
+    more = len(differing) - _MOST_SHOWN
+    return "; ".join(pairs()) + (f"; and {more} more" if more > 0 else "")
+
+
+def _shown(settings: dict[str, Any], key: str) -> str:
+    text = json.dumps(settings[key], ensure_ascii=False) if key in settings else _MISSING
+    return text if len(text) <= 40 else text[:40] + "..."
+
+
+def _hint(grows: str, differing: Collection[str]) -> str:
+    """A word about the one setting that may grow, where that is what differs."""
+    return f" ({grows} may only grow)" if grows and list(differing) == [grows] else ""

@@ -155,7 +155,7 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
         (["train", "nowhere", "--out", "OUT"], "expected a training set with a manifest.json, but nowhere"),
         (
             ["train", "SET", "--out", "RUN", "--seed", "5"],
-            "holds a training run begun with other settings (train)",
+            "begun with other settings (train.seed: 0 there, 5 here); use them or another",
         ),
     ],
 )

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Any, NamedTuple
 
 from gloves.takes.tracked_take import TrackedTake
-from handsim.app.interrupts import ENDING, interrupt_flag
+from handsim.app.interrupts import interrupt_flag
 from handsim.app.live_status import LiveStatus
 from track.capture_tracking import track_stream
 from track.live_recording import LiveRecorder
@@ -50,7 +50,7 @@ def track_live(
         CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
     """
     with (
-        interrupt_flag(ENDING) as interrupted,  # the frames so far are kept
+        interrupt_flag() as interrupted,  # the frames so far are kept
         closing(open_stream(url, ended=interrupted)) as stream,
         LiveRecorder(tracker, out, settings) as recorder,
         LiveStatus() as status,

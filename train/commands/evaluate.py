@@ -15,6 +15,7 @@ from handsim.errors import HandSimError
 from handsim.files.json_files import save_json
 from train.labelers.storage import labeler_for_glove
 from train.reports.figures_table import print_figures
+from train.threads import label_on
 
 
 def evaluate(
@@ -26,6 +27,7 @@ def evaluate(
     ghosts: int = 0,
     seed: int = 0,
     json: Path | None = None,
+    threads: int = 1,
 ) -> None:
     """Measure a labeler on labeled captures, corrupted as in the paper.
 
@@ -37,12 +39,16 @@ def evaluate(
         ghosts: Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2).
         seed: Seed of the corruption.
         json: File for the figures.
+        threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
     from train.data.augmentation import Corruption
     from train.evaluation.labeler_evaluation import evaluate_labeler, evaluate_takes
 
     if occlude < 0 or ghosts < 0:
         raise HandSimError(f"occlude is {occlude} and ghosts {ghosts}, expected 0 or more of each")
+    if seed < 0:
+        raise HandSimError(f"seed is {seed}, expected 0 or more")
+    label_on(threads)
     network = labeler_for_glove(glove, labeler)
     if all(path.suffix == ".npz" for path in captures):
         if occlude or ghosts:

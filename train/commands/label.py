@@ -14,6 +14,7 @@ from gloves.captures.markers import labeled_capture, unlabeled_frames
 from gloves.layout import load_layout
 from handsim.app.progress import progress_bar
 from train.labelers.storage import labeler_for_glove
+from train.threads import label_on
 
 _SIDE_FRAMES: Final = 100
 
@@ -23,6 +24,7 @@ def label(
     out: Path,
     glove: str = "dense19",
     labeler: str | None = None,
+    threads: int = 1,
 ) -> None:
     """Label every frame of a capture on its own; names and order of its columns are not used.
 
@@ -31,7 +33,9 @@ def label(
         out: Labeled .trc or .c3d file; points that are not markers become columns Unlabeled1, Unlabeled2, ...
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
+        threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
+    label_on(threads)
     check_suffix(out, WRITABLE)  # before the work, not after it
     network = labeler_for_glove(glove, labeler)
     source = read_capture(capture)

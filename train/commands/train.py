@@ -25,6 +25,7 @@ def _train(
     out: Path,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")],
     preset: Preset | None = None,
+    threads: int | None = None,
 ) -> None:
     """Train a labeler on a training set and write a page about it; run it again to continue a stopped run.
 
@@ -33,6 +34,7 @@ def _train(
         out: Folder for the weights, the model card, the checkpoint and report.html.
         config: How to train.
         preset: A published recipe, which replaces the defaults; options given beside it hold.
+        threads: Threads on a CPU; the faster of one and all when not given, measured now and then.
     """
     del preset  # it is in `config` already
     from train.loop import train_labeler
@@ -43,7 +45,7 @@ def _train(
         def report(done: int, total: int, loss: float) -> None:
             bar.update(task, completed=done, total=total, description=f"loss {loss:.3f}")
 
-        card = train_labeler(rows, config, out, progress=report)
+        card = train_labeler(rows, config, out, threads=threads, progress=report)
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
     Console().print(f"weights and model card in {out}")
     Console().print(f"report in {out / PAGE}", soft_wrap=True, markup=False)
@@ -71,8 +73,9 @@ def _dataset_of(
     out: Path,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")],
     preset: Preset | None = None,
+    threads: int | None = None,
 ) -> Path:
-    del out, config, preset
+    del out, config, preset, threads
     return dataset
 
 

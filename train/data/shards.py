@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import zipfile
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -16,10 +18,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gloves.optics.ghosts import MAX_GHOSTS
-from handsim.errors import DatasetError
+from handsim.errors import DatasetError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.json_files import load_json, save_json
-from handsim.hand.records import unpack_hand
+from handsim.hand.records import HAND_DTYPE, unpack_hand
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_QPOS
 
@@ -132,10 +134,54 @@ def load_manifest(path: Path) -> Manifest:
     content = load_json(path / MANIFEST)
     if content.get("schema") != SCHEMA:
         raise DatasetError(f"{path} has schema {content.get('schema')}, expected {SCHEMA}")
-    try:
-        return Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
-    except (TypeError, KeyError) as error:
-        raise DatasetError(f"{path / MANIFEST} is damaged: a field is missing or unknown") from error
+    return checked_manifest(path / MANIFEST, content)
+
+
+_MANIFEST_FIELDS: Final[dict[str, tuple[str, Callable[[Any], bool]]]] = {
+    "config": ("a table", lambda value: isinstance(value, dict)),
+    "marker_names": (
+        "a list of different names",
+        lambda value: _are_names(value) and len(set(value)) == len(value) > 0,
+    ),
+    "num_frames": ("a whole number of at least 1", lambda value: type(value) is int and value >= 1),
+    "min_cameras": ("a whole number of at least 1", lambda value: type(value) is int and value >= 1),
+    "files": (
+        "a table of names of files in this folder and their SHA-256",
+        lambda value: _is_table_of(value, str) and all(Path(name).name == name for name in value),
+    ),
+    "redrawn": ("a table of counts", lambda value: value is None or _is_table_of(value, int)),
+    "units": ("text", lambda value: isinstance(value, str)),
+    "schema": (str(SCHEMA), lambda value: value == SCHEMA),
+}
+_MAY_LACK: Final = {"redrawn", "units"}
+
+
+def _are_names(value: object) -> bool:
+    return isinstance(value, list) and all(isinstance(name, str) for name in value)
+
+
+def _is_table_of(value: object, kind: type) -> bool:
+    return isinstance(value, dict) and all(type(entry) is kind for entry in value.values())
+
+
+def checked_manifest(file: Path, content: dict[str, Any]) -> Manifest:
+    """The manifest that a file's content is.
+
+    Raises:
+        DatasetError: A field is missing, unknown, or holds something else.
+    """
+    remedy = "delete it and run handsim generate again"
+    for name in content.keys() | _MANIFEST_FIELDS.keys():
+        if name not in _MANIFEST_FIELDS:
+            raise DatasetError(
+                f"{file} is damaged: {choices(name, _MANIFEST_FIELDS, noun='field')}; {remedy}"
+            )
+        expected, is_right = _MANIFEST_FIELDS[name]
+        if name not in content and name not in _MAY_LACK:
+            raise DatasetError(f"{file} is damaged: the field {name} is missing; {remedy}")
+        if name in content and not is_right(content[name]):
+            raise DatasetError(f"{file} is damaged: {name} is not {expected}; {remedy}")
+    return Manifest(**{**content, "marker_names": tuple(content["marker_names"])})
 
 
 class Dataset:
@@ -166,7 +212,14 @@ class Dataset:
                 )
         self.path = path
         names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
-        self.shards = [np.load(path / name, mmap_mode="r", allow_pickle=False) for name in names]
+        dtype = row_dtype(len(self.manifest.marker_names))
+        self.shards = [_load_records(path / name, dtype) for name in names]
+        found = sum(map(len, self.shards))
+        if found != self.manifest.num_frames:
+            raise DatasetError(
+                f"{path / MANIFEST} says {self.manifest.num_frames} frames, but the shards hold {found}; "
+                "delete it and run handsim generate again"
+            )
 
     @property
     def marker_names(self) -> tuple[str, ...]:
@@ -179,4 +232,21 @@ class Dataset:
 
     def hands(self, shard: int) -> list[HandShape]:
         """The hands of a shard; the `hand` of its rows is an index into them."""
-        return [unpack_hand(record) for record in np.load(self.path / hands_name(shard), allow_pickle=False)]
+        return [unpack_hand(record) for record in _load_records(self.path / hands_name(shard), HAND_DTYPE)]
+
+
+def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """A memory-mapped list of records of this type.
+
+    Raises:
+        DatasetError: The file holds something else.
+    """
+    try:
+        records: NDArray[np.void] = np.load(file, mmap_mode="r", allow_pickle=False)
+        if not isinstance(records, np.memmap):
+            raise ValueError("an archive, not an array")
+    except (ValueError, EOFError, TypeError, SyntaxError, RecursionError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{file} is damaged: it is no .npy file") from error
+    if records.dtype != dtype or records.ndim != 1:
+        raise DatasetError(f"{file} holds other records than those of this set; expected {dtype.names}")
+    return records

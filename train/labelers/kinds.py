@@ -16,6 +16,7 @@ from train.labelers.protocol import Labeler
 from train.labelers.set_labeler import TrainedSetLabeler, set_loss
 from train.labelers.set_network import SetLabeler
 from train.labelers.views import MeanHand
+from train.threads import labeling_threads
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,7 +56,8 @@ def cnn_labeler(network: DeepLabelCNN, marker_names: tuple[str, ...]) -> CNNLabe
 
     @torch.inference_mode()
     def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
-        predicted: NDArray[np.float32] = network(torch.from_numpy(images)).numpy()
+        with labeling_threads():
+            predicted: NDArray[np.float32] = network(torch.from_numpy(images)).numpy()
         return predicted
 
     return CNNLabeler(positions, network.mean_hand.get(), network.config, marker_names)

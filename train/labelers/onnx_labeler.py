@@ -14,7 +14,7 @@ from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
 from train.config import CNNConfig
 from train.labelers.cnn_labeler import CNNLabeler
-from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+from train.labelers.protocol import Labeling, checked_names, label_by_scores, label_in_batches, pad_clouds
 from train.labelers.views import MeanHand
 
 if TYPE_CHECKING:
@@ -60,13 +60,28 @@ class OnnxLabeler:
                 path.read_bytes(), options, providers=["CPUExecutionProvider"]
             )
             metadata = self._session.get_modelmeta().custom_metadata_map
-            names = json.loads(metadata[_NAMES])
-            self.marker_names: tuple[str, ...] = tuple(names)
+            self.marker_names = checked_names(json.loads(metadata[_NAMES]))
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
+            self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
         except Exception as error:  # onnxruntime's errors have no common class of their own
             raise WeightsError(
                 f"{path} is damaged or not a labeler's: expected what handsim export wrote"
             ) from error
+
+    def _try(self, given: str) -> None:
+        """Raise a ValueError unless the network gives finite numbers of the right shapes."""
+        count = len(self.marker_names)
+        if given == _IMAGES:
+            found = self._session.run(None, {_IMAGES: np.zeros((1, 1, 52, 52), np.float32)})[:1]
+            shapes = [(1, count, 3)]
+        else:
+            points = np.linspace(0.0, 0.1, 15, dtype=np.float32).reshape(1, 5, 3)
+            found = self._session.run(
+                _OUTPUTS, dict(zip(_INPUTS, (points, np.ones((1, 5), bool)), strict=True))
+            )
+            shapes = [(1, 5, count + 1), (1, count, 6)]
+        if [output.shape for output in found] != shapes or not all(np.isfinite(one).all() for one in found):
+            raise ValueError("the outputs are not those of a labeler")
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""

@@ -49,6 +49,19 @@ class Labeler(Protocol):
         ...
 
 
+def checked_names(names: object) -> tuple[str, ...]:
+    """Marker names out of a file.
+
+    Raises:
+        ValueError: They are not different texts.
+    """
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError("marker_names is not a list of names")
+    if len(set(names)) < len(names) or not names:
+        raise ValueError("marker_names names a marker twice, or none")
+    return tuple(names)
+
+
 def label_in_batches(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     label: Callable[[list[NDArray[np.float64]]], list[Labeling]],

@@ -10,6 +10,7 @@ import torch
 from train.data.batches import Batch
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
 from train.labelers.set_network import SetLabeler, labeling_loss
+from train.threads import labeling_threads
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,7 +38,8 @@ class TrainedSetLabeler:
     @torch.inference_mode()
     def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
         points, present = pad_clouds(clouds)
-        scores = self.network(torch.from_numpy(points), torch.from_numpy(present))
+        with labeling_threads():
+            scores = self.network(torch.from_numpy(points), torch.from_numpy(present))
         return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy())
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from gloves.layout import load_layout
-from handsim.errors import WeightsError, choices
+from handsim.errors import HandSimError, WeightsError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
-from train.labelers.protocol import Labeler
+from train.labelers.protocol import Labeler, checked_names
 
 if TYPE_CHECKING:
     from torch import nn
@@ -65,6 +65,11 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         if not weights.is_file() or not card.is_file():
             unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler")
             raise WeightsError(f"{unknown}, a folder that handsim train wrote, or an .onnx file")
+    return _read_network(weights, card)
+
+
+def _read_network(weights: Path, card: Path) -> tuple[nn.Module, dict[str, Any]]:
+    """A network from its two files; nothing in them is trusted."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -72,25 +77,49 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
 
     try:
         content = json.loads(card.read_text(encoding="utf-8"))
-        names = tuple(content["marker_names"])
-        network = new_network(_CONFIGS[content.get("labeler", "set")](**content["network"]))
+        names = checked_names(content["marker_names"])
+        config = _CONFIGS[content.get("labeler", "set")](**content["network"])
+        if len(names) != config.num_labels:
+            raise WeightsError(f"{card} names {len(names)} markers for {config.num_labels} labels")
+        if weights.stat().st_size < _bytes_of(config):  # before memory is asked for
+            raise ValueError("it is too short for the network that its card describes")
+        network = new_network(config)
         network.load_state_dict(load_file(weights))
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise WeightsError(
-            f"{weights} is damaged or not a labeler's: {str(error).splitlines()[0]}"
-        ) from error
-    if len(names) != content["network"]["num_labels"]:
-        raise WeightsError(f"{card} names {len(names)} markers for {content['network']['num_labels']} labels")
+    except WeightsError:
+        raise
+    except (HandSimError, SafetensorError, OSError, ValueError, LookupError, TypeError) as error:
+        raise _damaged(weights, error) from error
+    except (AttributeError, RuntimeError, RecursionError, OverflowError) as error:
+        raise _damaged(weights, error) from error
+    for name, tensor in network.state_dict().items():
+        if not tensor.isfinite().all():
+            raise WeightsError(f"{weights} is damaged: {name} holds NaN or infinite values")
     return network, content
+
+
+def _bytes_of(config: NetworkConfig) -> int:
+    """Size of a network's weights, which are not made."""
+    import torch
+
+    from train.labelers.kinds import new_network
+
+    with torch.device("meta"):
+        state = new_network(config).state_dict()
+    return sum(tensor.numel() * tensor.element_size() for tensor in state.values())
+
+
+def _damaged(weights: Path, error: Exception) -> WeightsError:
+    reason = (str(error) or type(error).__name__).splitlines()[0]
+    return WeightsError(f"{weights} is damaged or not a labeler's: {reason}")
 
 
 def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None:
     """Write weights and model card; `card` holds at least `marker_names`."""
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     with atomic_write(folder / WEIGHTS) as temporary:
-        save_file(tensors, temporary)
+        temporary.write_bytes(save(tensors))  # safetensors' own writing hides that a disk is full
     config: NetworkConfig = network.config  # type: ignore[assignment]
     kind = "cnn" if isinstance(config, CNNConfig) else "set"
     save_json(folder / CARD, {"labeler": kind, "network": dataclasses.asdict(config), **card})

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from gloves.optics.ghosts import GhostConfig
 from gloves.optics.reconstruction import OpticsConfig
+from handsim._checks import check_number, check_span
 from handsim.errors import DatasetError
 from handsim.hand.shape import Population
 from poses.shapes.samplers import PoseMix
@@ -50,3 +51,10 @@ class DatasetConfig:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected at least 1")
         if self.seed < 0:
             raise DatasetError(f"seed is {self.seed}, expected 0 or more")
+        check_number("slip_along", self.slip_along, 0.0, 1.0)
+        check_number("slip_around", self.slip_around, 0.0, 90.0)
+        check_number("volume", self.volume, 0.0, 10.0)
+        for name in ("blob_loss", "dropout"):
+            check_span(name, getattr(self, name))
+            if getattr(self, name)[1] > 1.0:
+                raise DatasetError(f"{name} is {getattr(self, name)}, expected chances from 0 to 1")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
+import signal
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +14,11 @@ import numpy as np
 
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
-from handsim.app.workers import in_processes
+from handsim.app.interrupts import Stopped
+from handsim.app.workers import check_workers, in_processes
 from handsim.errors import DatasetError
+from handsim.files.atomic import remove_leftovers
+from handsim.files.disk import check_free
 from handsim.files.json_files import claim, load_json, save_json
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
@@ -23,6 +26,7 @@ from handsim.hand.topology import SIDES
 from handsim.space.cameras import ROOM_CENTER, check_outside_volume, list_rigs, load_rig
 from train.data.shards import (
     CONFIG,
+    MANIFEST,
     Manifest,
     checksum,
     hands_name,
@@ -38,6 +42,7 @@ from train.simulation.people import sample_hands
 from train.simulation.training_frames import simulate_frames
 
 ROWS_PER_SHARD: Final = 8192
+_SMALL: Final = 50_000_000  # bytes that no disk is asked for
 Progress = Callable[[int, int], None]
 """Called with frames done and frames expected."""
 
@@ -45,11 +50,11 @@ Progress = Callable[[int, int], None]
 def generate_dataset(
     config: DatasetConfig, out: Path, *, workers: int | None = None, progress: Progress | None = None
 ) -> Manifest:
-    """Make a training set, or finish one that was stopped; the bytes depend on the config alone.
+    """Make a training set, finish a stopped one, or let one grow; the bytes depend on the config alone.
 
     Args:
         config: What to make.
-        out: Folder to make it in.
+        out: Folder to make it in. A set there may have fewer frames and must have the same settings else.
         workers: Processes; all cores when not given.
         progress: Called after every shard.
 
@@ -58,10 +63,11 @@ def generate_dataset(
         them. Positions are in [m], angles in [rad].
 
     Raises:
-        DatasetError: `out` holds a set of another config, or a worker died.
+        DatasetError: `out` holds a set of another config, its disk is too small, or a worker died.
         LayoutError: The glove is unknown or does not fit.
         ArgumentError: The rig is unknown or stands in the hands' way, or no hand of the population can rest.
     """
+    processes = check_workers(workers)
     layout, rig = load_layout(config.glove), load_rig(config.rig)
     check_outside_volume(rig, np.array(ROOM_CENTER), config.volume)
     if config.min_cameras > len(rig.positions):
@@ -76,16 +82,25 @@ def generate_dataset(
             "T_world_camera": rig.T_world_camera.tolist(),
             "field_of_view": rig.field_of_view,
         }
-    claim(out / CONFIG, settings, noun="training set", error=DatasetError)
+    _check_space(config, out, layout.num_markers)
+    claim(
+        out / CONFIG,
+        settings,
+        noun="training set",
+        error=DatasetError,
+        grows="num_frames",
+        result=out / MANIFEST,
+    )
     shards = range(-(-config.num_frames // ROWS_PER_SHARD))
-    todo = [shard for shard in shards if not _finished(out, shard)]
+    todo = [shard for shard in shards if not _finished(config, out, shard)]
     done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
-    for shard in in_processes(
-        functools.partial(make_shard, config, out), todo, workers or os.cpu_count() or 1
-    ):
-        done += _shard_size(config, shard)
-        if progress is not None:
-            progress(done, config.num_frames)
+    try:
+        for shard in in_processes(functools.partial(make_shard, config, out), todo, processes):
+            done += _shard_size(config, shard)
+            if progress is not None:
+                progress(done, config.num_frames)
+    except KeyboardInterrupt as stop:
+        raise _stopped(stop, out, done, config.num_frames) from stop
     names = [name(shard) for shard in shards for name in (rows_name, hands_name)]
     manifest = Manifest(
         config=load_json(out / CONFIG),
@@ -99,8 +114,34 @@ def generate_dataset(
     return manifest
 
 
-def _finished(out: Path, shard: int) -> bool:
-    return (out / rows_name(shard)).is_file() and (out / hands_name(shard)).is_file()
+def _stopped(stop: KeyboardInterrupt, out: Path, done: int, expected: int) -> Stopped:
+    """The same signal, with what is kept."""
+    remove_leftovers(out)  # of workers that had no time to
+    number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
+    return Stopped(
+        number, f"{done} of {expected} frames are in {out}, and the same command goes on after them"
+    )
+
+
+def _check_space(config: DatasetConfig, out: Path, num_markers: int) -> None:
+    """Refuse a set that is larger than the disk."""
+    people = config.num_frames // config.frames_per_hand + 1
+    needed = config.num_frames * row_dtype(num_markers).itemsize + people * len(SIDES) * HAND_DTYPE.itemsize
+    if needed > _SMALL:  # before anything counts shards
+        there = sum(file.stat().st_size for file in out.glob("*.npy"))
+        what = f"{config.num_frames} frames"
+        check_free(out, needed - there, what, "ask for fewer frames", error=DatasetError)
+
+
+def _finished(config: DatasetConfig, out: Path, shard: int) -> bool:
+    """Whether a shard is there with all its rows; the last one of a set that grows is made again."""
+    if not (out / hands_name(shard)).is_file():
+        return False
+    try:
+        rows = np.load(out / rows_name(shard), mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError):  # not there, or damaged
+        return False
+    return len(rows) == _shard_size(config, shard)
 
 
 def _shard_size(config: DatasetConfig, shard: int) -> int:

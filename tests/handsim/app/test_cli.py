@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import io
+import re
 import subprocess
 import sys
 import types
@@ -11,6 +13,7 @@ import pytest
 
 import handsim
 from handsim.app.cli import COMMANDS, main, run
+from handsim.app.interrupts import Stopped
 from handsim.errors import LayoutError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -142,9 +145,36 @@ def test_what_a_user_can_set_right_is_told_in_one_line(
     assert err.count("\n") == 1
 
 
-def test_our_own_mistakes_keep_their_traceback(invoke: Callable[..., int]) -> None:
-    with pytest.raises(ZeroDivisionError):
-        invoke(lambda: 1 // 0)
+def test_our_own_mistakes_are_one_line_and_a_log(
+    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert invoke(lambda: 1 // 0) == 1
+    said = capsys.readouterr().err
+    found = re.fullmatch(
+        r"handsim fake: unexpected ZeroDivisionError: .*; this is a mistake in handsim, please report it "
+        r"with (\S+)\n",
+        said,
+    )
+    assert found is not None, said
+    log = Path(found[1])
+    assert "Traceback (most recent call last)" in log.read_text() and "test_cli.py" in log.read_text()
+    log.unlink()
+
+
+def test_a_signal_is_told_with_what_is_kept(
+    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert invoke(raising(Stopped(15, "3 of 8 frames are in out"))) == 143
+    assert capsys.readouterr().err == "handsim fake: ended by SIGTERM; 3 of 8 frames are in out\n"
+
+
+def test_names_that_are_no_text_are_printed(
+    invoke: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="utf-8"))
+    assert invoke(lambda: print("take\udcff.trc")) == 0
+    assert raw.getvalue() == b"take\\udcff.trc\n"
 
 
 def test_a_real_missing_file_names_its_path(
@@ -176,6 +206,17 @@ def test_a_full_disk_on_stdout_is_one_line_and_code_1() -> None:
 def test_a_closed_pipe_is_no_traceback() -> None:
     result = shell("(sleep 0.5; handsim --version) | true; exit ${PIPESTATUS[0]}")
     assert (result.returncode, result.stderr) == (141, "")
+
+
+def test_help_into_a_closed_pipe_is_no_traceback() -> None:
+    result = shell("(sleep 0.5; handsim train --help) | true; exit ${PIPESTATUS[0]}")
+    assert (result.returncode, result.stderr) == (141, "")
+
+
+def test_closed_streams_are_no_traceback() -> None:
+    assert shell("handsim --help >&-").stderr == ""
+    result = shell("handsim trian >&- 2>&-")
+    assert (result.returncode, result.stdout) == (2, "")
 
 
 def test_overview_loads_nothing_heavy() -> None:

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from handsim.app.interrupts import interrupt_flag
+from handsim.app.interrupts import Stopped, interrupt_flag, signals_raise
 
 
 def test_the_first_interrupt_is_told_and_the_second_raises():
@@ -34,3 +34,32 @@ def test_other_threads_are_never_told():
     thread.start()
     thread.join()
     assert answers == [False]
+
+
+def test_the_flag_names_the_signal_and_covers_the_end_of_a_batch_job():
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with interrupt_flag() as interrupted:
+            os.kill(os.getpid(), number)
+            assert interrupted() and interrupted.number == number
+            with pytest.raises(Stopped):
+                os.kill(os.getpid(), number)
+                signal.sigtimedwait([], 1.0)
+
+
+def test_the_end_of_a_batch_job_raises_like_ctrl_c():
+    before = signal.getsignal(signal.SIGTERM)
+    with signals_raise(), pytest.raises(KeyboardInterrupt) as caught:
+        os.kill(os.getpid(), signal.SIGTERM)
+        signal.sigtimedwait([], 1.0)
+    assert isinstance(caught.value, Stopped) and caught.value.number == signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
+    try:
+        with signals_raise(), interrupt_flag() as interrupted:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not interrupted()
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -1,11 +1,15 @@
-"""The speed that a progress bar shows."""
+"""The speed that a progress bar shows, and the lines in its place where there is no terminal."""
 
 from __future__ import annotations
 
+import io
+import time
+
 import pytest
+from rich.console import Console
 from rich.progress import Progress
 
-from handsim.app.progress import _Speed
+from handsim.app.progress import _line, _lines, _Speed, progress_bar
 
 
 @pytest.mark.parametrize(
@@ -20,3 +24,26 @@ def test_speed_is_of_this_run_alone(steps, text):
         clock[0] += 2.0
         bar.update(task, completed=done, total=5000)
     assert str(_Speed("frames").render(bar.tasks[0])) == text
+
+
+def test_a_log_gets_a_line_now_and_then():
+    log = io.StringIO()
+    bar = Progress(disable=True)
+    task = bar.add_task("loss 0.812", total=1)
+    with _lines(Console(file=log, width=20), bar.tasks[0], "samples", every=0.05):
+        bar.update(task, completed=12800, total=5_000_000)
+        time.sleep(0.3)
+    lines = log.getvalue().splitlines()
+    assert len(lines) >= 2 and lines[0] == "12,800 of 5,000,000 samples, loss 0.812, 0:00:00"
+
+
+def test_a_line_before_anything_is_done():
+    bar = Progress(disable=True)
+    bar.add_task("", total=1)
+    assert _line(bar.tasks[0], "frames", 3661.2) == "working on frames, 1:01:01"
+
+
+def test_a_short_command_writes_no_line(capsys):
+    with progress_bar("frames") as (bar, task):
+        bar.update(task, completed=1, total=2)
+    assert capsys.readouterr().err == ""

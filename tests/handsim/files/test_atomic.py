@@ -100,3 +100,36 @@ def test_files_that_belong_together_come_together(tmp_path: Path) -> None:
         one.write_text("whole")
         two.write_text("whole")
     assert first.read_text() == second.read_text() == "whole"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no modes")
+def test_the_mode_is_what_the_umask_asks_for(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        with atomic_write(tmp_path / "weights") as temporary:
+            os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o600))  # as safetensors does
+    finally:
+        os.umask(before)
+    assert (tmp_path / "weights").stat().st_mode & 0o777 == 0o640
+
+
+def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    left = tmp_path / f".take[1].tmp-{gone.pid}.npz"
+    others = [tmp_path / f".take[1].tmp-{os.getppid()}.npz", tmp_path / f".b.tmp-{gone.pid}.npz"]
+    for file in (left, *others):
+        file.write_text("half")
+    with atomic_write(tmp_path / "take[1].npz") as temporary:
+        temporary.write_text("whole")
+    assert not left.exists()
+    assert all(file.exists() for file in others), "of a running process, and of another file"
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
+    tmp_path.chmod(0o500)
+    with pytest.raises(PermissionError) as caught, atomic_write(tmp_path / "a.trc"):
+        pytest.fail("the block must not run")
+    assert caught.value.filename == str(tmp_path / "a.trc")

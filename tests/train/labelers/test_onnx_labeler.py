@@ -98,3 +98,25 @@ def test_what_is_not_installed_is_told(exported, tmp_path, monkeypatch, missing)
             export_onnx(new_network(SetLabelerConfig()), ("a",) * 19, tmp_path / "x.onnx")
         else:
             OnnxLabeler(exported)
+
+
+@pytest.mark.parametrize("damage", ["nan", "names", "twice"])
+def test_a_file_whose_network_is_of_no_use_is_told(exported, tmp_path, damage):
+    import json
+
+    import onnx
+
+    model = onnx.load(str(exported))
+    if damage == "nan":
+        (weights, *_) = [one for one in model.graph.initializer if "embed.0.bias" in one.name]
+        weights.CopyFrom(
+            onnx.numpy_helper.from_array(np.full(weights.dims, np.nan, np.float32), weights.name)
+        )
+    else:
+        entry = next(entry for entry in model.metadata_props if "names" in entry.key)
+        names = json.loads(entry.value)
+        entry.value = json.dumps(names[:-1] if damage == "names" else [*names[:-1], names[0]])
+    path = tmp_path / "damaged.onnx"
+    onnx.save(model, str(path))
+    with pytest.raises(WeightsError, match=r"damaged.onnx is damaged or not a labeler's"):
+        OnnxLabeler(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout, save_layout
+from handsim.app.interrupts import Stopped
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
@@ -127,8 +129,6 @@ def test_a_killed_run_goes_on_to_the_same_bytes(finished, tmp_path):
 
 
 def test_another_seed_makes_other_rows(finished, tmp_path):
-    import dataclasses
-
     generate_dataset(dataclasses.replace(CONFIG, seed=4), tmp_path / "other", workers=1)
     assert contents(tmp_path / "other")[rows_name(0)] != contents(finished)[rows_name(0)]
 
@@ -186,8 +186,6 @@ def test_people_are_not_drawn_for_ever(rng, monkeypatch):
 
 
 def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
-    import shutil
-
     copy = tmp_path / "copy"
     shutil.copytree(finished, copy)
     content = json.loads((copy / MANIFEST).read_text())
@@ -201,15 +199,11 @@ def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
 
 
 def test_other_settings_in_the_same_folder_are_told(finished):
-    import dataclasses
-
-    with pytest.raises(DatasetError, match=r"begun with other settings \(num_frames, seed\)"):
+    with pytest.raises(DatasetError, match=r"\(num_frames: 700 there, 9 here; seed: 3 there, 9 here\)"):
         generate_dataset(dataclasses.replace(CONFIG, seed=9, num_frames=9), finished)
 
 
 def test_a_damaged_shard_is_named(finished, tmp_path):
-    import shutil
-
     copy = tmp_path / "copy"
     shutil.copytree(finished, copy)
     with (copy / rows_name(2)).open("r+b") as file:
@@ -255,3 +249,103 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(tmp_path, monkeypat
     assert code == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert [path.name for path in (tmp_path / "set").iterdir()] == ["config.json"]
+
+
+def test_a_set_grows_to_the_bytes_of_one_made_at_once(finished, tmp_path):
+    """700 frames are three shards of 200 and one of 100, which is made again."""
+    out = tmp_path / "grown"
+    generate_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
+    kept = (out / rows_name(0)).stat().st_mtime_ns
+    assert generate_dataset(CONFIG, out, workers=1) == Dataset(finished).manifest
+    assert contents(out) == contents(finished)
+    assert (out / rows_name(0)).stat().st_mtime_ns == kept
+    with pytest.raises(DatasetError, match=r"num_frames: 700 there, 300 here\).*num_frames may only grow"):
+        generate_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
+
+
+def test_a_growth_that_was_killed_is_unfinished_and_goes_on(finished, tmp_path, monkeypatch):
+    out = tmp_path / "grown"
+    generate_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
+
+    def killed(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(generation, "make_shard", killed)
+        with pytest.raises(Stopped) as caught:
+            generate_dataset(CONFIG, out, workers=1)
+    assert caught.value.kept == f"200 of 700 frames are in {out}, and the same command goes on after them"
+    with pytest.raises(DatasetError, match="is unfinished; run handsim generate again"):
+        Dataset(out)
+    generate_dataset(CONFIG, out, workers=1)
+    assert contents(out) == contents(finished)
+
+
+def test_a_set_that_the_disk_has_no_space_for_is_refused(tmp_path):
+    config = dataclasses.replace(CONFIG, num_frames=10**18)
+    with pytest.raises(DatasetError, match=r"10{18} frames need 7\d\d EB, but the disk of .* has .* free"):
+        generate_dataset(config, tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+
+
+MANIFESTS = {
+    "marker_names": (5, "marker_names is not a list of different names"),
+    "num_frames": (float("nan"), "num_frames is not a whole number of at least 1"),
+    "files": ({"../../etc/passwd": "0"}, "files is not a table of names of files in this folder"),
+    "config": (None, "config is not a table"),
+    "redrawn": ([1], "redrawn is not a table of counts"),
+}
+
+
+@pytest.mark.parametrize("field", MANIFESTS)
+def test_a_manifest_of_wrong_types_is_told(finished, tmp_path, field):
+    content = json.loads((finished / MANIFEST).read_text())
+    value, sentence = MANIFESTS[field]
+    (tmp_path / MANIFEST).write_text(json.dumps(content | {field: value}))
+    with pytest.raises(DatasetError, match=f"is damaged: {sentence}"):
+        Dataset(tmp_path)
+    del content[field]
+    (tmp_path / MANIFEST).write_text(json.dumps(content))
+    with pytest.raises(DatasetError, match=f"the field {field} is missing|is missing; delete"):
+        Dataset(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["floats", "text", "pickle", "short"])
+def test_a_shard_of_other_records_is_told(finished, tmp_path, kind):
+    copy = tmp_path / "copy"
+    shutil.copytree(finished, copy)
+    if kind == "text":
+        (copy / rows_name(1)).write_text("no array")
+    else:
+        rows = {
+            "floats": np.zeros(200),
+            "pickle": np.array([None] * 200),
+            "short": np.load(copy / rows_name(1))[:7],
+        }[kind]
+        np.save(copy / rows_name(1), rows)
+    content = json.loads((copy / MANIFEST).read_text())
+    content["files"][rows_name(1)] = checksum(copy / rows_name(1))
+    (copy / MANIFEST).write_text(json.dumps(content))
+    with pytest.raises(
+        DatasetError, match=r"holds other records|is damaged: it is no .npy file|shards hold 507"
+    ):
+        Dataset(copy)
+
+
+OPTION_ERRORS = {
+    "--workers -3": "workers is -3, expected at least 1",
+    "--volume nan": "volume is nan, expected a number from 0 to 10",
+    "--slip-around nan": "slip_around is nan, expected a number from 0 to 90",
+    "--population.children 5": "children is 5, expected a number from 0 to 1",
+    "--blob-loss 0 1.5": "blob_loss is (0.0, 1.5), expected chances from 0 to 1",
+    "--seed -1": "seed is -1, expected 0 or more",
+}
+
+
+@pytest.mark.parametrize("options", OPTION_ERRORS)
+def test_options_without_sense_are_told(tmp_path, capsys, options):
+    from handsim.app.cli import main
+
+    assert main(["generate", "--out", str(tmp_path / "set"), *options.split()]) == 1
+    assert capsys.readouterr().err == f"handsim generate: {OPTION_ERRORS[options]}\n"
+    assert not (tmp_path / "set").exists()

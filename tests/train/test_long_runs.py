@@ -1,0 +1,263 @@
+"""Runs that are stopped, grow, diverge or meet a full disk; modes and bytes of what they write."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import resource
+import signal
+
+import pytest
+import torch
+
+from handsim.app.cli import main
+from handsim.app.interrupts import Stopped
+from handsim.errors import ArgumentError, WeightsError
+from train.config import SetLabelerConfig, TrainConfig
+from train.data.shards import Dataset
+from train.labelers.storage import WEIGHTS, load_labeler
+from train.loop import CHECKPOINT, train_labeler
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.frame_scenes import SceneMix
+from train.simulation.generation import generate_dataset
+from train.threads import TrainingThreads, label_on, labeling_threads
+from train.training_state import TrainingError
+
+SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
+CONFIG = TrainConfig(samples=640, batch=32, network=SMALL)
+OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--network.depth", "1"]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sets") / "small"
+    generate_dataset(DatasetConfig(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    return Dataset(out)
+
+
+def done_in(run):
+    return torch.load(run / CHECKPOINT, weights_only=True)["done"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_keeps_the_last_step_and_the_run_ends_the_same(dataset, tmp_path, capsys, number):
+    def command(out):
+        return main(["train", str(dataset.path), "--out", str(out), "--samples", "640", *OPTIONS])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("train.training_state.TrainingState._average", sending(number))
+        assert command(tmp_path / "stopped") == 128 + number
+    said = capsys.readouterr().err
+    assert f"320 of 640 samples are kept in {tmp_path / 'stopped' / CHECKPOINT}, and the same command" in said
+    assert said.count("\n") == 1
+    assert done_in(tmp_path / "stopped") == 320
+    assert command(tmp_path / "stopped") == command(tmp_path / "whole") == 0
+    stopped, whole = ((tmp_path / name / WEIGHTS).read_bytes() for name in ("stopped", "whole"))
+    assert stopped == whole
+
+
+def sending(number):
+    """A step that is hit by a signal in its middle, at 320 samples."""
+    from train.training_state import TrainingState
+
+    average = TrainingState._average
+
+    def hit(self):
+        if self.done == 320:
+            os.kill(os.getpid(), number)
+        average(self)
+
+    return hit
+
+
+def test_a_run_grows_and_its_learning_rate_is_that_of_the_new_length(dataset, tmp_path):
+    train_labeler(dataset, CONFIG, tmp_path / "run")
+    steps = []
+    longer = dataclasses.replace(CONFIG, samples=960)
+    card = train_labeler(dataset, longer, tmp_path / "run", progress=lambda *step: steps.append(step[0]))
+    assert steps == list(range(672, 961, 32)) and card["train"]["samples"] == 960
+    losses = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)["history"]["losses"]
+    rates = {done: rate for done, _, rate in losses}
+    assert rates[640] < 1e-4 < rates[672]
+    with pytest.raises(WeightsError, match=r"train.samples: 960 there, 640 here.*may only grow"):
+        train_labeler(dataset, CONFIG, tmp_path / "run")
+
+
+def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_path, monkeypatch):
+    def cut(self, rows, names):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("train.training_state.TrainingState.evaluate", cut)
+        with pytest.raises(Stopped):
+            train_labeler(dataset, CONFIG, tmp_path / "cut")
+    done = done_in(tmp_path / "cut")
+    assert 0 < done < 640
+    curve = train_labeler(dataset, CONFIG, tmp_path / "cut")["curve"]
+    assert [entry[0] for entry in curve] == [
+        entry[0] for entry in train_labeler(dataset, CONFIG, tmp_path / "whole")["curve"]
+    ]
+    assert curve[0][0] == done
+
+
+def test_a_loss_that_is_no_number_ends_the_run(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "train.training_state.batch_loss",
+        lambda *args, **kwargs: torch.tensor(float("nan"), requires_grad=True),
+    )
+    with pytest.raises(TrainingError, match=r"the loss is nan after 32 samples; .* below 0.002"):
+        train_labeler(dataset, CONFIG, tmp_path / "run")
+    assert not (tmp_path / "run" / CHECKPOINT).exists()
+
+
+def test_what_a_run_writes_has_no_trace_of_the_process(dataset, tmp_path):
+    before = os.umask(0o022)
+    try:
+        train_labeler(dataset, CONFIG, tmp_path / "run")
+    finally:
+        os.umask(before)
+    assert b"tmp-" not in (tmp_path / "run" / CHECKPOINT).read_bytes()
+    modes = {
+        path.name: path.stat().st_mode & 0o777 for path in (tmp_path / "run").iterdir() if path.is_file()
+    }
+    assert set(modes.values()) == {0o644}, modes
+
+
+@pytest.mark.parametrize("damage", ["cut", "nan", "count", "shape", "list"])
+def test_a_damaged_checkpoint_is_told(dataset, tmp_path, damage):
+    train_labeler(dataset, CONFIG, tmp_path)
+    path = tmp_path / CHECKPOINT
+    content = torch.load(path, weights_only=True)
+    name = next(iter(content["mean"]))
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:-900])
+    else:
+        if damage == "nan":
+            content["mean"][name].view(-1)[0] = float("nan")
+        elif damage == "count":
+            content["done"] = -32
+        elif damage == "shape":
+            content["mean"][name] = torch.zeros(3)
+        torch.save([content] if damage == "list" else content, path)
+    with pytest.raises(WeightsError, match=r"checkpoint.pt is damaged; delete it to begin this run again"):
+        train_labeler(dataset, CONFIG, tmp_path)
+
+
+def test_a_full_disk_is_one_sentence_and_the_checkpoint_stays(dataset, tmp_path, capsys):
+    """A limit of file sizes stands in for the full disk: the same OSError from the same system call."""
+    options = ["train", str(dataset.path), "--out", str(tmp_path / "run"), *OPTIONS]
+    assert main([*options, "--samples", "320"]) == 0
+    kept = (tmp_path / "run" / CHECKPOINT).read_bytes()
+    capsys.readouterr()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+    try:
+        assert main([*options, "--samples", "640"]) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "file too large" in said
+    assert (tmp_path / "run" / CHECKPOINT).read_bytes() == kept
+    assert not list((tmp_path / "run").glob(".*"))
+    load_labeler(tmp_path / "run")
+
+
+class Machine:
+    """A clock, and a step that takes as long as the number of torch's threads makes it."""
+
+    def __init__(self, seconds: dict[int, float]) -> None:
+        self.seconds, self.time, self.steps = seconds, 0.0, []
+
+    def step(self):
+        self.steps.append(torch.get_num_threads())
+        self.time += self.seconds[torch.get_num_threads()]
+
+    def now(self):
+        return self.time
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "chosen", "steps"),
+    [
+        ({1: 0.5, 2: 4.0}, 1, [1, 1, 1, 2]),  # a busy machine: one slow step is enough
+        ({1: 0.5, 2: 0.3}, 2, [1, 1, 1, 2]),  # an idle one
+        ({1: 0.5, 2: 0.49}, 1, [1, 1, 1, 2, 2, 2]),  # no clear gain
+    ],
+)
+def test_threads_are_chosen_by_measurement(two_threads, seconds, chosen, steps):
+    machine = Machine(seconds)
+    threads = TrainingThreads(None, machine.step, now=machine.now)
+    with threads.in_use():
+        threads.renew()
+        assert threads.count == torch.get_num_threads() == chosen
+        threads.renew()
+        assert machine.steps == steps, "not measured again at once"
+        machine.time += threads.AGAIN + 1.0
+        machine.seconds = {1: 0.5, 2: 0.2}
+        threads.renew()
+        assert threads.count == 2, "others have ended their work"
+    assert torch.get_num_threads() == 2
+
+
+def test_a_given_number_of_threads_holds(two_threads):
+    machine = Machine({})
+    threads = TrainingThreads(1, machine.step)
+    with threads.in_use():
+        threads.renew()
+        assert torch.get_num_threads() == 1 and machine.steps == []
+    for wrong in (0, -2):
+        with pytest.raises(ArgumentError, match=f"threads is {wrong}, expected 1 to"):
+            TrainingThreads(wrong, machine.step)
+
+
+def test_a_measurement_leaves_the_run_as_it_is(dataset, tmp_path, two_threads, monkeypatch):
+    monkeypatch.setattr("train.threads._GAIN", 1e9)  # one thread is chosen whatever is measured
+    train_labeler(dataset, CONFIG, tmp_path / "measured")
+    train_labeler(dataset, CONFIG, tmp_path / "given", threads=1)
+    measured, given = ((tmp_path / name / WEIGHTS).read_bytes() for name in ("measured", "given"))
+    assert measured == given
+
+
+def test_labelers_use_one_thread_unless_told(two_threads, rng):
+    labeler = load_labeler("dense19")
+    seen = []
+    forward = labeler.network.forward
+    labeler.network.forward = lambda *args: (seen.append(torch.get_num_threads()), forward(*args))[1]
+    frame = [rng.normal(scale=0.05, size=(19, 3))]
+    labeler.label_frames(frame)
+    label_on(2)
+    try:
+        labeler.label_frames(frame)
+    finally:
+        label_on(1)
+    assert seen == [1, 2] and torch.get_num_threads() == 2
+    with labeling_threads():
+        assert torch.get_num_threads() == 1
+
+
+OPTION_ERRORS = {
+    "--learning-rate nan": "learning_rate is nan, expected a number above 0, at most 10",
+    "--learning-rate 1e9": "learning_rate is 1e+09, expected a number above 0, at most 10",
+    "--seed -1": "seed is -1, expected 0 or more",
+    "--network.width 0": "width is 0, expected a whole number from 1 to 4096",
+    "--network.gates 7": "gates is 7, expected a divisor of width, 64",
+    "--batch 0": "batch is 0, expected at least 1",
+    "--average nan": "average is nan, expected a number from 0 to 1",
+    "--cnn.reject nan": "reject is nan, expected more than 0",
+    "--threads 0": "threads is 0, expected 1 to 1024",
+}
+
+
+@pytest.mark.parametrize("options", OPTION_ERRORS)
+def test_options_without_sense_are_told(dataset, tmp_path, capsys, options):
+    assert main(["train", str(dataset.path), "--out", str(tmp_path / "run"), *options.split()]) == 1
+    assert capsys.readouterr().err == f"handsim train: {OPTION_ERRORS[options]}\n"
+    assert not (tmp_path / "run").exists()
