@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from handsim._version import __version__
 from handsim.app.command_table import COMMANDS, load
+from handsim.app.messages import told_warnings
 from handsim.app.presets import PresetCommand
 from handsim.errors import HandSimError, choices
 
@@ -30,7 +31,8 @@ def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
     """Run one command of a table; `main` is this with the table of the release."""
     program = f"handsim {args[0]}" if args and args[0] in commands else "handsim"
     try:
-        code = _dispatch(commands, args)
+        with told_warnings(program):
+            code = _dispatch(commands, args)
         sys.stdout.flush()  # a full disk or a closed pipe must show here, not while Python shuts down
         return code
     except BrokenPipeError:  # `handsim ... | head` has seen enough
