@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.atomic import atomic_write
+from handsim.files.inputs import read_bytes
+
+_MOST_JSON: Final = 1 << 26  # bytes
 
 
 def save_json(path: Path, content: dict[str, Any]) -> None:
@@ -24,8 +27,8 @@ def load_json(path: Path) -> dict[str, Any]:
         DatasetError: The file does not hold a JSON object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        content = json.loads(read_bytes(path, error=DatasetError, most=_MOST_JSON))
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path} is damaged: it does not hold JSON") from error
     if not isinstance(content, dict):
         raise DatasetError(f"{path} is damaged: it does not hold a JSON object")

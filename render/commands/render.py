@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal
 import tyro
 from rich.console import Console
 
+from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError, choices
 from render.cameras.viewpoints import ViewConfig
@@ -109,10 +110,9 @@ def render(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     seconds = time.perf_counter() - start
-    console = Console()
-    console.print(f"{out}: {count} images in {seconds:.0f} s", soft_wrap=True, markup=False)
+    print_line(f"{out}: {count} images in {seconds:.0f} s")
     if {"rgb", "depth"} & set(config.passes):
-        console.print(f"{out / SHEET}: some of them at one glance", soft_wrap=True, markup=False)
+        print_line(f"{out / SHEET}: some of them at one glance")
 
 
 def _tone_range(tones: tuple[str, ...]) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -20,14 +21,15 @@ from gloves.fit import GloveFit
 from gloves.takes.take import SUFFIX
 from gloves.takes.tracked_take import TrackedTake
 from handsim.app.interrupts import interrupt_flag
+from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.errors import ArgumentError, CaptureError
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.capture_tracking import TakeRecorder, track_capture, track_stream, warm_up
 from track.commands.user_options import BOTH, Size, calibrated_users, uncalibrated_users
-from track.evaluation.take_summary import print_line, summarize
+from track.evaluation.take_summary import summarize, suspicions
 from track.streams.point_stream import StreamedFrame, open_stream
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
@@ -97,6 +99,8 @@ def track(
     print_line(f"{out}: {take.num_frames} frames, {take.num_frames / take.rate:.1f} s at {take.rate:.4g} Hz")
     for line in (*summarize(take), *notes, f"{1e3 * np.median(timed.seconds):.2f} ms per frame"):
         print_line(line)
+    for suspicion in suspicions(take):
+        warnings.warn(suspicion, HandSimWarning, stacklevel=2)
 
 
 class TimedTracker(Tracker):
