@@ -57,7 +57,10 @@ def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dt
     if version not in {(1, 0), (2, 0)}:
         raise ValueError(f"an array file of version {version}")
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(file)
+    try:
+        shape, _, dtype = read(file)
+    except Exception as error:  # numpy reads it as Python text, which fails in many ways
+        raise ValueError("no header of an array") from error
     if dtype.hasobject or dtype.itemsize == 0 or len(shape) > _MOST_DIMENSIONS or min(shape, default=0) < 0:
         raise ValueError(f"an array of type {dtype} and shape {shape}")
     if math.prod(shape) * dtype.itemsize != size - file.tell():

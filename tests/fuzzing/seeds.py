@@ -26,6 +26,7 @@ from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_serve
 from track.user import save_user
 
 FRAMES, COLUMNS = 4, 24
+SETTINGS = {"num_frames": 10, "glove": "dense19", "scenes": {"one": 1.0}}
 MOTIVE = """\
 Format Version,1.23,Take Name,Take 1,Capture Frame Rate,120.000000,Export Frame Rate,120.000000,\
 Rotation Type,Quaternion,Total Frames in Take,3,Total Exported Frames,3,Length Units,Meters,\
@@ -147,8 +148,7 @@ def user(folder: Path) -> list[Path]:
 
 
 def settings(folder: Path) -> list[Path]:
-    content = {"num_frames": 10, "glove": "dense19", "scenes": {"one": 1.0}}
-    (folder / "config.json").write_text(json.dumps(content))
+    (folder / "config.json").write_text(json.dumps(SETTINGS))
     return [folder / "config.json"]
 
 

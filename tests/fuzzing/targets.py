@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -30,23 +33,35 @@ _CLOUD: Final = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.07, 0.0], [
 
 def _read_settings(path: Path) -> None:
     load_json(path)
-    claim(path, {"num_frames": 10}, noun="training set", error=HandSimError)
+    claim(path, seeds.SETTINGS, noun="training set", error=HandSimError)
 
 
 def _read_packet(path: Path) -> None:
     kind, payload = unpack(path.read_bytes())
-    for version in ((3, 0), (3, 1), (4, 0), (4, 1)):
-        if kind == Kind.SERVER_INFO:
-            parse_server_info(payload)
-        else:
-            parse_frame(payload, version)
-            return
+    if kind == Kind.SERVER_INFO or path.name == "info":
+        parse_server_info(payload)
+    else:
+        parse_frame(payload, (4, 1) if path.name.endswith("4.1") else (3, 0))
 
 
 def _read_photo(path: Path) -> None:
     photo_files.cache_clear()
-    photo_files(path.parent)
-    draw_photo(path, (16, 12), np.random.default_rng(0))
+    with _silence():
+        photo_files(path.parent)
+        draw_photo(path, (16, 12), np.random.default_rng(0))
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Without the messages that the libraries of OpenCV write themselves."""
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
 
 
 def _read_weights(path: Path) -> None:
