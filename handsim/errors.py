@@ -14,6 +14,10 @@ class HandSimError(Exception):
     """Root of every error that handsim raises on purpose."""
 
 
+class HandSimWarning(UserWarning):
+    """Something in the data that is probably not what the user meant; the work goes on."""
+
+
 class ArgumentError(HandSimError):
     """An argument of the wrong shape, range or name: a mistake in the call, which handsim never catches."""
 

@@ -103,8 +103,8 @@ def render_take(
                 _check_space(out, len(done) + 1, len(todo) - 1)
     except KeyboardInterrupt as stop:
         remove_leftovers(out)  # of workers that had no time to
-        kept = f"{count} of {total} images are in {out}, and the same command goes on after them"
-        raise Stopped(stop.number if isinstance(stop, Stopped) else signal.SIGINT, kept) from stop
+        drawn_so_far = f"{count} of {total} images are in {out}, and the same command goes on after them"
+        raise Stopped(stop.number if isinstance(stop, Stopped) else signal.SIGINT, drawn_so_far) from stop
     for name in formats:
         open_writer(name, _folder(out, formats, name)).finish()
     lost = frozenset(left_out_frames(out))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gloves.captures.capture import Capture
+from gloves.captures.plausibility import check_place, check_unit
 from gloves.fit import GloveFit
 from gloves.optics.identities import number_runs
 from gloves.takes.tracked_take import STATUSES, TrackedTake, usual_rate
@@ -23,7 +24,7 @@ from handsim.hand.topology import NUM_QPOS
 from track.streams.point_stream import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
-from train.labelers.protocol import Labeler, check_unit
+from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
     from jaxtyping import Bool
@@ -52,9 +53,11 @@ def track_capture(capture: Capture, tracker: Tracker, *, progress: Progress | No
 
     Raises:
         ArgumentError: The capture is not in meters.
+        CaptureError: Most of its points are far from any room.
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
+    check_place(capture, tracker.config.intake.farthest)
     recorder = TakeRecorder(tracker)
     for frame, tracked in track_stream(frames, tracker):
         recorder.add(frame, tracked)

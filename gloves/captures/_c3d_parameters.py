@@ -17,6 +17,7 @@ _INTEL, _DEC, _SGI = 84, 85, 86
 INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
 FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
+_MOST_BYTES: Final = 1 << 22  # of all values together; records that overlap could state far more
 _LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
 
 
@@ -49,8 +50,9 @@ class Parameters:
             raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
         processor = data[start + 3]
         groups: dict[int, str] = {}
-        found: list[tuple[int, str, bytes]] = []
+        found: list[tuple[int, str, memoryview]] = []
         at = start + 4
+        view = memoryview(data)
         try:
             while at + 2 <= len(data):
                 name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
@@ -64,15 +66,18 @@ class Parameters:
                 if group < 0:
                     groups[-group] = name
                 else:
-                    record = data[offset_at + 2 : offset_at + 2 + _LONGEST_RECORD]
+                    record = view[offset_at + 2 : offset_at + 2 + _LONGEST_RECORD]
                     found.append((group, name, record))
                 if offset == 0:
                     break
                 if offset_at + offset > len(data):
                     raise ValueError(name)
                 at = offset_at + offset
+            if sum(_num_bytes(raw) for _, _, raw in found) > _MOST_BYTES:
+                raise CaptureError(f"damaged: the parameters hold more than {_MOST_BYTES} bytes")
             values = {
-                (groups.get(group, ""), name): _read_values(raw, processor) for group, name, raw in found
+                (groups.get(group, ""), name): _read_values(bytes(raw), processor)
+                for group, name, raw in found
             }
         except (ValueError, IndexError) as error:
             raise CaptureError("damaged: the parameter section cannot be read") from error
@@ -102,6 +107,11 @@ class Parameters:
     def strings(self, group: str, name: str) -> list[str]:
         """A parameter of characters as strings without padding; empty if it is absent."""
         return [value for value in self.values.get((group, name), []) if isinstance(value, str)]
+
+
+def _num_bytes(raw: memoryview) -> int:
+    """Bytes that a parameter record takes and states."""
+    return 64 + math.prod(raw[2 : 2 + raw[1]]) * abs(int.from_bytes(raw[:1], "little", signed=True))
 
 
 def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:

@@ -25,6 +25,7 @@ METERS: Final = {
     "metres": 1.0,
 }
 _BLANK: Final = math.nan
+_MOST_BLANKS: Final = 4_000_000  # cells of a table that may be absent from its rows
 
 
 def meters_per(unit: str) -> float:
@@ -91,13 +92,15 @@ def parse_table(
     Raises:
         CaptureError: No rows, a cut last row, a cell that is not a number, or a row that is too long.
     """
-    numbered = [(number, line) for number, line in enumerate(lines[start:], start + 1) if line.strip()]
-    if not numbered:
+    rows = [index for index in range(start, len(lines)) if lines[index].strip()]
+    if not rows:
         raise CaptureError("no frames: nothing follows the header")
-    if not ended and numbered[-1][0] == len(lines):
-        _check_whole(numbered, delimiter, num_columns)
-    table = np.full((len(numbered), num_columns), np.nan)
-    for row, (number, line) in enumerate(numbered):
+    if not ended and rows[-1] == len(lines) - 1:
+        _check_whole(lines[rows[0]], lines[-1], len(lines), delimiter, num_columns)
+    _check_size(lines, len(rows), num_columns)
+    table = np.full((len(rows), num_columns), np.nan)
+    for row, index in enumerate(rows):
+        number, line = index + 1, lines[index]
         cells = line.split(delimiter)
         if len(cells) > num_columns:
             if any(cell.strip() for cell in cells[num_columns:]):
@@ -110,14 +113,23 @@ def parse_table(
             table[row, : len(cells)] = [float(cell) if cell else _BLANK for cell in cells]
         except ValueError:
             table[row, : len(cells)] = _parse_cells(cells, number, column_name)
-    _check_finite(table, numbered, column_name)
+    _check_finite(table, rows, column_name)
     return table
 
 
-def _check_whole(numbered: list[tuple[int, bytes]], delimiter: bytes, num_columns: int) -> None:
-    number, line = numbered[-1]
+def _check_size(lines: list[bytes], num_rows: int, num_columns: int) -> None:
+    """Refuse a table whose cells are mostly absent before it is allocated."""
+    written = sum(map(len, lines))  # a cell takes one byte at least, its delimiter
+    if num_rows * num_columns > written + _MOST_BLANKS:
+        raise CaptureError(
+            f"damaged: {num_rows} rows of {num_columns} columns are more than {written} bytes can hold"
+        )
+
+
+def _check_whole(first: bytes, line: bytes, number: int, delimiter: bytes, num_columns: int) -> None:
+    """Whether the last line, which has no line end, is as long as the first row of the table."""
     # At most one blank cell beyond the table counts: the delimiter that may end a row.
-    usual = min(numbered[0][1].count(delimiter) + 1, num_columns + 1)
+    usual = min(first.count(delimiter) + 1, num_columns + 1)
     expected, got = max(usual, num_columns), line.count(delimiter) + 1
     if got < expected:
         raise CaptureError(
@@ -141,13 +153,13 @@ def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], s
 
 def _check_finite(
     table: Float[np.ndarray, "T columns"],
-    numbered: list[tuple[int, bytes]],
+    rows: list[int],
     column_name: Callable[[int], str],
 ) -> None:
     infinite = np.argwhere(np.isinf(table))
     if len(infinite):
         row, column = (int(index) for index in infinite[0])
         raise CaptureError(
-            f"line {numbered[row][0]}, column {column + 1} ({column_name(column)}): infinite, expected a "
+            f"line {rows[row] + 1}, column {column + 1} ({column_name(column)}): infinite, expected a "
             "finite number or a blank cell"
         )

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 _BLOCK: Final = 512
 _MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state the rest in TRIAL:ACTUAL_END_FIELD
+_MOST_FILLING: Final = 2 * _BLOCK  # bytes behind the last frame
 _MOST_LABEL_BYTES: Final = 255
 
 
@@ -117,6 +118,7 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
         INTEGER_DTYPES[parameters.processor].replace("i", "u")
     )
     num_points = int(parameters.number("POINT", "USED", default=header[1])) & 0xFFFF
+    _check_analog(parameters, per_frame=int(header[2]), samples=int(header[9]))
     scale = parameters.number("POINT", "SCALE")
     if scale == 0.0:
         raise CaptureError(f"POINT:SCALE is {scale:g}, expected a number that is not 0")
@@ -134,6 +136,8 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
         raise CaptureError("no frames: the file holds no frame")
     if stated is not None and present < stated:
         raise CaptureError(f"truncated: the file states {stated} frames and has room for {present}")
+    if stated is not None and present > stated:
+        _check_end(data, start + stated * frame_bytes, start, f"{stated} frames of {words} numbers")
     frames = np.frombuffer(data, dtype, count=(stated or present) * words, offset=start).reshape(-1, words)
     if stated is None:
         frames = _without_padding(frames)
@@ -142,6 +146,43 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
         return to_native(points, parameters.processor)
     scaled: NDArray[np.float64] = points * np.array([scale, scale, scale, 1.0])
     return scaled
+
+
+def _check_analog(parameters: Parameters, *, per_frame: int, samples: int) -> None:
+    """Whether the header's analog block, which lies between the points of two frames, is the parameters'.
+
+    Args:
+        parameters: Of the file.
+        per_frame: Analog numbers of a frame by the header.
+        samples: Samples of a channel in a frame by the header.
+
+    Raises:
+        CaptureError: It is not, so that points would be read from other places than they were written to.
+    """
+    channels = int(parameters.number("ANALOG", "USED", default=0.0 if per_frame == 0 else -1.0))
+    if channels < 0 or per_frame == channels * samples:  # less than none: nothing is stated
+        return
+    rates = [parameters.number(group, "RATE", default=0.0) for group in ("ANALOG", "POINT")]
+    ratio = round(rates[0] / rates[1]) if rates[1] > 0.0 else 0
+    if per_frame != channels * ratio:
+        raise CaptureError(
+            f"damaged: the header states {per_frame} analog numbers a frame, and the parameters {channels} "
+            f"channels of {max(samples, ratio)} samples; export the file again, without analog data"
+        )
+
+
+def _check_end(data: bytes, end: int, start: int, stated: str) -> None:
+    """Whether the data end where the frames do, up to the blocks that fill the file.
+
+    Raises:
+        CaptureError: They do not, so that the frames have another size or number than stated.
+    """
+    parameters_at = (data[0] - 1) * _BLOCK
+    last = parameters_at if parameters_at > start else len(data)
+    if last - end >= _MOST_FILLING and any(data[end + _MOST_FILLING :]):
+        raise CaptureError(
+            f"damaged: the file states {stated}, which are {end - start} bytes, and has {last - start}"
+        )
 
 
 def _stated_frames(parameters: Parameters, in_header: int) -> int | None:

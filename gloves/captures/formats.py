@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Final
 
 from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import Capture
+from gloves.captures.markers import unlabeled_frames
 from gloves.captures.motive_csv import read_motive_csv
+from gloves.captures.plausibility import unit_fault, zeros_as_missing
 from gloves.captures.trc import read_trc, write_trc
-from handsim.errors import CaptureError, choices
+from handsim.errors import CaptureError, HandSimWarning, choices
 from handsim.files.atomic import atomic_write
+from handsim.files.inputs import read_bytes
 
 _READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": read_motive_csv}
 READABLE: Final = tuple(_READERS)
@@ -28,20 +32,41 @@ def read_capture(path: str | Path) -> Capture:
         [Hz].
 
     Raises:
-        CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its units are unknown.
+        CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its unit is unknown or
+            cannot be that of its positions.
+
+    Warns:
+        HandSimWarning: Points at exactly (0, 0, 0) were taken as missing.
     """
     path = Path(path)
     check_suffix(path, READABLE)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CaptureError(f"{path}: cannot be read: {error.strerror}") from error
+    data = read_bytes(path, error=CaptureError)
     if not data:
         raise CaptureError(f"{path}: the file is empty")
     try:
-        return _READERS[path.suffix.lower()](data)
+        capture = _READERS[path.suffix.lower()](data)
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}") from error
+    return _checked(path, capture)
+
+
+def _checked(path: Path, capture: Capture) -> Capture:
+    """The capture without zeros for missing points, if its positions can be in the unit of its file."""
+    capture, zeros = zeros_as_missing(capture)
+    if zeros:
+        warnings.warn(
+            f"{path}: {zeros} points at exactly (0, 0, 0) are read as missing; if they are points, move the "
+            "origin",
+            HandSimWarning,
+            stacklevel=3,
+        )
+    fault = unit_fault(unlabeled_frames(capture))
+    if fault is not None:
+        raise CaptureError(
+            f"{path}: by the unit of length that the file states, {fault.found}; correct that unit, probably "
+            f"to {fault.guess}"
+        )
+    return capture
 
 
 def write_capture(path: str | Path, capture: Capture) -> None:

@@ -7,10 +7,10 @@ from typing import Final, Literal
 
 import mujoco
 import trimesh
-from rich.console import Console
 
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
+from handsim.app.messages import print_line
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.hand.mjcf import Site, build_spec
@@ -44,15 +44,12 @@ def hand(
     if glove is not None:
         sites = attach_markers(load_layout(glove), model).sites(model)
     write_model(out, model, sites=sites)
-    console = Console()
-    console.print(
-        f"{out}: {side} hand of size {size}, {len(sites)} marker sites", soft_wrap=True, markup=False
-    )
+    print_line(f"{out}: {side} hand of size {size}, {len(sites)} marker sites")
     if mesh is not None:
         write_mesh(mesh, model)
         surface = model.surface
         counts = f"{len(surface.vertices)} vertices, {len(surface.faces)} triangles"
-        console.print(f"{mesh}: its skin, {counts}", soft_wrap=True, markup=False)
+        print_line(f"{mesh}: its skin, {counts}")
 
 
 def write_model(path: Path, model: HandModel, *, sites: tuple[Site, ...] = ()) -> None:

@@ -14,7 +14,9 @@ import numpy as np
 
 from gloves.takes.growing import GrownArchive, growing_path, is_growing
 from handsim.errors import CaptureError, HandSimError
+from handsim.files.arrays import read_npz
 from handsim.files.atomic import atomic_write
+from handsim.files.inputs import check_regular
 
 Content = TypeVar("Content")
 
@@ -26,7 +28,7 @@ KINDS: Final = {
 _OLDEST_KIND: Final = "take"  # of headers without a kind
 _DAMAGE: Final = (
     HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, EOFError,
-    RuntimeError, zipfile.BadZipFile, zlib.error,
+    RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """Exceptions that reading a damaged file may raise."""
 
@@ -105,11 +107,13 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]
             "running, and can be read"
         )
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        check_regular(path, error=CaptureError)
+        arrays = read_npz(path)
         header = json.loads(str(arrays["header"]))
         if not isinstance(header, dict):
             raise ValueError("the header is not a table")
+    except CaptureError:
+        raise
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
     except _DAMAGE as error:
@@ -133,6 +137,27 @@ def _read_cut_off(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.n
     told = f"{path}: a recording that was cut off or is still running; it has {grown.num_frames} frames"
     warnings.warn(told, CutOffWarning, stacklevel=4)
     return grown.header, arrays
+
+
+def check_types(arrays: Mapping[str, np.ndarray], expected: Mapping[str, np.dtype[Any] | str]) -> None:
+    """Raise a `ValueError` unless every array has its type."""
+    if any(arrays[name].dtype != dtype for name, dtype in expected.items()):
+        raise ValueError("numbers of another type")
+
+
+def names_of(stored: object) -> tuple[str, ...]:
+    """A stored list of names; raises a `ValueError` if it is something else."""
+    if not isinstance(stored, list) or not all(isinstance(name, str) for name in stored):
+        raise ValueError("names are not a list of texts")
+    return tuple(stored)
+
+
+def settings_of(header: Mapping[str, Any]) -> dict[str, Any]:
+    """The stored settings; raises a `ValueError` if they are not a table."""
+    settings = header["settings"]
+    if not isinstance(settings, dict):
+        raise ValueError("settings are not a table")
+    return settings
 
 
 def check_shapes(expected: Iterable[tuple[np.ndarray, tuple[int, ...]]]) -> None:

@@ -13,7 +13,14 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.fit import GlovedHand, attach
 from gloves.layout import stored_layout
-from gloves.takes.archives import check_shapes, read_archive, write_archive
+from gloves.takes.archives import (
+    check_shapes,
+    check_types,
+    names_of,
+    read_archive,
+    settings_of,
+    write_archive,
+)
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
@@ -143,14 +150,20 @@ def load_take(path: Path) -> Take:
     return read_archive(path, KIND, SCHEMA, _unpack)
 
 
+_TYPES: Final = {"points": "f8", "ids": "i4", "labels": "i2", "qpos": "f8", "T_world_body": "f8"}
+
+
 def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
+    check_types(arrays, {**_TYPES, "hands": HAND_DTYPE})
+    if not (np.isfinite(arrays["qpos"]).all() and np.isfinite(arrays["T_world_body"]).all()):
+        raise ValueError("poses are not finite")
     stored = zip(header["layouts"], arrays["hands"], arrays["qpos"], strict=True)
     hands = tuple(
         GlovedHand(attach(stored_layout(layout), HandModel(unpack_hand(record))), qpos)
         for layout, record, qpos in stored
     )
     body = header["body"] and HeldBody(
-        header["body"]["name"], tuple(header["body"]["marker_names"]), arrays["T_world_body"]
+        header["body"]["name"], names_of(header["body"]["marker_names"]), arrays["T_world_body"]
     )
     take = Take(
         rate=float(header["rate"]),
@@ -159,7 +172,7 @@ def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
         labels=arrays["labels"],
         hands=hands,
         body=body,
-        settings=header["settings"],
+        settings=settings_of(header),
     )
     return take
 

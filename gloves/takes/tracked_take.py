@@ -13,7 +13,14 @@ import numpy as np
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from gloves.layout import stored_layout
-from gloves.takes.archives import check_shapes, read_archive, write_archive
+from gloves.takes.archives import (
+    check_shapes,
+    check_types,
+    names_of,
+    read_archive,
+    settings_of,
+    write_archive,
+)
 from gloves.takes.growing import Column
 from handsim.errors import ArgumentError, choices
 from handsim.hand.model import HandModel
@@ -255,6 +262,7 @@ _ATTACHMENT: Final = ("points", "normals", "bone_indices", "bone_weights")
 
 def unpack_take(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTake:
     """A take from the header and the arrays of a file; any exception means that they are damaged."""
+    check_types(arrays, {**_ARRAYS, "hands": HAND_DTYPE})
     if tuple(header["statuses"]) != STATUSES:
         raise ValueError("other statuses")
     hands = []
@@ -262,17 +270,15 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Tracke
     for record, layout, parts in zip(arrays["hands"], header["layouts"], worn, strict=True):
         attachment = Attachment(stored_layout(layout), *parts)
         hands.append(GloveFit(HandModel(unpack_hand(record)), attachment))
-    names = [(stored["name"], tuple(stored["marker_names"])) for stored in header["bodies"]]
+    names = [(stored["name"], names_of(stored["marker_names"])) for stored in header["bodies"]]
     positions = np.split(arrays["body_places"], np.cumsum([len(markers) for _, markers in names], dtype=int))
     if len(positions.pop()):
         raise ValueError("positions of markers without a body")
-    if any(arrays[name].dtype != dtype for name, dtype in _ARRAYS.items()):
-        raise ValueError("numbers of another type")
     return TrackedTake(
         rate=usual_rate(arrays["times"]) if header["rate"] is None else float(header["rate"]),
         hands=tuple(hands),
         bodies=tuple(MarkedBody(*name, markers) for name, markers in zip(names, positions, strict=True)),
-        settings=header["settings"],
+        settings=settings_of(header),
         numbers=arrays.get(NUMBERS),
         **{name: arrays[name] for name in _ARRAYS},
     )

@@ -4,6 +4,7 @@
 - cli: the command `handsim`, its errors and exit codes
 - presets: commands whose defaults come from a preset
 - demo: what the steps of `handsim demo` share
+- messages: lines as they are, and warnings as lines
 - progress: the progress bar of all commands, and lines in its place in a log
 - live_status: one line of status, renewed in place
 - interrupts: signals to end, as a flag that a loop reads or as an exception

@@ -18,6 +18,7 @@ from typing import Any, Final
 from handsim._version import __version__
 from handsim.app.command_table import COMMANDS, load
 from handsim.app.interrupts import Stopped, signals_raise
+from handsim.app.messages import told_warnings
 from handsim.app.presets import PresetCommand
 from handsim.errors import HandSimError, choices
 
@@ -40,7 +41,7 @@ def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
     # One core solves its small systems faster than several do; a worker has a core of its own.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        with signals_raise():
+        with told_warnings(program), signals_raise():
             code = _dispatch(commands, args)
         sys.stdout.flush()  # a full disk or a closed pipe must show here, not while Python shuts down
         return code

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from handsim.app.command_table import DEMO_STEPS, load
 from handsim.app.demo import GLOVE, DemoRun
+from handsim.app.messages import print_line
 from handsim.app.page import Section, write_page
 from handsim.errors import ArgumentError
 
@@ -48,7 +49,7 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
         "on simulation alone labels the points that the cameras see.",
     )
     console.print(figures.notes[0])
-    console.print(f"page: {page.resolve()}", soft_wrap=True, markup=False)
+    print_line(f"page: {page.resolve()}")
 
 
 def _print_table(console: Console, table: Sequence[Sequence[str]], *, title: str) -> None:

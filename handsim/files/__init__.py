@@ -2,6 +2,8 @@
 
 - atomic: a temporary path that takes its name at the end, and reading of TOML
 - disk: free space, asked for before the work
+- arrays: `.npz` archives with their sizes checked first
+- inputs: what others wrote, read only from regular files of a bounded size
 - json_files: JSON objects, and folders claimed by a settings file
 - toml_values: type checks and formatting of TOML values
 """

@@ -5,14 +5,19 @@ from __future__ import annotations
 import errno
 import glob
 import os
+import re
 import shutil
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from handsim.errors import HandSimError
+from handsim.files.inputs import read_bytes
+
+_MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
+_DOTTED: Final = re.compile(r"""(?:[\w"'-]\s{0,9}\.\s{0,9}[\w"'-]+){20}""")
 
 
 @contextmanager
@@ -143,10 +148,13 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
         path: The file.
         error: What to raise, in one sentence, when the file cannot be read or is not TOML.
     """
+    data = read_bytes(path, error=error, most=_MOST_TOML)
     try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except OSError as cause:
-        raise error(f"{path}: cannot be read: {cause.strerror}") from cause
+        text = data.decode("utf-8")
+        deep = _DOTTED.search(text)
+        if deep is not None:
+            raise ValueError(f"the key {deep[0][:20]}... has too many parts")
+        return tomllib.loads(text)
     except UnicodeDecodeError as cause:
         raise error(f"{path}: not a TOML file: it is not UTF-8 text") from cause
     except ValueError as cause:

@@ -9,9 +9,11 @@ from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.atomic import atomic_write, remove_leftovers
+from handsim.files.inputs import read_bytes
 
 _MOST_SHOWN: Final = 4  # settings that a message lists
 _MISSING: Final = "nothing"
+_MOST_JSON: Final = 1 << 26  # bytes
 
 
 def save_json(path: Path, content: dict[str, Any]) -> None:
@@ -27,8 +29,8 @@ def load_json(path: Path) -> dict[str, Any]:
         DatasetError: The file does not hold a JSON object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:  # the second: brackets nested thousands deep
+        content = json.loads(read_bytes(path, error=DatasetError, most=_MOST_JSON))
+    except (ValueError, RecursionError) as error:
         raise DatasetError(f"{path} is damaged: it does not hold JSON") from error
     if not isinstance(content, dict):
         raise DatasetError(f"{path} is damaged: it does not hold a JSON object")

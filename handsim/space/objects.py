@@ -17,6 +17,7 @@ import trimesh
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, ObjectError, choices
+from handsim.files.inputs import check_regular
 from handsim.space import solids as object_solids
 from handsim.space.solids import Part
 
@@ -29,6 +30,7 @@ MARKER_RADIUS: Final = 0.0032
 MESH_SUFFIXES: Final = (".stl", ".obj", ".ply", ".glb")
 _LARGEST: Final = 1.0  # [m]
 _SMALLEST: Final = 0.002
+_MOST_BYTES: Final = 1 << 26
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +117,6 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
         raise ObjectError(f"{path}: the mesh is empty, expected a closed surface of triangles")
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path}: the mesh has vertices that are NaN or infinite, expected finite meters")
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if size > _LARGEST:
         raise ObjectError(
@@ -123,15 +124,12 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
         )
     if size < _SMALLEST:
         raise ObjectError(f"{path}: the mesh is {size:.3g} m large, expected at least 2 mm, in meters")
-    if not mesh.is_watertight:
-        raise ObjectError(f"{path}: the mesh is not watertight; close its holes, so that it has an inside")
-    if mesh.volume < 0.0:
-        mesh.invert()
+    hull = _close(mesh, path)
     return RigidObject(
         name=path.name,
         vertices=np.asarray(mesh.vertices),
         faces=np.asarray(mesh.faces),
-        parts=(object_solids.hull_part(mesh.vertices),),
+        parts=(hull,),
         marker_names=(),
         markers=np.empty((0, 3)),
         marker_normals=np.empty((0, 3)),
@@ -143,13 +141,36 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
 def _read_mesh(path: Path) -> Any:
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise ObjectError(f"{path}: expected a mesh file that ends in {', '.join(MESH_SUFFIXES)}")
+    check_regular(path, error=ObjectError, most=_MOST_BYTES)
     if not path.is_file():
         raise ObjectError(f"{path}: no such file")
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # readers of damaged files fail in many ways
-        raise ObjectError(f"{path}: not a readable {path.suffix} mesh ({error})") from error
+        reason = " ".join(str(error).split())[:80]
+        raise ObjectError(f"{path}: not a readable {path.suffix} mesh ({reason})") from error
+    if len(mesh.faces) and not 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices):
+        raise ObjectError(f"{path}: a triangle names a vertex that is not among the {len(mesh.vertices)}")
     return mesh
+
+
+def _close(mesh: Any, path: Path) -> Part:
+    """Join the seams of a mesh, turn its inside in, and give its hull.
+
+    Raises:
+        ObjectError: It is not closed, or encloses nothing.
+    """
+    try:
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)  # a closed surface may come with seams
+        closed = bool(mesh.is_watertight)
+        if closed and mesh.volume < 0.0:
+            mesh.invert()
+        hull = object_solids.hull_part(mesh.vertices) if closed else None
+    except Exception as error:  # odd triangles fail in many ways
+        raise ObjectError(f"{path}: not a closed surface ({' '.join(str(error).split())[:80]})") from error
+    if hull is None:
+        raise ObjectError(f"{path}: the mesh is not watertight; close its holes, so that it has an inside")
+    return hull
 
 
 @cache

@@ -16,6 +16,7 @@ from rich.text import Text
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, list_layouts, load_layout, starter_layout
+from handsim.app.messages import print_line
 from handsim.errors import LayoutError
 from handsim.files.atomic import atomic_write
 from handsim.hand.shape import SIZES
@@ -42,7 +43,7 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
     """
     layout = load_layout(glove)
     table = Table(
-        "", "name", "bone", title=f"{layout.name}: {layout.num_markers} markers", title_justify="left"
+        "", "name", "bone", title=Text(f"{layout.name}: {layout.num_markers} markers"), title_justify="left"
     )
     for column in ("along", "around [deg]", "across"):
         table.add_column(column, justify="right")
@@ -70,7 +71,7 @@ def new_glove(file: Annotated[Path, tyro.conf.Positional]) -> None:
         raise LayoutError(f"{file} exists already and is left as it is; name a new file")
     with atomic_write(file) as temporary:
         temporary.write_text(starter_layout(), "utf-8")
-    Console().print(f"{file}: edit it, then run `handsim glove check {file}`", soft_wrap=True, markup=False)
+    print_line(f"{file}: edit it, then run `handsim glove check {file}`")
 
 
 def check_glove(
@@ -86,7 +87,7 @@ def check_glove(
         size: Size of the hand in the picture.
     """
     layout = load_layout(glove)
-    table = Table("size", "nearest two markers", title=f"{layout.name}: {layout.num_markers} markers")
+    table = Table("size", "nearest two markers", title=Text(f"{layout.name}: {layout.num_markers} markers"))
     table.add_column("centers apart [mm]", justify="right")
     overlaps = []
     for name in SIZES:
@@ -107,7 +108,7 @@ def check_glove(
 
     picture = Path(glove).with_suffix(".png") if out is None else out
     write_png(picture, draw_glove(nominal_fit(layout, size, "right")))
-    console.print(f"{picture}: the glove on a hand of size {size}", soft_wrap=True, markup=False)
+    print_line(f"{picture}: the glove on a hand of size {size}")
 
 
 def nearest_pair(points: NDArray[np.float64]) -> tuple[int, int, float]:

@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal
 import tyro
 from rich.console import Console
 
+from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError, choices
 from render.cameras.viewpoints import ViewConfig
@@ -112,18 +113,15 @@ def render(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     seconds = time.perf_counter() - start
-    console = Console()
     lost = left_out_frames(out)
     if lost:
-        console.print(
+        print_line(
             f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a "
-            "hand or an object",
-            soft_wrap=True,
-            markup=False,
+            "hand or an object"
         )
-    console.print(f"{out}: {count} images in {seconds:.0f} s", soft_wrap=True, markup=False)
+    print_line(f"{out}: {count} images in {seconds:.0f} s")
     if {"rgb", "depth"} & set(config.passes):
-        console.print(f"{out / SHEET}: some of them at one glance", soft_wrap=True, markup=False)
+        print_line(f"{out / SHEET}: some of them at one glance")
 
 
 def _tone_ranges(tones: tuple[str, ...]) -> tuple[float, ...]:

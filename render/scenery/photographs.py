@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from handsim.errors import HandSimError
+from handsim.files.inputs import check_regular
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs
+_MOST_PIXELS: Final = 100_000_000  # of a photograph
 _GAMMA: Final = 2.2
 
 
@@ -52,11 +56,25 @@ def _no_photo(folder: Path) -> HandSimError:
 
 def _read(file: Path) -> NDArray[np.uint8] | None:
     try:
+        check_regular(file, error=HandSimError)
+        if _num_pixels(file) > _MOST_PIXELS:
+            return None
         data = np.fromfile(file, dtype=np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    except (OSError, cv2.error):
+    except (OSError, cv2.error, HandSimError):
         return None
     return None if picture is None else np.asarray(picture)
+
+
+def _num_pixels(file: Path) -> int:
+    """Pixels that a file states; OpenCV would allocate them all before it finds that they are not there."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of decompression bombs
+            with Image.open(file) as picture:
+                return int(picture.width * picture.height)
+    except Exception as error:  # headers are damaged in many ways
+        raise HandSimError(f"{file}: not a readable photograph") from error
 
 
 def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.captures.capture import Capture
+from gloves.captures.plausibility import check_unit
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate, template_fault
 from track.calibration.frames import CalibrationError
 from track.capture_tracking import capture_frames
 from track.streams.point_stream import StreamedFrame
-from train.labelers.protocol import check_unit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,13 +10,13 @@ import tyro
 
 from gloves.captures.formats import read_capture
 from gloves.takes.take import SUFFIX, load_take
+from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from track.bodies.body_file import SUFFIX as TOML
 from track.bodies.body_file import save_body
 from track.bodies.rigid_body import RigidTemplate
 from track.calibration.body_learning import learn_body
-from track.evaluation.take_summary import print_line
 
 
 def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:

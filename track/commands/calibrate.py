@@ -15,13 +15,13 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from gloves.fit import GloveFit
 from gloves.takes.tracked_take import INITIALIZED, TRACKED, TrackedTake
+from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.hand.topology import Side
 from track.calibration.user_calibration import Calibration, CalibrationError, calibrate_hands
 from track.capture_tracking import track_capture
 from track.commands.user_options import BOTH, Size, uncalibrated_users
-from track.evaluation.take_summary import print_line
 from track.tracker import Tracker
 from track.user import save_user
 from train.labelers.protocol import Labeler

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,15 +20,16 @@ from gloves.captures.markers import labeled_capture
 from gloves.fit import GloveFit
 from gloves.takes.take import SUFFIX
 from gloves.takes.tracked_take import TrackedTake, load_tracked_take
+from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, HandSimWarning
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.capture_tracking import track_capture, warm_up
 from track.commands.live import TrackedSource, track_live
 from track.commands.user_options import BOTH, Size, calibrated_users, uncalibrated_users
-from track.evaluation.take_summary import print_line, summarize
+from track.evaluation.take_summary import summarize, suspicions
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
@@ -102,6 +104,8 @@ def track(
         f"{1e3 * np.median(timed.seconds):.2f} ms per frame",
     ):
         print_line(line)
+    for suspicion in suspicions(tracked.take):
+        warnings.warn(suspicion, HandSimWarning, stacklevel=2)
 
 
 class TimedTracker(Tracker):

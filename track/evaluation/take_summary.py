@@ -1,16 +1,20 @@
-"""Summary of a tracked take, as lines of text."""
+"""Summary of a tracked take, as lines of text, and what in it tells of a mistake."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from rich.console import Console
 
 from gloves.takes.tracked_take import LOST, STATUSES, TrackedTake
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
+
+_LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
+_MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
+_MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
+_MOST_UNLABELED: Final = 0.25  # share of the points
 
 
 def summarize(take: TrackedTake) -> list[str]:
@@ -34,6 +38,41 @@ def summarize(take: TrackedTake) -> list[str]:
     return [*lines, f"{unlabeled} of {int(there.sum())} points are not markers"]
 
 
+def suspicions(take: TrackedTake) -> list[str]:
+    """What is probably not as the user meant it, as one sentence each with its remedy."""
+    found = []
+    for number, side in enumerate(take.sides):
+        shown = take.status[:, number] != LOST
+        others = " ".join(other for other in take.sides if other != side)
+        if shown.mean() < _LEAST_SEEN:
+            remedy = f"track the {others} hand alone (--hands {others}), or name the glove worn (--glove)"
+            found.append(
+                f"the {side} hand was seen in {100 * shown.mean():.1f} % of the frames; if it is not in the "
+                f"capture, {remedy if others else 'name the other hand (--hands) or the glove worn (--glove)'}"
+            )
+            continue
+        filled = float(take.filled[shown, number].mean())
+        if filled > _MOST_FILLED:
+            found.append(
+                f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its "
+                "pose; name the glove worn (--glove) and the hands that are in the capture (--hands)"
+            )
+        rms = float(np.nanmedian(take.rms[shown, number])) if np.isfinite(take.rms[:, number]).any() else 0.0
+        if rms > _MOST_RMS:
+            found.append(
+                f"the {side} hand's markers are {1e3 * rms:.1f} mm off its pose; name the glove worn "
+                "(--glove), try another --size, or calibrate the hands (handsim calibrate, then --shape)"
+            )
+    there = np.isfinite(take.points[..., 0])
+    unlabeled = float((take.labels[there] < 0).mean()) if there.any() else 0.0
+    if unlabeled > _MOST_UNLABELED:
+        found.append(
+            f"{100 * unlabeled:.1f} % of the points are not markers of what was tracked; name the glove worn "
+            "(--glove), the hands (--hands) and the rigid bodies (--body) that are in the capture"
+        )
+    return found
+
+
 def _status_shares(status: Int[np.ndarray, "T"]) -> str:
     """Share of the frames with each status."""
     return ", ".join(
@@ -44,8 +83,3 @@ def _status_shares(status: Int[np.ndarray, "T"]) -> str:
 
 def _median_rms(rms: Float[np.ndarray, "T"]) -> str:
     return f"median RMS {1e3 * np.nanmedian(rms):.2f} mm"
-
-
-def print_line(line: str) -> None:
-    """Print a line as it is."""
-    Console().print(line, highlight=False, soft_wrap=True, markup=False)

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
+from handsim.app.messages import print_line
 from handsim.errors import HandSimError
 
 
@@ -25,4 +25,4 @@ def export(labeler: Annotated[str, tyro.conf.Positional], out: Path) -> None:
         raise HandSimError(f"cannot write '{out}', expected a name that ends in .onnx")
     network, card = load_network(labeler)
     export_onnx(network, card["marker_names"], out)
-    Console().print(f"{out}: {len(card['marker_names'])} markers", highlight=False, soft_wrap=True)
+    print_line(f"{out}: {len(card['marker_names'])} markers")

@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import tyro
 from rich.console import Console
 
+from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
@@ -41,5 +42,5 @@ def generate(
             TakeConfig(kind="hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
         )
         report = write_report(Dataset(out), present=take.markers_present(), rate=take.rate)
-    Console().print(f"{manifest.num_frames} frames of {config.glove} in {out}")
-    Console().print(f"report in {report}", soft_wrap=True, markup=False)
+    print_line(f"{manifest.num_frames} frames of {config.glove} in {out}")
+    print_line(f"report in {report}")

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX
+from handsim.app.messages import print_line
 from handsim.files.atomic import atomic_writes
 from train.simulation.takes import TakeConfig, simulate_take
 
@@ -32,8 +32,4 @@ def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -
         write_capture(capture_file, Capture(names, take.points, take.rate))
         take.save(truth_file)
     counts = count_gaps(take.markers_present())
-    Console().print(
-        f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}",
-        highlight=False,
-        soft_wrap=True,
-    )
+    print_line(f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}")

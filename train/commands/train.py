@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import tyro
-from rich.console import Console
 
+from handsim.app.messages import print_line
 from handsim.app.presets import PresetCommand, given_option
 from handsim.app.progress import progress_bar
 from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
@@ -47,8 +47,8 @@ def _train(
 
         card = train_labeler(rows, config, out, threads=threads, progress=report)
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
-    Console().print(f"weights and model card in {out}")
-    Console().print(f"report in {out / PAGE}", soft_wrap=True, markup=False)
+    print_line(f"weights and model card in {out}")
+    print_line(f"report in {out / PAGE}")
 
 
 def _with_recipe_as_default(args: Sequence[str], prog: str) -> Callable[..., None]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
+from gloves.captures.plausibility import check_unit
 from handsim.errors import ArgumentError
 from train.labelers.matching import match_scores
 
@@ -16,9 +17,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_POINTS: Final = 512
-MAX_SPAN: Final = 30.0
-"""Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
-_MIN_POINTS: Final = 5  # from which a cloud shows its unit; fewer points may all be strays
 _BATCH: Final = 256
 
 
@@ -128,21 +126,3 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
     if len(cloud) > MAX_POINTS:
         raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MAX_POINTS}")
     return cloud
-
-
-def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> None:
-    """Refuse clouds in millimeters, by their median span, since strays of a real system lie anywhere.
-
-    Args:
-        clouds: Points of each frame [m].
-
-    Raises:
-        ArgumentError: Most frames span more than a room.
-    """
-    spans = [
-        float((cloud.max(axis=0) - cloud.min(axis=0)).max()) for cloud in clouds if len(cloud) >= _MIN_POINTS
-    ]
-    if max(spans, default=0.0) > MAX_SPAN and (span := float(np.median(spans))) > MAX_SPAN:
-        raise ArgumentError(
-            f"the points of a frame span {span:.0f} m, expected a hand in meters; millimeters?"
-        )

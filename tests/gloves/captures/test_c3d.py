@@ -39,6 +39,7 @@ def c3d(
     rate: float = 120.0,
     missing: tuple[tuple[int, int], ...] = (),
     analog: int = 0,
+    analog_in_header: int | None = None,
     stated_frames: int | None = None,
     long_frames: tuple[int, int] | None = None,
 ) -> bytes:
@@ -75,7 +76,9 @@ def c3d(
         group.append(record("ACTUAL_END_FIELD", 3, integers(*long_frames), processor))
     parameters = bytes([1, 0x50, 2, processor]) + b"".join(group) + bytes(4)
     assert len(parameters) <= 1024
-    header = bytes([2, 0x50]) + struct.pack(f"{order}5H", num_points, analog, 1, num_frames, 0)
+    header = bytes([2, 0x50]) + struct.pack(
+        f"{order}5H", num_points, analog if analog_in_header is None else analog_in_header, 1, num_frames, 0
+    )
     header += floats(np.array([scale]), processor) + struct.pack(f"{order}2H", 4, int(analog > 0))
     header += floats(np.array([rate]), processor)
     residual = np.zeros((num_frames, num_points, 1))
@@ -210,6 +213,11 @@ BAD: dict[str, bytes] = {
     "more frames stated than there are": c3d(stated_frames=99),
     "a long take cut": c3d(stated_frames=65535, long_frames=(0, 2)),
     "unknown numbers": c3d()[:515] + b"\x99" + c3d()[516:],
+    "an analog block in the header alone": c3d(np.tile(POINTS, (40, 1, 1)), analog_in_header=8),
+    "another analog block in the header": c3d(np.tile(POINTS, (40, 1, 1)), analog=4, analog_in_header=2),
+    "fewer points than were written": c3d(np.tile(POINTS, (40, 4, 1))).replace(
+        b"USED\x08\0\x02\x01\x01\x08", b"USED\x08\0\x02\x01\x01\x02"
+    ),
     "no units": c3d().replace(b"UNITS", b"STINU"),
     "no rate stated": c3d().replace(b"RATE", b"ETAR"),
 }

@@ -25,6 +25,7 @@ def captures(draw: st.DrawFn) -> Capture:
     num_frames, num_markers = draw(st.integers(1, 6)), draw(st.integers(1, 5))
     names = draw(st.lists(NAMES, min_size=num_markers, max_size=num_markers))
     positions = draw(hnp.arrays(np.float64, (num_frames, num_markers, 3), elements=st.floats(-10.0, 10.0)))
+    positions[(np.abs(positions) < 1e-6).all(axis=-1)] = 1e-3  # zeros are read as missing
     positions[draw(hnp.arrays(np.bool_, (num_frames, num_markers)))] = np.nan
     return Capture(tuple(names), positions, draw(st.sampled_from([24.0, 59.94, 120.0, 1000.0 / 3.0])))
 

@@ -1,0 +1,136 @@
+"""What the positions of a capture tell about mistakes in its file: a wrong unit or place, zeros for gaps."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gloves.captures.capture import Capture
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+MAX_SPAN: Final = 30.0
+"""Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
+_MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
+_MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
+_MIN_POINTS: Final = 5  # from which a cloud shows its unit; fewer points may all be strays
+_MIN_FRAMES: Final = 10  # from which small or wide clouds count; a few frames may show strays alone
+_SAMPLED: Final = 200  # frames that are looked at, evenly spread
+
+
+class UnitFault(NamedTuple):
+    """Clouds in a wrong unit."""
+
+    found: str
+    """What is wrong with them as meters."""
+    guess: str
+    """The unit of length that they probably had before they were scaled."""
+
+    @property
+    def hint(self) -> str:
+        """The guess as a question about positions that should be in meters."""
+        return "; scaled twice?" if self.guess == "meters" else f"; {self.guess}?"
+
+
+def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> UnitFault | None:
+    """What tells that clouds are not in meters, if anything does.
+
+    Medians over the frames decide, since strays of a real system lie anywhere.
+
+    Args:
+        clouds: Points of each frame [m].
+    """
+    shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
+    step = -(-len(shown) // _SAMPLED) or 1
+    shown = shown[::step]
+    if not shown:
+        return None
+    span = float(np.median([np.ptp(cloud, axis=0).max() for cloud in shown]))
+    if span > MAX_SPAN:
+        return UnitFault(f"the points of a frame span {span:.0f} m", "millimeters")
+    if len(shown) < _MIN_FRAMES:
+        return None
+    if span < _MIN_SPAN:
+        return UnitFault(f"the points of a frame span {1e3 * span:.2g} mm", "meters")
+    spacing = float(np.median([_spacing(cloud) for cloud in shown]))
+    if spacing > _MAX_SPACING:
+        return UnitFault(f"the points of a frame are {spacing:.2g} m apart", "centimeters")
+    return None
+
+
+def _spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
+    """Median distance of a point from its nearest neighbor [m]."""
+    return float(np.median(cKDTree(cloud).query(cloud, k=2)[0][:, 1]))
+
+
+def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> None:
+    """Refuse clouds that are not in meters.
+
+    Args:
+        clouds: Points of each frame [m].
+
+    Raises:
+        ArgumentError: They cannot be, see `unit_fault`.
+    """
+    fault = unit_fault(clouds)
+    if fault is not None:
+        raise ArgumentError(f"{fault.found}, expected a hand in meters{fault.hint}")
+
+
+def zeros_as_missing(capture: Capture) -> tuple[Capture, int]:
+    """A capture whose points at exactly (0, 0, 0) are missing, and how many they were.
+
+    Some programs write zeros for what was not seen. A measured point is never exactly there twice; a capture
+    in which nothing moves is left as it is.
+    """
+    positions = capture.positions
+    zero = (positions == 0.0).all(axis=-1)
+    count = int(zero.sum())
+    if count < 2 or not _moves(positions, np.isfinite(positions[..., 0]) & ~zero):
+        return capture, 0
+    return dataclasses.replace(capture, positions=np.where(zero[..., None], np.nan, positions)), count
+
+
+def check_place(capture: Capture, farthest: float) -> None:
+    """Tell of points so far from the origin that they will be left out.
+
+    Args:
+        capture: Positions [m].
+        farthest: From this coordinate on a point is left out [m].
+
+    Raises:
+        CaptureError: They are most of the points.
+
+    Warns:
+        HandSimWarning: There are some.
+    """
+    there = np.isfinite(capture.positions[..., 0])
+    far = int((np.abs(capture.positions[there]).max(axis=-1, initial=0.0) >= farthest).sum())
+    points = int(there.sum())
+    if far > points / 2:
+        raise CaptureError(
+            f"{far} of {points} points lie {farthest:.0f} m or more from the origin, expected hands in a "
+            "room; move the origin of the capture into the room"
+        )
+    if far:
+        warnings.warn(
+            f"{far} of {points} points lie {farthest:.0f} m or more from the origin and are left out",
+            HandSimWarning,
+            stacklevel=2,
+        )
+
+
+def _moves(positions: Float[np.ndarray, "T N 3"], there: Bool[np.ndarray, "T N"]) -> bool:
+    """Whether any trajectory takes more than one position."""
+    for column in range(positions.shape[1]):
+        track = positions[there[:, column], column]
+        if len(track) and (track != track[0]).any():
+            return True
+    return False

@@ -1,0 +1,68 @@
+"""Arrays from files of others: sizes are read and checked before anything is allocated, nothing is unpickled."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+
+_MOST_MEMBERS: Final = 100
+_MOST_DIMENSIONS: Final = 8
+_ALWAYS: Final = 1 << 28  # bytes that any archive may hold
+_LARGEST_RATIO: Final = 20  # of the bytes in memory to those of the file beyond that
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
+    """All arrays of an `.npz`, by name.
+
+    Args:
+        path: A regular file.
+
+    Raises:
+        ValueError: Not an archive of plain arrays, a header that does not fit its bytes, or far more bytes
+            than such a file may hold.
+        OSError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError: It cannot be read.
+    """
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        size, most = sum(member.file_size for member in members), _most_bytes(path.stat().st_size)
+        if len(members) > _MOST_MEMBERS or size > most:
+            raise ValueError(f"{len(members)} arrays of {size} bytes, expected at most {most} bytes")
+        for member in members:
+            with archive.open(member) as file:
+                check_npy_header(file, member.file_size)
+    with np.load(path, allow_pickle=False) as stored:
+        return {name: stored[name] for name in stored.files}
+
+
+def _most_bytes(size: int) -> int:
+    """Bytes that a file of this size may take in memory."""
+    return max(_ALWAYS, _LARGEST_RATIO * size)
+
+
+def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of the array in an `.npy`, whose header must state exactly its bytes.
+
+    Args:
+        file: At its beginning; read up to the end of the header.
+        size: Number of its bytes.
+
+    Raises:
+        ValueError: It does not, or the array holds Python objects.
+    """
+    version = np.lib.format.read_magic(file)
+    if version not in {(1, 0), (2, 0)}:
+        raise ValueError(f"an array file of version {version}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    try:
+        shape, _, dtype = read(file)
+    except Exception as error:  # numpy reads it as Python text, which fails in many ways
+        raise ValueError("no header of an array") from error
+    if dtype.hasobject or dtype.itemsize == 0 or len(shape) > _MOST_DIMENSIONS or min(shape, default=0) < 0:
+        raise ValueError(f"an array of type {dtype} and shape {shape}")
+    if math.prod(shape) * dtype.itemsize != size - file.tell():
+        raise ValueError(f"an array of type {dtype} and shape {shape} in {size} bytes")
+    return shape, dtype

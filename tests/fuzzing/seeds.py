@@ -1,0 +1,225 @@
+"""Valid files of every kind, small and the same each time."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import trimesh
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import write_capture
+from gloves.fit import GlovedHand, GloveFit, attach
+from gloves.layout import load_layout, save_layout, starter_layout
+from gloves.takes.take import Take
+from gloves.takes.tracked_take import STATUSES, MarkedBody, TrackedTake
+from handsim.hand.model import HandModel
+from handsim.hand.shape import sample_shape
+from handsim.space.objects import named_object
+from track.bodies.body_file import save_body
+from track.bodies.rigid_body import RigidTemplate
+from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
+from track.user import save_user
+
+FRAMES, COLUMNS = 4, 24
+SETTINGS = {"num_frames": 10, "glove": "dense19", "scenes": {"one": 1.0}}
+MOTIVE = """\
+Format Version,1.23,Take Name,Take 1,Capture Frame Rate,120.000000,Export Frame Rate,120.000000,\
+Rotation Type,Quaternion,Total Frames in Take,3,Total Exported Frames,3,Length Units,Meters,\
+Coordinate Space,Global
+
+,,Type,Marker,Marker,Marker,Marker,Marker,Marker
+,,Name,Hand:Thumb,Hand:Thumb,Hand:Thumb,Unlabeled 17,Unlabeled 17,Unlabeled 17
+,,ID,1,1,1,2,2,2
+,,,Position,Position,Position,Position,Position,Position
+Frame,Time (Seconds),,X,Y,Z,X,Y,Z
+0,0.000000,,0.1,0.2,0.3,0.15,0.25,0.35
+1,0.008333,,0.11,0.21,0.31,,,
+2,0.016667,,0.12,0.22,0.32,0.16,0.26,0.36
+"""
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(17)
+
+
+def capture() -> Capture:
+    positions = _rng().uniform(0.0, 0.2, size=(12, 7, 3))
+    positions[3, 2] = np.nan
+    return Capture(("ThumbTip", "*2", "Anna:c", "d", "e", "f", "Unlabeled 7"), positions, 120.0)
+
+
+def trc(folder: Path) -> list[Path]:
+    write_capture(folder / "take.trc", capture())
+    return [folder / "take.trc"]
+
+
+def c3d(folder: Path) -> list[Path]:
+    write_capture(folder / "take.c3d", capture())
+    return [folder / "take.c3d"]
+
+
+def motive_csv(folder: Path) -> list[Path]:
+    (folder / "take.csv").write_text(MOTIVE)
+    return [folder / "take.csv"]
+
+
+def layout(folder: Path) -> list[Path]:
+    (folder / "starter.toml").write_text(starter_layout())
+    save_layout(folder / "dense.toml", load_layout("dense19"))
+    return [folder / "starter.toml", folder / "dense.toml"]
+
+
+def rig(folder: Path) -> list[Path]:
+    top = 'name = "mine"\nfield_of_view = 60.0\nresolution = 1280\n'
+    camera = "[[camera]]\nposition = [{}, 0.0, 2.0]\ntarget = [0.0, 0.0, 1.1]\n"
+    (folder / "rig.toml").write_text(top + camera.format(1.5) + camera.format(-1.5))
+    return [folder / "rig.toml"]
+
+
+def body(folder: Path) -> list[Path]:
+    save_body(folder / "body.toml", RigidTemplate.of(named_object("controller")))
+    return [folder / "body.toml"]
+
+
+def mesh(folder: Path) -> list[Path]:
+    box = trimesh.creation.box((0.05, 0.06, 0.07))
+    for ending in ("stl", "obj", "ply", "glb"):
+        box.export(folder / f"box.{ending}")
+    return [folder / f"box.{ending}" for ending in ("stl", "obj", "ply", "glb")]
+
+
+def hands() -> tuple[GloveFit, ...]:
+    rng = _rng()
+    shapes = [sample_shape(side=side, rng=rng) for side in ("left", "right")]
+    return tuple(attach(load_layout("sparse13"), HandModel(shape)) for shape in shapes)
+
+
+def truth(folder: Path) -> list[Path]:
+    qpos = np.zeros((FRAMES, 27))
+    qpos[:, 3] = 1.0
+    take = Take(
+        rate=120.0,
+        points=_rng().uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3)),
+        ids=np.tile(np.arange(COLUMNS), (FRAMES, 1)),
+        labels=np.tile(np.arange(COLUMNS), (FRAMES, 1)),
+        hands=tuple(GlovedHand(hand, qpos) for hand in hands()),
+        body=None,
+        settings={"kind": "single-hand"},
+    )
+    take.save(folder / "take.truth.npz")
+    return [folder / "take.truth.npz"]
+
+
+def tracked(folder: Path) -> list[Path]:
+    rng, worn = _rng(), hands()
+    qpos = np.zeros((FRAMES, 2, 27))
+    qpos[..., 3] = 1.0
+    take = TrackedTake(
+        rate=120.0,
+        times=np.arange(FRAMES) / 120.0,
+        hands=worn,
+        qpos=qpos,
+        status=np.full((FRAMES, 2), STATUSES.index("tracked"), dtype=np.int8),
+        rms=np.full((FRAMES, 2), 1e-3),
+        markers=rng.uniform(0.0, 0.2, size=(FRAMES, 2, worn[0].layout.num_markers, 3)),
+        filled=np.zeros((FRAMES, 2, worn[0].layout.num_markers), dtype=bool),
+        points=rng.uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3)),
+        ids=np.tile(np.arange(COLUMNS, dtype=np.int32), (FRAMES, 1)),
+        labels=np.tile(np.arange(COLUMNS, dtype=np.int16), (FRAMES, 1)),
+        confidence=np.ones((FRAMES, COLUMNS)),
+        bodies=(MarkedBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3)),),
+        body_poses=np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (FRAMES, 1, 1)),
+        body_status=np.full((FRAMES, 1), STATUSES.index("tracked"), dtype=np.int8),
+        body_rms=np.full((FRAMES, 1), 1e-3),
+        settings={"glove": "sparse13"},
+    )
+    take.save(folder / "take.npz")
+    return [folder / "take.npz"]
+
+
+def user(folder: Path) -> list[Path]:
+    save_user(folder / "user.json", hands(), "calibrated")
+    return [folder / "user.json"]
+
+
+def settings(folder: Path) -> list[Path]:
+    (folder / "config.json").write_text(json.dumps(SETTINGS))
+    return [folder / "config.json"]
+
+
+def packets(folder: Path) -> list[Path]:
+    rng = _rng()
+    frame = MarkerFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))
+    info = ServerInfo("Motive", (3, 1), 1511, "239.255.42.99")
+    contents = {
+        "frame-3.0": pack_frame(frame, (3, 0)),
+        "frame-4.1": pack_frame(frame, (4, 1)),
+        "info": pack_server_info(info),
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    return [folder / name for name in contents]
+
+
+def photos(folder: Path) -> list[Path]:
+    picture = _rng().integers(0, 256, size=(24, 32, 3), dtype=np.uint8)
+    names = ("photo.jpg", "photo.png", "photo.webp", "photo.bmp", "photo.tif")
+    for name in names:
+        cv2.imwrite(str(folder / name), picture)
+    return [folder / name for name in names]
+
+
+def weights(folder: Path) -> list[Path]:
+    import torch
+
+    from train.config import SetLabelerConfig
+    from train.labelers.kinds import new_network
+    from train.labelers.storage import CARD, WEIGHTS, save_network
+
+    torch.manual_seed(0)
+    network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
+    save_network(folder, network, {"marker_names": list("abcd")})
+    return [folder / WEIGHTS, folder / CARD]
+
+
+def onnx(folder: Path) -> list[Path]:
+    import torch
+
+    from train.config import SetLabelerConfig
+    from train.labelers.kinds import new_network
+    from train.labelers.onnx_labeler import export_onnx
+
+    torch.manual_seed(0)
+    network = new_network(SetLabelerConfig(num_labels=4, width=8, gates=2, depth=1, num_distances=4))
+    export_onnx(network, tuple("abcd"), folder / "labeler.onnx")
+    return [folder / "labeler.onnx"]
+
+
+def dataset(folder: Path) -> list[Path]:
+    from handsim.hand.records import HAND_DTYPE, pack_hand
+    from train.data.shards import CONFIG, MANIFEST, Manifest, hands_name, row_dtype, rows_name, save_array
+
+    names = load_layout("sparse13").names
+    rows = np.zeros(3, dtype=row_dtype(len(names)))
+    rows["qpos"][:, 3] = 1.0
+    rows["markers"] = rows["observed"] = _rng().uniform(0.0, 0.2, size=(3, len(names), 3))
+    save_array(folder / rows_name(0), rows)
+    save_array(folder / hands_name(0), np.array([pack_hand(hands()[1].shape)], dtype=HAND_DTYPE))
+    files = [folder / rows_name(0), folder / hands_name(0)]
+    sums = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+    manifest = Manifest({"glove": "sparse13"}, names, 3, 3, sums)
+    for name, content in ((MANIFEST, dataclasses.asdict(manifest)), (CONFIG, {"glove": "sparse13"})):
+        (folder / name).write_text(json.dumps(content, indent=1))
+    return [*files, folder / MANIFEST]
+
+
+def checkpoint(folder: Path) -> list[Path]:
+    from tests.fuzzing.training import state
+
+    state(folder).save(folder / "checkpoint.pt")
+    return [folder / "checkpoint.pt"]

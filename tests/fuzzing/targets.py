@@ -1,0 +1,120 @@
+"""Every reader of files and packets, and how it is called."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gloves.captures.formats import read_capture
+from gloves.layout import load_layout
+from gloves.takes.take import load_take
+from gloves.takes.tracked_take import load_tracked_take
+from handsim.errors import HandSimError
+from handsim.files.json_files import claim, load_json
+from handsim.space.cameras import load_rig
+from handsim.space.objects import load_object
+from render.scenery.photographs import draw_photo, photo_files
+from tests.fuzzing import seeds
+from tests.fuzzing.engine import Target
+from tests.fuzzing.mutations import mutate_archive
+from track.bodies.body_file import load_body
+from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
+from track.user import load_user
+
+_CLOUD: Final = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.07, 0.0], [0.0, 0.02, 0.08]])
+
+
+def _read_settings(path: Path) -> None:
+    load_json(path)
+    claim(path, seeds.SETTINGS, noun="training set", error=HandSimError)
+
+
+def _read_packet(path: Path) -> None:
+    kind, payload = unpack(path.read_bytes())
+    if kind == Kind.SERVER_INFO or path.name == "info":
+        parse_server_info(payload)
+    else:
+        parse_frame(payload, (4, 1) if path.name.endswith("4.1") else (3, 0))
+
+
+def _read_photo(path: Path) -> None:
+    photo_files.cache_clear()
+    with _silence():
+        photo_files(path.parent)
+        draw_photo(path, (16, 12), np.random.default_rng(0))
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Without the messages that the libraries of OpenCV write themselves."""
+    kept, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nothing, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nothing)
+
+
+def _read_weights(path: Path) -> None:
+    from train.labelers.storage import load_labeler
+
+    load_labeler(path.parent).label_frames([_CLOUD])
+
+
+def _read_onnx(path: Path) -> None:
+    from train.labelers.storage import load_labeler
+
+    load_labeler(path).label_frames([_CLOUD])
+
+
+def _read_dataset(path: Path) -> None:
+    """With checksums of what is there, so that more than the checksum is tried."""
+    from train.data.shards import MANIFEST, Dataset
+
+    manifest = path.with_name(MANIFEST)
+    if path != manifest:
+        content = json.loads(manifest.read_text())
+        content["files"][path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        manifest.write_text(json.dumps(content))
+    dataset = Dataset(path.parent)
+    rows = dataset.rows()
+    hands = dataset.hands(0)
+    assert len(rows) and len(rows["markers"]) and len(hands)
+
+
+def _read_checkpoint(path: Path) -> None:
+    from tests.fuzzing.training import state
+
+    state(path.parent).restore(path)
+
+
+_ALL: Final = (
+    Target("c3d", seeds.c3d, read_capture),
+    Target("trc", seeds.trc, read_capture),
+    Target("csv", seeds.motive_csv, read_capture),
+    Target("layout", seeds.layout, load_layout),
+    Target("rig", seeds.rig, load_rig),
+    Target("body", seeds.body, load_body),
+    Target("mesh", seeds.mesh, load_object),
+    Target("truth", seeds.truth, load_take, mutate_archive),
+    Target("tracked", seeds.tracked, load_tracked_take, mutate_archive),
+    Target("user", seeds.user, load_user),
+    Target("weights", seeds.weights, _read_weights),
+    Target("onnx", seeds.onnx, _read_onnx),
+    Target("dataset", seeds.dataset, _read_dataset),
+    Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_archive),
+    Target("settings", seeds.settings, _read_settings),
+    Target("packet", seeds.packets, _read_packet, refusals=(DamagedPacket,)),
+    Target("photo", seeds.photos, _read_photo),
+)
+TARGETS: Final = {target.name: target for target in _ALL}
+"""By name."""
