@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _MOST_FITTINGS: Final = 20
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
+_LARGEST: Final = 100.0  # [m], of a direction and a bone's number too; far more than any hand has
 _SUM_TOLERANCE: Final = 1e-6
 
 
@@ -49,6 +50,8 @@ class Attachment:
                 raise ArgumentError(f"{name} has shape {shape}, expected {expected}")
             if not np.isfinite(getattr(self, name)).all():
                 raise ArgumentError(f"{name} holds NaN or infinite values, expected finite numbers")
+            if np.abs(getattr(self, name)).max(initial=0) > _LARGEST:
+                raise ArgumentError(f"{name} holds numbers beyond {_LARGEST:g}, expected markers on a hand")
         bones, shares = self.bone_indices, self.bone_weights
         if bones.dtype.kind != "i" or not ((bones >= 0) & (bones < NUM_BONES)).all():
             raise ArgumentError(

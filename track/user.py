@@ -103,7 +103,11 @@ def load_user(path: str | Path) -> tuple[GloveFit, ...]:
 
 
 def _reason(error: Exception) -> str:
-    return f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
+    if isinstance(error, KeyError):
+        return f"the key {error} is missing"
+    if isinstance(error, TypeError | AttributeError | OverflowError):  # in the words of Python
+        return "a value is of another kind than handsim calibrate writes"
+    return " ".join(str(error).splitlines())
 
 
 def _to_json(hand: GloveFit) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tokenize
 import warnings
 import zipfile
 import zlib
@@ -28,7 +29,7 @@ KINDS: Final = {
 _OLDEST_KIND: Final = "take"  # of headers without a kind
 _DAMAGE: Final = (
     HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, EOFError,
-    RuntimeError, SyntaxError, zipfile.BadZipFile, zlib.error,
+    RuntimeError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """Exceptions that reading a damaged file may raise."""
 
@@ -128,7 +129,7 @@ def _read_cut_off(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.n
         arrays = grown.read()
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (*_DAMAGE, RecursionError) as error:
+    except _DAMAGE as error:
         raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
     if grown.num_frames < 2:
         raise CaptureError(

@@ -30,7 +30,7 @@ from handsim.hand.topology import NUM_QPOS, Side
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
+    from numpy.typing import DTypeLike, NDArray
 
 KIND: Final = "tracked take"
 SCHEMA: Final = 1
@@ -54,6 +54,8 @@ class MarkedBody:
             raise ArgumentError(
                 f"{self.name}: positions has shape {self.positions.shape}, expected {expected}"
             )
+        if not all(isinstance(name, str) for name in (self.name, *self.marker_names)):
+            raise ArgumentError(f"{self.name!r}: a name is no text, expected text for body and markers")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,6 +260,15 @@ _ARRAYS: Final = {
 }
 """The fields that a file holds by their names, and their types."""
 _ATTACHMENT: Final = ("points", "normals", "bone_indices", "bone_weights")
+_TYPES: Final[dict[str, DTypeLike]] = {
+    **_ARRAYS,
+    NUMBERS: "i8",
+    "hands": HAND_DTYPE,
+    "body_places": "f8",
+    **{f"attachment_{name}": "f8" for name in _ATTACHMENT if name != "bone_indices"},
+}
+"""The types of the arrays of a file; indices of bones may be of any whole type."""
+_LARGEST: Final = 1e9  # [m], of anything
 
 
 def unpack_take(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> TrackedTake:
@@ -265,6 +276,8 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Tracke
     check_types(arrays, {**_ARRAYS, "hands": HAND_DTYPE})
     if tuple(header["statuses"]) != STATUSES:
         raise ValueError("other statuses")
+    if any(arrays[name].dtype != dtype for name, dtype in _TYPES.items() if name in arrays):
+        raise ValueError("numbers of another type")
     hands = []
     worn = zip(*(arrays[f"attachment_{name}"] for name in _ATTACHMENT), strict=True)
     for record, layout, parts in zip(arrays["hands"], header["layouts"], worn, strict=True):
@@ -320,8 +333,23 @@ def _check(take: TrackedTake) -> None:
             or (np.isnan(poses) != (status == LOST)[..., None]).any()
         ):
             raise ValueError("a status is unknown, or does not fit its pose")
+    bodies_markers = [body.positions for body in take.bodies]
+    for values in (take.qpos, take.markers, take.points, take.body_poses, *bodies_markers):
+        _check_range(values, -_LARGEST, _LARGEST)
+    for values in (take.rms, take.body_rms):
+        _check_range(values, 0.0, _LARGEST)
+    _check_range(take.confidence, 0.0, 1.0)
     if not _within(take.labels, -1, len(take.label_names) - 1):
         raise ValueError("a label names no marker")
+
+
+def _check_range(values: NDArray[np.float64], low: float, high: float) -> None:
+    """Raise a `ValueError` unless all numbers that are not NaN are within a range."""
+    if not (
+        np.fmin.reduce(values, axis=None, initial=low) >= low
+        and np.fmax.reduce(values, axis=None, initial=high) <= high
+    ):
+        raise ValueError(f"a number is not from {low:g} to {high:g}")
 
 
 def _within(values: NDArray[Any], low: float, high: float) -> bool:

@@ -90,9 +90,19 @@ def spoil_sides(content):
     content["hands"][1] = content["hands"][0]
 
 
+def spoil_glove(content):
+    content["glove"] = 1
+
+
+def spoil_distance(content):
+    content["hands"][0]["markers"]["points"][3][1] = 1e30
+
+
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
+        (spoil_glove, "a value is of another kind than handsim calibrate writes"),
+        (spoil_distance, "points holds numbers beyond 100, expected markers on a hand"),
         (spoil_schema, "schema 99, expected 1"),
         (spoil_layout, "unknown bone 'toe'"),
         (spoil_number, "damaged"),

@@ -151,9 +151,33 @@ def test_what_does_not_fit_together_is_no_take(take):
         {"labels": take.labels + 20},
         {"confidence": take.confidence[:, 1:]},
         {"bodies": ()},
+        {"numbers": np.arange(FRAMES - 1)},
+        {"confidence": np.where(take.confidence > 0.5, 1.5, take.confidence)},
+        {"rms": -take.rms},
+        {"points": np.where(take.points > 0.0, np.inf, take.points)},
+        {"markers": 1e30 * take.markers},
+        {"body_poses": -np.inf * np.abs(take.body_poses)},
     ):
         with pytest.raises(ArgumentError, match="not a tracked take: "):
             dataclasses.replace(take, **change)
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [("body_places", "S8"), ("attachment_points", "f4"), ("numbers", "f8"), ("hands", "f8")],
+)
+def test_numbers_of_another_type_are_refused(name, dtype, take, tmp_path):
+    path = tmp_path / "take.npz"
+    dataclasses.replace(take, numbers=np.arange(FRAMES)).save(path)
+    with np.load(path) as stored:
+        before = stored[name] if name != "hands" else np.zeros(2)
+    altered(path, **{name: before.astype(dtype)})
+    assert_refused(path, "not a tracked take, or a damaged one")
+
+
+def test_names_of_bodies_are_text():
+    with pytest.raises(ArgumentError, match="a name is no text"):
+        MarkedBody("pen", ("Pen1", 5, "Pen3"), PEN.positions)
 
 
 def altered(path, **arrays) -> None:

@@ -37,9 +37,9 @@ def test_a_log_gets_a_line_every_ten_seconds(monkeypatch, capsys):
     now = [50.0]
     monkeypatch.setattr(live_status.time, "monotonic", lambda: now[0])
     with LiveStatus() as status:
-        for _ in range(250):
+        for _ in range(200):
             status.show(f"{now[0]:.1f}")
-            now[0] += 0.1
+            now[0] += 0.125
         status.show("writing", now=True)
     assert capsys.readouterr().err == "50.0\n60.0\n70.0\nwriting\n"
 
