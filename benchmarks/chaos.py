@@ -3,10 +3,10 @@
     python benchmarks/chaos.py [generate train ...] [--kills 20 --seed 0]
 
 Each command runs once undisturbed. Then it is killed by SIGTERM, SIGKILL and SIGINT in turn, at a random
-moment, and run again to its end. The table counts what must be zero: reruns whose files differ, processes that
-outlive the command, temporary files after the rerun, and files that stay in /dev/shm. Ctrl-C goes to the whole
-group of processes, as from a terminal; the other signals go to the command alone. The last column is the longest
-time from SIGTERM or SIGINT to the end. Exit code 1 when a count is not zero.
+moment, and run again to its end. The table counts what must be zero: reruns whose files differ, processes
+that outlive the command, temporary files after the rerun, and files that stay in /dev/shm. Ctrl-C goes to
+the whole group of processes, as from a terminal; the other signals go to the command alone. The last column
+is the longest time from SIGTERM or SIGINT to the end. Exit code 1 when a count is not zero.
 """
 
 from __future__ import annotations
