@@ -10,7 +10,7 @@ DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format figures docs clean drawing
+.PHONY: help demo test lint format figures chaos docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -37,6 +37,9 @@ docs: $(INSTALLED)  ## the guide and the API reference, into docs/_build
 
 figures: $(INSTALLED)  ## write docs/figures.toml into the pages; ONLY=table5 runs that command anew
 	$(BIN)/python docs/renew_figures.py $(if $(ONLY),--only $(ONLY))
+
+chaos: $(INSTALLED)  ## kill every long command at random moments and run it again; KILLS=20
+	$(BIN)/python benchmarks/chaos.py --kills $(or $(KILLS),20)
 
 clean:  ## remove .venv, caches and what the demo wrote
 	rm -rf $(VENV) demo docs/_build docs/api build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

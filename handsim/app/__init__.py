@@ -2,6 +2,7 @@
 
 - command_table: the table of commands, each loaded when it is called
 - cli: the command `handsim`, its errors and exit codes
+- completion: a script that completes commands and options in a shell
 - presets: commands whose defaults come from a preset
 - demo: what the steps of `handsim demo` share
 - messages: lines as they are, and warnings as lines

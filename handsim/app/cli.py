@@ -166,14 +166,27 @@ def _dispatch(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> i
     if args[0] == "--version":
         print(f"handsim {__version__}")
         return 0
+    if args[0] == "--print-completion":
+        return _print_completion(commands, args[1:])
     name = args[0]
     if name not in commands:
         noun = "option" if name.startswith("-") else "command"
-        valid = ("--help", "--version") if noun == "option" else commands
+        valid = ("--help", "--version", "--print-completion") if noun == "option" else commands
         print(f"handsim: {choices(name, valid, noun=noun)}", file=sys.stderr)
         return 2
     target, help_line = commands[name]
     return _call(target, prog=f"handsim {name}", help_line=help_line, args=args[1:])
+
+
+def _print_completion(commands: Mapping[str, tuple[str, str]], shells: Sequence[str]) -> int:
+    """Print the script that completes commands and options in a shell."""
+    if list(shells) != ["bash"]:
+        print("handsim: --print-completion takes one shell; valid names: bash", file=sys.stderr)
+        return 2
+    from handsim.app.completion import bash_completion
+
+    print(bash_completion(commands), end="")
+    return 0
 
 
 def _call(target: str, *, prog: str, help_line: str, args: Sequence[str]) -> int:

@@ -228,3 +228,20 @@ def test_overview_loads_nothing_heavy() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
     )
     assert result.stderr == "[]\n"
+
+
+def test_completion_knows_commands_and_options(tmp_path: Path) -> None:
+    script = tmp_path / "completion.bash"
+    assert shell(f"handsim --print-completion bash > {script}").returncode == 0
+
+    def complete(*words: str) -> list[str]:
+        typed = " ".join(f"'{word}'" for word in words)
+        line = f"source {script}; COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}; _handsim; "
+        return subprocess.run(
+            ["bash", "-c", line + 'echo "${COMPREPLY[@]}"'], capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    assert complete("handsim", "tra") == ["train", "track"]
+    assert complete("handsim", "train", "--thr") == ["--threads"]
+    assert "list" in complete("handsim", "glove", "")
+    assert shell("handsim --print-completion fish").returncode == 2
