@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -96,7 +97,7 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]
     try:
         check_regular(path, error=CaptureError)
         arrays = read_npz(path)
-        header = json.loads(str(arrays["header"]))
+        header = json.loads(_text(arrays["header"]))
         if not isinstance(header, dict):
             raise ValueError("the header is not a table")
     except CaptureError:
@@ -106,6 +107,13 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]
     except _DAMAGE as error:
         raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
     return header, arrays
+
+
+def _text(array: np.ndarray) -> str:
+    """The text in an array; raises a `ValueError` if it is not one."""
+    if array.dtype.kind != "U" or array.ndim or (array.reshape(1).view("u4") > sys.maxunicode).any():
+        raise ValueError("not a text")
+    return str(array)
 
 
 def check_types(arrays: Mapping[str, np.ndarray], expected: Mapping[str, np.dtype[Any] | str]) -> None:

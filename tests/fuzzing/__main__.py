@@ -32,7 +32,9 @@ def main() -> int:
                     limit_memory(4000)
                 kinds.update(_told(failure, options.keep, kinds))
         failed += kinds.total()
-        print(f"{name}: {count} cases, {kinds.total()} failed, {time.perf_counter() - began:.0f} s", flush=True)
+        print(
+            f"{name}: {count} cases, {kinds.total()} failed, {time.perf_counter() - began:.0f} s", flush=True
+        )
     return int(failed > 0)
 
 
