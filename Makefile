@@ -10,7 +10,7 @@ DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format figures chaos docs clean drawing
+.PHONY: help demo test lint format fuzz figures chaos docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -31,6 +31,9 @@ lint: $(INSTALLED)  ## style, format, types and the order of imports
 format: $(INSTALLED)  ## put the code into its format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+fuzz: $(INSTALLED)  ## damaged files for every reader: CASES=20000 of each, TARGET=c3d for one
+	$(BIN)/python -m tests.fuzzing --cases $(or $(CASES),20000) $(if $(TARGET),--target $(TARGET))
 
 docs: $(INSTALLED)  ## the guide and the API reference, into docs/_build
 	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs docs/_build

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Final
+
+_LONGEST: Final = 200  # characters of a name that a sentence shows
 
 
 class HandSimError(Exception):
@@ -57,6 +60,7 @@ class WeightsError(FileError):
 def choices(given: str, valid: Iterable[str], *, noun: str) -> str:
     """Sentence for an unknown name: what was given, the nearest valid name, and all valid names."""
     names = list(valid)
+    given = given if len(given) <= _LONGEST else given[:_LONGEST] + "..."
     near = difflib.get_close_matches(given, names, n=1)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {noun} '{given}'{hint}; valid names: {', '.join(names)}"

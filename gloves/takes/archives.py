@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import tokenize
 import warnings
 import zipfile
@@ -110,7 +111,7 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]
     try:
         check_regular(path, error=CaptureError)
         arrays = read_npz(path)
-        header = json.loads(str(arrays["header"]))
+        header = json.loads(_text(arrays["header"]))
         if not isinstance(header, dict):
             raise ValueError("the header is not a table")
     except CaptureError:
@@ -138,6 +139,13 @@ def _read_cut_off(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.n
     told = f"{path}: a recording that was cut off or is still running; it has {grown.num_frames} frames"
     warnings.warn(told, CutOffWarning, stacklevel=4)
     return grown.header, arrays
+
+
+def _text(array: np.ndarray) -> str:
+    """The text in an array; raises a `ValueError` if it is not one."""
+    if array.dtype.kind != "U" or array.ndim or (array.reshape(1).view("u4") > sys.maxunicode).any():
+        raise ValueError("not a text")
+    return str(array)
 
 
 def check_types(arrays: Mapping[str, np.ndarray], expected: Mapping[str, np.dtype[Any] | str]) -> None:

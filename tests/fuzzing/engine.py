@@ -76,8 +76,21 @@ def run_corpus(target: Target, folder: Path) -> Iterator[Failure | None]:
 
 
 def run_case(target: Target, file: Path, data: bytes) -> Failure | None:
-    """Read one damaged file."""
+    """Read one damaged file; what took too long is read again, because kernels are compiled at first use."""
     file.write_bytes(data)
+    what, seconds, grown = _read(target, file)
+    if what is None and seconds > MOST_SECONDS:
+        file.write_bytes(data)
+        what, seconds, _ = _read(target, file)
+    if what is None and seconds > MOST_SECONDS:
+        what = f"took {seconds:.1f} s"
+    if what is None and grown > MOST_MEGABYTES:
+        what = f"took {grown:.0f} MB"
+    return None if what is None else Failure(target.name, file.name, data, what)
+
+
+def _read(target: Target, file: Path) -> tuple[str | None, float, float]:
+    """What escaped, if anything; the seconds, and the megabytes by which the largest memory grew."""
     memory, began = _peak_megabytes(), time.process_time()
     what = None
     try:
@@ -85,15 +98,10 @@ def run_case(target: Target, file: Path, data: bytes) -> Failure | None:
             warnings.simplefilter("ignore")
             target.read(file)
     except target.refusals as error:
-        what = None if str(error).strip() and "\n" not in str(error) else f"a sentence of lines: {error!r}"
+        what = None if str(error).strip() and "\n" not in str(error) else f"not one sentence: {error!r}"
     except Exception:
         what = traceback.format_exc().strip()
-    seconds, grown = time.process_time() - began, _peak_megabytes() - memory
-    if what is None and seconds > MOST_SECONDS:
-        what = f"took {seconds:.1f} s"
-    if what is None and grown > MOST_MEGABYTES:
-        what = f"took {grown:.0f} MB"
-    return None if what is None else Failure(target.name, file.name, data, what)
+    return what, time.process_time() - began, _peak_megabytes() - memory
 
 
 def keep(failure: Failure, folder: Path) -> Path:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.takes.tracked_take import LOST, STATUSES, TrackedTake
+from handsim.hand.topology import Side
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -40,35 +41,38 @@ def summarize(take: TrackedTake) -> list[str]:
 
 def suspicions(take: TrackedTake) -> list[str]:
     """What is probably not as the user meant it, as one sentence each with its remedy."""
-    found = []
-    for number, side in enumerate(take.sides):
-        shown = take.status[:, number] != LOST
-        others = " ".join(other for other in take.sides if other != side)
-        if shown.mean() < _LEAST_SEEN:
-            remedy = f"track the {others} hand alone (--hands {others}), or name the glove worn (--glove)"
-            found.append(
-                f"the {side} hand was seen in {100 * shown.mean():.1f} % of the frames; if it is not in the "
-                f"capture, {remedy if others else 'name the other hand (--hands) or the glove worn (--glove)'}"
-            )
-            continue
-        filled = float(take.filled[shown, number].mean())
-        if filled > _MOST_FILLED:
-            found.append(
-                f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its "
-                "pose; name the glove worn (--glove) and the hands that are in the capture (--hands)"
-            )
-        rms = float(np.nanmedian(take.rms[shown, number])) if np.isfinite(take.rms[:, number]).any() else 0.0
-        if rms > _MOST_RMS:
-            found.append(
-                f"the {side} hand's markers are {1e3 * rms:.1f} mm off its pose; name the glove worn "
-                "(--glove), try another --size, or calibrate the hands (handsim calibrate, then --shape)"
-            )
+    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
     there = np.isfinite(take.points[..., 0])
     unlabeled = float((take.labels[there] < 0).mean()) if there.any() else 0.0
     if unlabeled > _MOST_UNLABELED:
         found.append(
             f"{100 * unlabeled:.1f} % of the points are not markers of what was tracked; name the glove worn "
             "(--glove), the hands (--hands) and the rigid bodies (--body) that are in the capture"
+        )
+    return found
+
+
+def _suspicions_of(take: TrackedTake, side: Side) -> list[str]:
+    """What tells of a mistake about one hand."""
+    hand = take.hand(side)
+    shown = take.status[:, hand] != LOST
+    if shown.mean() < _LEAST_SEEN:
+        others = [f" (--hands {other})" for other in take.sides if other != side]
+        return [
+            f"the {side} hand was seen in {100 * shown.mean():.1f} % of the frames; name the glove worn "
+            f"(--glove), or track the other hand alone{''.join(others)}"
+        ]
+    found = []
+    filled, rms = float(take.filled[shown, hand].mean()), float(np.nanmedian(take.rms[:, hand]))
+    if filled > _MOST_FILLED:
+        found.append(
+            f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its pose; "
+            "name the glove worn (--glove) and the hands that are in the capture (--hands)"
+        )
+    if rms > _MOST_RMS:
+        found.append(
+            f"the {side} hand's markers are {1e3 * rms:.1f} mm off its pose; name the glove worn (--glove), "
+            "try another --size, or calibrate the hands (handsim calibrate, then --shape)"
         )
     return found
 
