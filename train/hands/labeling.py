@@ -1,0 +1,173 @@
+"""The hands of a capture with their labels: how many each frame holds, and which is left and right.
+
+Frames in which the hands stand apart are decided on their own. In the others, a point belongs to the hand that
+it belonged to a moment before or after. Where that is unknown, because the hands touch all the time, some
+frames are cut (`train.hands.frame_hands`), and the others follow from these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from train.hands.frame_hands import Criteria, FoundHand, HandFinder
+from train.hands.links import carried, previous_points
+from train.hands.sides import sides_of
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+    Frames = Sequence[NDArray[np.float64]]
+    Hands = list[list[FoundHand]]
+
+_CHUNK: Final = 512
+_SPEED, _FARTHEST = 3.0, 0.03  # of a marker [m/s], and from frame to frame [m]
+_MEMORY: Final = 0.3  # for which it counts whose a point was [s]
+_KNOWN: Final = 0.05  # what is left of a certain vote, at least, where it counts
+_CUT_EVERY: Final = 0.1  # between frames that are cut [s]
+_FOLLOWED_FEWEST: Final = 4
+_ROUNDS: Final = 2
+SIDES: Final = (1, -1)
+"""Right, left."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameLabels:
+    """The labels of one frame with any number of hands up to two."""
+
+    sides: Int[np.ndarray, "N"]
+    """1 for a point of a right hand, -1 for one of a left hand, 0 for one of no hand."""
+    labels: Int[np.ndarray, "N"]
+    """Marker of each point, -1 for none."""
+    confidence: Float[np.ndarray, "N"]
+    """Of each label, 0 to 1; 0 for a point without one."""
+
+    @property
+    def hands(self) -> tuple[bool, bool]:
+        """Whether there is a right hand, and a left one."""
+        return bool((self.sides > 0).any()), bool((self.sides < 0).any())
+
+
+def label_hands(
+    frames: Frames, finder: HandFinder, rate: float, *, progress: Callable[[int], None] | None = None
+) -> list[FrameLabels]:
+    """Label the hands of every frame.
+
+    Args:
+        frames: Points of each frame [m].
+        finder: Finds the hands of single frames.
+        rate: Frames per second [Hz].
+        progress: Called with the number of frames that are done.
+    """
+    found: Hands = []
+    for first in range(0, len(frames), _CHUNK):
+        found += [_two_best(hands) for hands in finder.find(frames[first : first + _CHUNK])]
+        if progress is not None:
+            progress(len(found))
+    followed = _Followed(frames, rate)
+    _cut_some(frames, found, finder, followed, rate)
+    by_side = followed.by_side(found)
+    for _ in range(_ROUNDS):
+        if not _follow(frames, by_side, finder, followed):
+            break
+    return [_frame_labels(len(points), hands) for points, hands in zip(frames, by_side, strict=True)]
+
+
+class _Followed:
+    """All points of a capture, each linked to what it was in the frame before."""
+
+    def __init__(self, frames: Frames, rate: float) -> None:
+        self.starts = np.concatenate([[0], np.cumsum([len(points) for points in frames])]).astype(np.int64)
+        points = np.concatenate([np.zeros((0, 3)), *frames])
+        self.previous = previous_points(points, self.starts, min(_FARTHEST, _SPEED / rate + 0.005))
+        self._keep = float(np.exp(-1.0 / (_MEMORY * rate)))
+
+    def by_side(self, found: Hands) -> list[dict[int, FoundHand]]:
+        """The hands of every frame by their sides."""
+        sides = sides_of(found, self.starts, self.previous)
+        return [dict(zip(side, hands, strict=True)) for side, hands in zip(sides, found, strict=True)]
+
+    def votes(self, by_side: Sequence[dict[int, FoundHand]]) -> NDArray[np.float64]:
+        """On which side each point is by the frames before and after, where that is known: 1 or -1, else 0."""
+        own = np.zeros(len(self.previous))
+        for start, hands in zip(self.starts, by_side, strict=False):
+            for side, hand in hands.items():
+                own[start + hand.points] = side
+        before, after = carried(own, self.previous, self._keep)
+        total = before + after
+        votes: NDArray[np.float64] = np.where(np.abs(total) > _KNOWN, np.sign(total), 0.0)
+        return votes
+
+
+def _two_best(hands: list[FoundHand]) -> list[FoundHand]:
+    return sorted(hands, key=lambda hand: hand.weight, reverse=True)[:2]
+
+
+def _cut_some(frames: Frames, found: Hands, finder: HandFinder, followed: _Followed, rate: float) -> None:
+    """Cut merged hands in some of the frames in which it is unknown whose their points are."""
+    votes = followed.votes(followed.by_side(found))
+    step, last = max(1, round(_CUT_EVERY * rate)), -np.inf
+    for number, points in enumerate(frames):
+        if number < last + step or len(found[number]) == 2 or not finder.is_merged(points):
+            continue
+        known = votes[followed.starts[number] : followed.starts[number + 1]]
+        if min((known > 0).sum(), (known < 0).sum()) >= finder.fewest:
+            continue
+        cut = _two_best(finder.find_merged(points))
+        if sum(hand.weight for hand in cut) > sum(hand.weight for hand in found[number]):
+            found[number] = cut
+        last = number
+
+
+def _follow(
+    frames: Frames, by_side: list[dict[int, FoundHand]], finder: HandFinder, followed: _Followed
+) -> bool:
+    """Label hands again where points without a label were a hand's; whether there were any."""
+    votes = followed.votes(by_side)
+    clouds, places = [], []
+    for number, (points, hands) in enumerate(zip(frames, by_side, strict=True)):
+        known = votes[followed.starts[number] : followed.starts[number + 1]].copy()
+        taken = np.zeros(len(points), dtype=bool)
+        for side, hand in hands.items():
+            known[hand.points], taken[hand.points] = side, True
+        if not (known[~taken] != 0.0).any():
+            continue
+        for side in SIDES:
+            cloud = _cloud(points, known, side, finder.measures.link_distance)
+            if (known[cloud] == side).sum() >= _FOLLOWED_FEWEST and (known[cloud] == side)[~taken[cloud]].any():
+                clouds.append((points, cloud))
+                places.append((number, side))
+    criteria = Criteria(_FOLLOWED_FEWEST, 0.4, 0.6, 0.012, 0.0)
+    better = False
+    for (number, side), hand in zip(places, finder.label(clouds, criteria), strict=True):
+        there = by_side[number].get(side)
+        if hand is not None and (there is None or hand.weight > there.weight):
+            by_side[number][side] = hand
+            better = True
+    return better
+
+
+def _cloud(
+    points: NDArray[np.float64], known: NDArray[np.float64], side: int, reach: float
+) -> NDArray[np.int64]:
+    """The points of one side, and near them those of an unknown side."""
+    mine = np.flatnonzero(known == side)
+    unknown = np.flatnonzero(known == 0.0)
+    if not len(mine):
+        return mine
+    near = np.linalg.norm(points[unknown, None] - points[mine], axis=-1).min(axis=1) <= reach
+    return np.sort(np.concatenate([mine, unknown[near]]))
+
+
+def _frame_labels(count: int, hands: dict[int, FoundHand]) -> FrameLabels:
+    """Labels of a frame with `count` points; of two hands with a point the more confident one has it."""
+    sides, labels, confidence = np.zeros(count, dtype=np.int64), np.full(count, -1), np.zeros(count)
+    for side, hand in hands.items():
+        mine = hand.confidence > confidence[hand.points]
+        here = hand.points[mine]
+        sides[here], labels[here], confidence[here] = side, hand.labels[mine], hand.confidence[mine]
+    return FrameLabels(sides, labels, confidence)
