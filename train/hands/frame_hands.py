@@ -94,7 +94,7 @@ class HandFinder:
         return max(_FEWEST, int(np.ceil(_LEAST_SHARE * self._markers)))
 
     def find(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[list[FoundHand]]:
-        """The hands of each frame that stand apart, or come apart at a shorter distance.
+        """The hands of each frame that stand apart.
 
         Args:
             frames: Points of each frame [m].
@@ -102,9 +102,9 @@ class HandFinder:
         wanted, choices = [], []
         for number, points in enumerate(frames):
             for group in self._groups(points):
-                parts = [group] if len(group) <= self._markers + _SPARE else self._split(points, group)
-                choices += [number] * len(parts)
-                wanted += [(points, part) for part in parts]
+                if len(group) <= self._markers + _SPARE:
+                    choices.append(number)
+                    wanted.append((points, group))
         found: list[list[FoundHand]] = [[] for _ in frames]
         for number, hand in zip(choices, self.label(wanted, self.certain), strict=True):
             if hand is not None:

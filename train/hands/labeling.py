@@ -30,7 +30,15 @@ _MEMORY: Final = 0.3  # for which it counts whose a point was [s]
 _KNOWN: Final = 0.05  # what is left of a certain vote, at least, where it counts
 _CUT_EVERY: Final = 0.1  # between frames that are cut [s]
 _FOLLOWED_FEWEST: Final = 4
-_ROUNDS: Final = 2
+_BETTER: Final = 3.0  # by which a cut frame must explain more points
+_GAIN: Final = 0.5  # by which a hand labeled again must explain more points
+_FOLLOWED_HAND: Final = Criteria(
+    fewest=_FOLLOWED_FEWEST, confidence=0.7, fitting_share=0.8, misfit=0.010, clearness=0.0
+)
+_HIDDEN_HAND: Final = Criteria(
+    fewest=_FOLLOWED_FEWEST, confidence=0.4, fitting_share=0.6, misfit=0.012, clearness=0.0
+)
+_ROUNDS: Final = 4
 SIDES: Final = (1, -1)
 """Right, left."""
 
@@ -69,11 +77,11 @@ def label_hands(
         if progress is not None:
             progress(len(found))
     followed = _Followed(frames, rate)
-    _cut_some(frames, found, finder, followed, rate)
     by_side = followed.by_side(found)
-    for _ in range(_ROUNDS):
-        if not _follow(frames, by_side, finder, followed):
-            break
+    _follow(frames, by_side, finder, followed)
+    if _cut_some(frames, by_side, finder, followed, rate):
+        _follow(frames, by_side, finder, followed)
+    _follow(frames, by_side, finder, followed, _HIDDEN_HAND)
     return [_frame_labels(len(points), hands) for points, hands in zip(frames, by_side, strict=True)]
 
 
@@ -107,45 +115,112 @@ def _two_best(hands: list[FoundHand]) -> list[FoundHand]:
     return sorted(hands, key=lambda hand: hand.weight, reverse=True)[:2]
 
 
-def _cut_some(frames: Frames, found: Hands, finder: HandFinder, followed: _Followed, rate: float) -> None:
-    """Cut merged hands in some of the frames in which it is unknown whose their points are."""
-    votes = followed.votes(followed.by_side(found))
+def _cut_some(
+    frames: Frames, by_side: list[dict[int, FoundHand]], finder: HandFinder, followed: _Followed, rate: float
+) -> bool:
+    """Cut merged hands in some of the frames in which many points have no label; whether that found any.
+
+    A hand is on the side on which most of its points were; where that is unknown, all such hands vote.
+    """
     step, last = max(1, round(_CUT_EVERY * rate)), -np.inf
+    cuts: Hands = [[] for _ in frames]
     for number, points in enumerate(frames):
-        if number < last + step or len(found[number]) == 2 or not finder.is_merged(points):
+        labeled = sum(len(hand.points) for hand in by_side[number].values())
+        if number < last + step or len(points) - labeled < finder.fewest or not finder.is_merged(points):
             continue
-        known = votes[followed.starts[number] : followed.starts[number + 1]]
-        if min((known > 0).sum(), (known < 0).sum()) >= finder.fewest:
-            continue
-        cut = _two_best(finder.find_merged(points))
-        if sum(hand.weight for hand in cut) > sum(hand.weight for hand in found[number]):
-            found[number] = cut
         last = number
+        cut = _two_best(finder.find_merged(points))
+        if sum(hand.weight for hand in cut) > _BETTER + sum(hand.weight for hand in by_side[number].values()):
+            cuts[number] = cut
+    votes, voted = followed.votes(by_side), followed.by_side(cuts)
+    for number, cut in enumerate(cuts):
+        if cut:
+            known = votes[followed.starts[number] : followed.starts[number + 1]]
+            balance = [float(known[hand.points].sum()) for hand in cut]
+            difference = balance[0] - (balance[1] if len(cut) == 2 else 0.0)
+            side = 1 if difference > 0.0 else -1
+            clear = abs(difference) >= _FOLLOWED_FEWEST
+            by_side[number] = dict(zip((side, -side), cut, strict=False)) if clear else voted[number]
+    return any(cuts)
 
 
 def _follow(
-    frames: Frames, by_side: list[dict[int, FoundHand]], finder: HandFinder, followed: _Followed
+    frames: Frames,
+    by_side: list[dict[int, FoundHand]],
+    finder: HandFinder,
+    followed: _Followed,
+    criteria: Criteria = _FOLLOWED_HAND,
+) -> None:
+    """Label hands again where points without a label were a hand's, or are beside one."""
+    for _ in range(_ROUNDS):
+        votes = followed.votes(by_side)
+        clouds: list[tuple[int, int, NDArray[np.int64]]] = []
+        for number, hands in enumerate(by_side):
+            known = votes[followed.starts[number] : followed.starts[number + 1]].copy()
+            clouds += _voted_clouds(number, frames[number], hands, known, finder)
+        better = _improve(frames, by_side, finder, clouds, criteria)
+        clouds = []
+        for number, hands in enumerate(by_side):
+            clouds += _remaining_clouds(number, frames[number], hands, finder)
+        if not _improve(frames, by_side, finder, clouds, criteria) and not better:
+            break
+
+
+def _voted_clouds(
+    number: int,
+    points: NDArray[np.float64],
+    hands: dict[int, FoundHand],
+    known: NDArray[np.float64],
+    finder: HandFinder,
+) -> list[tuple[int, int, NDArray[np.int64]]]:
+    """Frame, side and points of clouds that hold points without a label which were on that side."""
+    taken = np.zeros(len(points), dtype=bool)
+    for side, hand in hands.items():
+        known[hand.points], taken[hand.points] = side, True
+    if not (known[~taken] != 0.0).any():
+        return []
+    clouds = []
+    for side in SIDES:
+        cloud = _cloud(points, known, side, finder.measures.link_distance)
+        mine = known[cloud] == side
+        if mine.sum() >= _FOLLOWED_FEWEST and mine[~taken[cloud]].any():
+            clouds.append((number, side, cloud))
+    return clouds
+
+
+def _remaining_clouds(
+    number: int, points: NDArray[np.float64], hands: dict[int, FoundHand], finder: HandFinder
+) -> list[tuple[int, int, NDArray[np.int64]]]:
+    """Frame, side and points of clouds that are what one hand leaves of a cluster."""
+    clouds = []
+    for side, hand in hands.items():
+        known = np.zeros(len(points))
+        known[hand.points] = side
+        other = hands.get(-side)
+        if other is not None:
+            known[other.points] = -side
+        if (known == 0.0).sum() >= (_FOLLOWED_FEWEST if other is None else 1):
+            if other is None:
+                known = np.where(known == 0.0, -side, known)
+            cloud = _cloud(points, known, -side, finder.measures.link_distance)
+            if other is None or len(cloud) > len(other.points):
+                clouds.append((number, -side, cloud))
+    return clouds
+
+
+def _improve(
+    frames: Frames,
+    by_side: list[dict[int, FoundHand]],
+    finder: HandFinder,
+    clouds: list[tuple[int, int, NDArray[np.int64]]],
+    criteria: Criteria,
 ) -> bool:
-    """Label hands again where points without a label were a hand's; whether there were any."""
-    votes = followed.votes(by_side)
-    clouds, places = [], []
-    for number, (points, hands) in enumerate(zip(frames, by_side, strict=True)):
-        known = votes[followed.starts[number] : followed.starts[number + 1]].copy()
-        taken = np.zeros(len(points), dtype=bool)
-        for side, hand in hands.items():
-            known[hand.points], taken[hand.points] = side, True
-        if not (known[~taken] != 0.0).any():
-            continue
-        for side in SIDES:
-            cloud = _cloud(points, known, side, finder.measures.link_distance)
-            if (known[cloud] == side).sum() >= _FOLLOWED_FEWEST and (known[cloud] == side)[~taken[cloud]].any():
-                clouds.append((points, cloud))
-                places.append((number, side))
-    criteria = Criteria(_FOLLOWED_FEWEST, 0.4, 0.6, 0.012, 0.0)
+    """Label clouds, and take each hand that is better than what there is; whether any was."""
     better = False
-    for (number, side), hand in zip(places, finder.label(clouds, criteria), strict=True):
+    labeled = finder.label([(frames[number], cloud) for number, _, cloud in clouds], criteria)
+    for (number, side, _), hand in zip(clouds, labeled, strict=True):
         there = by_side[number].get(side)
-        if hand is not None and (there is None or hand.weight > there.weight):
+        if hand is not None and (there is None or hand.weight > there.weight + _GAIN):
             by_side[number][side] = hand
             better = True
     return better
