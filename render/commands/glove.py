@@ -18,6 +18,7 @@ from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, list_layouts, load_layout, starter_layout
 from handsim.errors import LayoutError
 from handsim.files.atomic import atomic_write
+from handsim.files.outputs import check_outputs
 from handsim.hand.shape import SIZES
 
 if TYPE_CHECKING:
@@ -86,6 +87,8 @@ def check_glove(
         size: Size of the hand in the picture.
     """
     layout = load_layout(glove)
+    picture = Path(glove).with_suffix(".png") if out is None else out
+    check_outputs([glove], [picture])
     table = Table("size", "nearest two markers", title=f"{layout.name}: {layout.num_markers} markers")
     table.add_column("centers apart [mm]", justify="right")
     overlaps = []
@@ -105,7 +108,6 @@ def check_glove(
     from render.illustrations.captions import write_png
     from render.illustrations.hands import draw_glove
 
-    picture = Path(glove).with_suffix(".png") if out is None else out
     write_png(picture, draw_glove(nominal_fit(layout, size, "right")))
     console.print(f"{picture}: the glove on a hand of size {size}", soft_wrap=True, markup=False)
 

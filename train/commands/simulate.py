@@ -13,6 +13,7 @@ from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX
+from handsim.files.outputs import check_outputs
 from train.simulation.takes import TakeConfig, simulate_take
 
 
@@ -24,6 +25,7 @@ def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -
         config: What to simulate.
     """
     check_suffix(out, WRITABLE)
+    check_outputs((config.glove, config.rig), (out, out.with_suffix(SUFFIX)))
     take = simulate_take(config)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     write_capture(out, Capture(names, take.points, take.rate))

@@ -60,6 +60,8 @@ class FoundHand:
     confidence: Float[np.ndarray, "H"]
     vote: float
     """Clearness of the side: positive for a right hand, negative for a left one."""
+    support: Float[np.ndarray, "H"]
+    """How certain it is that each point is of this hand, and not of another one, 0 to 1."""
 
     @property
     def weight(self) -> float:
@@ -159,7 +161,7 @@ class HandFinder:
         side, clearness = self._classifier.classify(points[here], names)
         if clearness < criteria.clearness:
             return None
-        return FoundHand(here, names, sure, clearness if side == "right" else -clearness)
+        return FoundHand(here, names, sure, clearness if side == "right" else -clearness, np.ones(len(here)))
 
     def _groups(self, points: NDArray[np.float64]) -> list[Group]:
         groups = clusters(points, self.measures.link_distance)

@@ -7,9 +7,10 @@ frames are cut (`train.hands.frame_hands`), and the others follow from these.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -25,9 +26,10 @@ if TYPE_CHECKING:
     Hands = list[list[FoundHand]]
 
 _CHUNK: Final = 512
-_SPEED, _FARTHEST = 3.0, 0.03  # of a marker [m/s], and from frame to frame [m]
+_SPEED, _ACCELERATION = 2.0, 80.0  # of a marker [m/s], [m/s^2]
+_NOISE, _FARTHEST = 0.004, 0.03  # of a step from frame to frame [m]
 _MEMORY: Final = 0.3  # for which it counts whose a point was [s]
-_KNOWN: Final = 0.05  # what is left of a certain vote, at least, where it counts
+_KNOWN: Final = 0.02  # what is left of a certain vote, at least, where it counts
 _CUT_EVERY: Final = 0.1  # between frames that are cut [s]
 _FOLLOWED_FEWEST: Final = 4
 _BETTER: Final = 3.0  # by which a cut frame must explain more points
@@ -38,6 +40,7 @@ _FOLLOWED_HAND: Final = Criteria(
 _HIDDEN_HAND: Final = Criteria(
     fewest=_FOLLOWED_FEWEST, confidence=0.4, fitting_share=0.6, misfit=0.012, clearness=0.0
 )
+_GUESSED: Final = 0.2  # vote of a point of which nothing was known, where a known one has 1
 _ROUNDS: Final = 4
 SIDES: Final = (1, -1)
 """Right, left."""
@@ -91,7 +94,9 @@ class _Followed:
     def __init__(self, frames: Frames, rate: float) -> None:
         self.starts = np.concatenate([[0], np.cumsum([len(points) for points in frames])]).astype(np.int64)
         points = np.concatenate([np.zeros((0, 3)), *frames])
-        self.previous = previous_points(points, self.starts, min(_FARTHEST, _SPEED / rate + 0.005))
+        reach = min(_FARTHEST, _SPEED / rate + _NOISE)
+        expected_reach = min(_FARTHEST, 0.5 * _ACCELERATION / rate**2 + _NOISE)
+        self.previous = previous_points(points, self.starts, reach, expected_reach)
         self._keep = float(np.exp(-1.0 / (_MEMORY * rate)))
 
     def by_side(self, found: Hands) -> list[dict[int, FoundHand]]:
@@ -104,7 +109,9 @@ class _Followed:
         own = np.zeros(len(self.previous))
         for start, hands in zip(self.starts, by_side, strict=False):
             for side, hand in hands.items():
-                own[start + hand.points] = side
+                vote = hand.support * hand.confidence
+                here = start + hand.points
+                own[here] = np.where(vote > np.abs(own[here]), side * vote, own[here])
         before, after = carried(own, self.previous, self._keep)
         total = before + after
         votes: NDArray[np.float64] = np.where(np.abs(total) > _KNOWN, np.sign(total), 0.0)
@@ -154,16 +161,25 @@ def _follow(
     """Label hands again where points without a label were a hand's, or are beside one."""
     for _ in range(_ROUNDS):
         votes = followed.votes(by_side)
-        clouds: list[tuple[int, int, NDArray[np.int64]]] = []
-        for number, hands in enumerate(by_side):
-            known = votes[followed.starts[number] : followed.starts[number + 1]].copy()
-            clouds += _voted_clouds(number, frames[number], hands, known, finder)
-        better = _improve(frames, by_side, finder, clouds, criteria)
-        clouds = []
-        for number, hands in enumerate(by_side):
-            clouds += _remaining_clouds(number, frames[number], hands, finder)
-        if not _improve(frames, by_side, finder, clouds, criteria) and not better:
+        better = False
+        for clouds_of in (_voted_clouds, _remaining_clouds):
+            clouds: list[_Cloud] = []
+            for number, hands in enumerate(by_side):
+                known = votes[followed.starts[number] : followed.starts[number + 1]].copy()
+                clouds += clouds_of(number, frames[number], hands, known, finder.measures.link_distance)
+            better |= _improve(frames, by_side, finder, clouds, criteria)
+        if not better:
             break
+
+
+class _Cloud(NamedTuple):
+    """Points of a frame among which a hand is looked for."""
+
+    frame: int
+    side: int
+    points: NDArray[np.int64]
+    voted: NDArray[np.bool_]
+    """Which points of the frame are known to be on that side."""
 
 
 def _voted_clouds(
@@ -171,40 +187,43 @@ def _voted_clouds(
     points: NDArray[np.float64],
     hands: dict[int, FoundHand],
     known: NDArray[np.float64],
-    finder: HandFinder,
-) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """Frame, side and points of clouds that hold points without a label which were on that side."""
+    reach: float,
+) -> list[_Cloud]:
+    """Clouds with points that have no label and were on their side."""
     taken = np.zeros(len(points), dtype=bool)
     for side, hand in hands.items():
         known[hand.points], taken[hand.points] = side, True
-    if not (known[~taken] != 0.0).any():
-        return []
     clouds = []
     for side in SIDES:
-        cloud = _cloud(points, known, side, finder.measures.link_distance)
-        mine = known[cloud] == side
-        if mine.sum() >= _FOLLOWED_FEWEST and mine[~taken[cloud]].any():
-            clouds.append((number, side, cloud))
+        voted = known == side
+        if voted.sum() >= _FOLLOWED_FEWEST and (voted & ~taken).any():
+            clouds.append(_Cloud(number, side, _near(points, voted, known == 0.0, reach), voted))
     return clouds
 
 
 def _remaining_clouds(
-    number: int, points: NDArray[np.float64], hands: dict[int, FoundHand], finder: HandFinder
-) -> list[tuple[int, int, NDArray[np.int64]]]:
-    """Frame, side and points of clouds that are what one hand leaves of a cluster."""
+    number: int,
+    points: NDArray[np.float64],
+    hands: dict[int, FoundHand],
+    known: NDArray[np.float64],
+    reach: float,
+) -> list[_Cloud]:
+    """Clouds that are what one hand leaves of the points of which no more is known."""
     clouds = []
     for side, hand in hands.items():
-        known = np.zeros(len(points))
-        known[hand.points] = side
         other = hands.get(-side)
+        mine = known == -side
         if other is not None:
-            known[other.points] = -side
-        if (known == 0.0).sum() >= (_FOLLOWED_FEWEST if other is None else 1):
-            if other is None:
-                known = np.where(known == 0.0, -side, known)
-            cloud = _cloud(points, known, -side, finder.measures.link_distance)
-            if other is None or len(cloud) > len(other.points):
-                clouds.append((number, -side, cloud))
+            mine[other.points] = True
+        mine[hand.points] = False
+        free = (known == 0.0) & ~mine
+        free[hand.points] = False
+        if other is None:
+            cloud = np.flatnonzero(mine | free)
+        else:
+            cloud = _near(points, mine, free, reach)
+        if len(cloud) >= _FOLLOWED_FEWEST and (other is None or len(cloud) > len(other.points)):
+            clouds.append(_Cloud(number, -side, cloud, mine))
     return clouds
 
 
@@ -212,30 +231,29 @@ def _improve(
     frames: Frames,
     by_side: list[dict[int, FoundHand]],
     finder: HandFinder,
-    clouds: list[tuple[int, int, NDArray[np.int64]]],
+    clouds: list[_Cloud],
     criteria: Criteria,
 ) -> bool:
     """Label clouds, and take each hand that is better than what there is; whether any was."""
     better = False
-    labeled = finder.label([(frames[number], cloud) for number, _, cloud in clouds], criteria)
-    for (number, side, _), hand in zip(clouds, labeled, strict=True):
-        there = by_side[number].get(side)
+    labeled = finder.label([(frames[cloud.frame], cloud.points) for cloud in clouds], criteria)
+    for cloud, hand in zip(clouds, labeled, strict=True):
+        there = by_side[cloud.frame].get(cloud.side)
         if hand is not None and (there is None or hand.weight > there.weight + _GAIN):
-            by_side[number][side] = hand
+            support = np.where(cloud.voted[hand.points], hand.support[0], _GUESSED)
+            by_side[cloud.frame][cloud.side] = dataclasses.replace(hand, support=support)
             better = True
     return better
 
 
-def _cloud(
-    points: NDArray[np.float64], known: NDArray[np.float64], side: int, reach: float
+def _near(
+    points: NDArray[np.float64], mine: NDArray[np.bool_], free: NDArray[np.bool_], reach: float
 ) -> NDArray[np.int64]:
-    """The points of one side, and near them those of an unknown side."""
-    mine = np.flatnonzero(known == side)
-    unknown = np.flatnonzero(known == 0.0)
-    if not len(mine):
-        return mine
-    near = np.linalg.norm(points[unknown, None] - points[mine], axis=-1).min(axis=1) <= reach
-    return np.sort(np.concatenate([mine, unknown[near]]))
+    """Some points and the free ones within reach of them [m]."""
+    if not mine.any() or not free.any():
+        return np.flatnonzero(mine)
+    near = np.linalg.norm(points[free, None] - points[mine], axis=-1).min(axis=1) <= reach
+    return np.sort(np.concatenate([np.flatnonzero(mine), np.flatnonzero(free)[near]]))
 
 
 def _frame_labels(count: int, hands: dict[int, FoundHand]) -> FrameLabels:

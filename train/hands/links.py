@@ -48,7 +48,7 @@ def _single_linkage(points: NDArray[np.float64], distance: float) -> NDArray[np.
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def previous_points(
-    points: Float[np.ndarray, "P 3"], starts: Int[np.ndarray, "T+1"], reach: float
+    points: Float[np.ndarray, "P 3"], starts: Int[np.ndarray, "T+1"], reach: float, expected_reach: float
 ) -> Int[np.ndarray, "P"]:
     """Which point of the frame before each point was, -1 where none is: the nearest both ways.
 
@@ -57,16 +57,18 @@ def previous_points(
     Args:
         points: Points of all frames in a row [m].
         starts: Where each frame starts among them, and where the last one ends.
-        reach: Longest step, and longest distance from where a point is expected [m].
+        reach: Longest first step [m].
+        expected_reach: Longest distance from where a point is expected [m].
     """
     previous = np.full(len(points), -1)
     expected = points.copy()
+    reaches = np.full(len(points), reach)
     for frame in range(1, len(starts) - 1):
         before, now, end = starts[frame - 1], starts[frame], starts[frame + 1]
         back = np.full(end - now, -1)
         nearest = np.full(end - now, reach**2)
         for old in range(before, now):
-            best, least = -1, reach**2
+            best, least = -1, reaches[old] ** 2
             for new in range(now, end):
                 squared = _squared(expected[old], points[new])
                 if squared < least:
@@ -76,7 +78,7 @@ def previous_points(
         for new in range(now, end):
             old = back[new - now]
             if old >= 0:
-                previous[new] = old
+                previous[new], reaches[new] = old, expected_reach
                 for axis in range(3):
                     expected[new, axis] = 2.0 * points[new, axis] - points[old, axis]
     return previous
