@@ -17,6 +17,7 @@ import numpy as np
 from train.hands.frame_hands import Criteria, FoundHand, HandFinder
 from train.hands.links import carried, previous_points
 from train.hands.sides import sides_of
+from train.labelers.protocol import check_clouds
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -73,7 +74,11 @@ def label_hands(
         finder: Finds the hands of single frames.
         rate: Frames per second [Hz].
         progress: Called with the number of frames that are done.
+
+    Raises:
+        ArgumentError: The points are not in meters, or a frame holds more than 512.
     """
+    check_clouds(frames)
     found: Hands = []
     for first in range(0, len(frames), _CHUNK):
         found += [_two_best(hands) for hands in finder.find(frames[first : first + _CHUNK])]
