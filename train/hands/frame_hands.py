@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 _LEAST_SHARE: Final = 0.4  # of a hand's markers that must be labeled
 _FEWEST: Final = 5
+_FEW: Final = 4  # points near each other that may be of a hidden hand
 _SPARE: Final = 6  # points beyond a hand's markers from which on a cluster may be two hands
 _MOST: Final = 120  # points of a cluster; larger ones are not hands
 _SHORTER_LINKS: Final = (0.8, 0.65, 0.5)  # at which hands that are close to each other come apart
@@ -60,8 +61,6 @@ class FoundHand:
     confidence: Float[np.ndarray, "H"]
     vote: float
     """Clearness of the side: positive for a right hand, negative for a left one."""
-    support: Float[np.ndarray, "H"]
-    """How certain it is that each point is of this hand, and not of another one, 0 to 1."""
 
     @property
     def weight(self) -> float:
@@ -95,23 +94,26 @@ class HandFinder:
         """Least number of labeled points of a hand."""
         return max(_FEWEST, int(np.ceil(_LEAST_SHARE * self._markers)))
 
-    def find(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[list[FoundHand]]:
-        """The hands of each frame that stand apart.
+    def find(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[tuple[list[FoundHand], bool]]:
+        """The hands of each frame that stand apart, and whether they leave no other points that are near each other.
 
         Args:
             frames: Points of each frame [m].
         """
         wanted, choices = [], []
+        pending = np.zeros(len(frames), dtype=np.int64)
         for number, points in enumerate(frames):
-            for group in self._groups(points):
-                if len(group) <= self._markers + _SPARE:
+            groups = clusters(points, self.measures.link_distance)
+            pending[number] = sum(len(group) >= _FEW for group in groups)
+            for group in groups:
+                if self.fewest <= len(group) <= self._markers + _SPARE:
                     choices.append(number)
                     wanted.append((points, group))
         found: list[list[FoundHand]] = [[] for _ in frames]
         for number, hand in zip(choices, self.label(wanted, self.certain), strict=True):
             if hand is not None:
                 found[number].append(hand)
-        return found
+        return [(hands, len(hands) == count) for hands, count in zip(found, pending, strict=True)]
 
     def find_merged(self, points: Float[np.ndarray, "N 3"]) -> list[FoundHand]:
         """The hands of one frame, also of those that touch; slower.
@@ -161,7 +163,7 @@ class HandFinder:
         side, clearness = self._classifier.classify(points[here], names)
         if clearness < criteria.clearness:
             return None
-        return FoundHand(here, names, sure, clearness if side == "right" else -clearness, np.ones(len(here)))
+        return FoundHand(here, names, sure, clearness if side == "right" else -clearness)
 
     def _groups(self, points: NDArray[np.float64]) -> list[Group]:
         groups = clusters(points, self.measures.link_distance)

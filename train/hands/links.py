@@ -84,27 +84,12 @@ def previous_points(
     return previous
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def carried(
-    values: Float[np.ndarray, "P"], previous: Int[np.ndarray, "P"], keep: float
-) -> tuple[Float[np.ndarray, "P"], Float[np.ndarray, "P"]]:
-    """What each point has from the frames before it and from those after it.
-
-    Args:
-        values: Own value of each point; 0 for none, which takes that of the point it was before.
-        previous: See `previous_points`.
-        keep: Share of a value that is left after one frame.
-    """
-    before, after = np.zeros(len(values)), np.zeros(len(values))
-    for new in range(len(values)):
-        old = previous[new]
-        if old >= 0:
-            before[new] = keep * (values[old] if values[old] != 0.0 else before[old])
-    for new in range(len(values) - 1, -1, -1):
-        old = previous[new]
-        if old >= 0:
-            after[old] = keep * (values[new] if values[new] != 0.0 else after[new])
-    return before, after
+def following_points(previous: Int[np.ndarray, "P"]) -> Int[np.ndarray, "P"]:
+    """Which point of the next frame each point is, -1 where none is; see `previous_points`."""
+    following = np.full(len(previous), -1)
+    linked = np.flatnonzero(previous >= 0)
+    following[previous[linked]] = linked
+    return following
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator]
