@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gloves.captures.formats import READABLE, read_capture
-from gloves.captures.markers import select_markers
+from gloves.captures.markers import select_hands
 from handsim.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    """The named markers of all frames of labeled captures [m], NaN where missing.
+    """The named markers of all frames of labeled captures [m], NaN where missing; hand by hand.
 
     Raises:
         CaptureError: A file cannot be read or lacks a marker; the file is named.
@@ -49,7 +49,7 @@ def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarra
 
 def _markers_of(file: Path, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
     try:
-        return select_markers(read_capture(file), names)
+        return np.concatenate(select_hands(read_capture(file), names))
     except CaptureError as error:
         text = str(error)
         raise CaptureError(text if text.startswith(str(file)) else f"{file}: {text}") from error

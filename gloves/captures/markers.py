@@ -35,6 +35,39 @@ def select_markers(capture: Capture, names: Sequence[str]) -> Float[np.ndarray, 
     return capture.positions[:, [bare.index(name) for name in names]]
 
 
+def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarray, "T M 3"]]:
+    """The named markers of every hand of a labeled capture, in their order.
+
+    A capture of one hand has one column per marker, as `select_markers` takes it. One of two hands, as
+    `handsim track` and `handsim label` write it, has a set of columns for each: "right:ThumbTip" and so on.
+    Of such a set, the frames without a marker are left out: the hand was not there.
+
+    Raises:
+        CaptureError: A marker is not among the columns, or is among those of a hand twice or not at all.
+    """
+    columns = [_split_name(column) for column in capture.names]
+    sets = list(dict.fromkeys(prefix for prefix, name in columns if name in names))
+    held = [name for _, name in columns if name in names]
+    if len(sets) < 2 or len(held) == len(set(held)):
+        return [select_markers(capture, names)]
+    hands = []
+    for prefix in sets:
+        mine = [number for number, (other, _) in enumerate(columns) if other == prefix]
+        part = Capture(tuple(columns[number][1] for number in mine), capture.positions[:, mine], capture.rate)
+        try:
+            markers = select_markers(part, names)
+        except CaptureError as error:
+            raise CaptureError(f"columns '{prefix}:...': {error}") from error
+        hands.append(markers[np.isfinite(markers[..., 0]).any(axis=1)])
+    return hands
+
+
+def _split_name(column: str) -> tuple[str, str]:
+    """What is before the last colon of a column's name, and what is behind it."""
+    prefix, _, name = column.rpartition(":")
+    return prefix.strip(), name.strip()
+
+
 def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:
     """The points of every frame [m] without their labels; an empty frame is (0, 3)."""
     there = np.isfinite(capture.positions).all(axis=-1)

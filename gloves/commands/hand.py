@@ -13,6 +13,7 @@ from gloves.layout import load_layout
 from handsim.app.messages import print_line
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
+from handsim.files.outputs import check_outputs
 from handsim.hand.mjcf import Site, build_spec
 from handsim.hand.model import HandModel
 
@@ -39,6 +40,7 @@ def hand(
         raise HandSimError(f"--out is {out}, expected a file name that ends in .xml")
     if mesh is not None and mesh.suffix.lower() not in _MESH_SUFFIXES:
         raise HandSimError(f"--mesh is {mesh}, expected a file name that ends in {', '.join(_MESH_SUFFIXES)}")
+    check_outputs([glove], (out, mesh))
     model = HandModel.named(size, side=side)
     sites: tuple[Site, ...] = ()
     if glove is not None:

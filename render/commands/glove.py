@@ -19,6 +19,7 @@ from gloves.layout import MarkerLayout, list_layouts, load_layout, starter_layou
 from handsim.app.messages import print_line
 from handsim.errors import LayoutError
 from handsim.files.atomic import atomic_write
+from handsim.files.outputs import check_outputs
 from handsim.hand.shape import SIZES
 
 if TYPE_CHECKING:
@@ -87,6 +88,8 @@ def check_glove(
         size: Size of the hand in the picture.
     """
     layout = load_layout(glove)
+    picture = Path(glove).with_suffix(".png") if out is None else out
+    check_outputs([glove], [picture])
     table = Table("size", "nearest two markers", title=Text(f"{layout.name}: {layout.num_markers} markers"))
     table.add_column("centers apart [mm]", justify="right")
     overlaps = []
@@ -106,7 +109,6 @@ def check_glove(
     from render.illustrations.captions import write_png
     from render.illustrations.hands import draw_glove
 
-    picture = Path(glove).with_suffix(".png") if out is None else out
     write_png(picture, draw_glove(nominal_fit(layout, size, "right")))
     print_line(f"{picture}: the glove on a hand of size {size}")
 

@@ -12,6 +12,7 @@ from gloves.captures.formats import read_capture
 from gloves.takes.take import SUFFIX, load_take
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
+from handsim.files.outputs import check_outputs
 from handsim.space.objects import named_object
 from track.bodies.body_file import SUFFIX as TOML
 from track.bodies.body_file import save_body
@@ -31,6 +32,7 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
     """
     if out.suffix.lower() != TOML:
         raise ArgumentError(f"--out is {out}, expected a file name that ends in {TOML}")
+    check_outputs([source], [out])
     found = _take_body(source) if source.name.endswith(SUFFIX) else learn_body(read_capture(source), out.stem)
     save_body(out, found)
     widest = 1e3 * np.max(found.distances)

@@ -18,6 +18,7 @@ from gloves.takes.tracked_take import INITIALIZED, TRACKED, TrackedTake
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
+from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.calibration.user_calibration import Calibration, CalibrationError, calibrate_hands
 from track.capture_tracking import track_capture
@@ -59,6 +60,7 @@ def calibrate(
     """
     if out.suffix.lower() != ".json":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .json")
+    check_outputs((capture, glove, labeler), [out])
     start = uncalibrated_users(glove, size, hands)
     source = read_capture(capture)
     network = labeler_for_glove(glove, labeler)

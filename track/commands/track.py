@@ -23,6 +23,7 @@ from gloves.takes.tracked_take import TrackedTake, load_tracked_take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError, HandSimWarning
+from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
@@ -74,6 +75,7 @@ def track(
             points Unlabeled1, Unlabeled2, ...
     """
     _check_options(capture, live, seconds, out, labeled)
+    check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
     if shape is None:
         user = uncalibrated_users(glove, size or "M", BOTH if hands is None else hands)
     else:

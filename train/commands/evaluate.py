@@ -11,8 +11,9 @@ from rich.console import Console
 
 from gloves.captures.collection import find_captures, read_markers
 from gloves.takes.take import load_take
-from handsim.errors import HandSimError
+from handsim.errors import CaptureError, HandSimError
 from handsim.files.json_files import save_json
+from handsim.files.outputs import check_outputs
 from train.labelers.storage import labeler_for_glove
 from train.reports.figures_table import print_figures
 from train.threads import label_on
@@ -33,6 +34,7 @@ def evaluate(
 
     Args:
         captures: Labeled .trc, .c3d or .csv files, folders searched for them, or the .truth.npz of takes.
+            Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by itself.
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
         occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).
@@ -49,8 +51,10 @@ def evaluate(
     if seed < 0:
         raise HandSimError(f"seed is {seed}, expected 0 or more")
     label_on(threads)
+    are_takes = _are_takes(captures)
+    check_outputs((*captures, glove, labeler), [json])
     network = labeler_for_glove(glove, labeler)
-    if all(path.suffix == ".npz" for path in captures):
+    if are_takes:
         if occlude or ghosts:
             raise HandSimError(
                 "a simulated take has its own gaps and ghosts: leave out --occlude and --ghosts"
@@ -63,14 +67,39 @@ def evaluate(
         corruption = Corruption(occlude, ghosts)
         report = evaluate_labeler(network, markers, corruption, rng=np.random.default_rng(seed))
         title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
+    if not any(report.confusion[:-1].ravel()):
+        given = ", ".join(str(path) for path in captures)
+        raise CaptureError(
+            f"nothing to count: no frame of {given} holds a marker of glove '{glove}'; expected labeled captures"
+        )
     by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
     _print_report(report.figures, by_marker, title)
     if json is not None:
         drawn = {"glove": glove, "occlude": occlude, "ghosts": ghosts, "seed": seed}
         # JSON has no NaN, which stands where there was nothing to count.
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
-        found = {"frames": report.num_frames, "figures": figures, "slot_accuracy_by_marker": by_marker}
+        found = {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
+        found["slot_accuracy_by_marker"] = by_marker
         save_json(json, {**drawn, **found})
+
+
+def _are_takes(captures: tuple[Path, ...]) -> bool:
+    """Whether the truth of takes was given, not labeled captures.
+
+    Raises:
+        CaptureError: Nothing was given, or both.
+    """
+    if not captures:
+        raise CaptureError(
+            "no capture was given, expected labeled captures, folders or the .truth.npz of takes"
+        )
+    takes = [path for path in captures if path.suffix == ".npz"]
+    if takes and len(takes) < len(captures):
+        other = next(path for path in captures if path not in takes)
+        raise CaptureError(
+            f"given a take, {takes[0]}, and a capture, {other}, expected one kind; evaluate each on its own"
+        )
+    return bool(takes)
 
 
 def _print_report(figures: dict[str, float], by_marker: dict[str, float], title: str) -> None:

@@ -9,6 +9,7 @@ import tyro
 
 from handsim.app.messages import print_line
 from handsim.errors import HandSimError
+from handsim.files.outputs import check_outputs
 
 
 def export(labeler: Annotated[str, tyro.conf.Positional], out: Path) -> None:
@@ -23,6 +24,7 @@ def export(labeler: Annotated[str, tyro.conf.Positional], out: Path) -> None:
 
     if out.suffix.lower() != ".onnx":
         raise HandSimError(f"cannot write '{out}', expected a name that ends in .onnx")
+    check_outputs([labeler], [out])
     network, card = load_network(labeler)
     export_onnx(network, card["marker_names"], out)
     print_line(f"{out}: {len(card['marker_names'])} markers")

@@ -14,6 +14,7 @@ from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX
 from handsim.app.messages import print_line
 from handsim.files.atomic import atomic_writes
+from handsim.files.outputs import check_outputs
 from train.simulation.takes import TakeConfig, simulate_take
 
 
@@ -25,6 +26,7 @@ def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -
         config: What to simulate.
     """
     check_suffix(out, WRITABLE)
+    check_outputs((config.glove, config.rig), (out, out.with_suffix(SUFFIX)))
     take = simulate_take(config)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     truth = out.with_suffix(SUFFIX)

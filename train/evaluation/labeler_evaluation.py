@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -39,6 +39,8 @@ class Report:
     """Confidence of each point's label, the points of all frames in order."""
     right: Bool[np.ndarray, "N"]
     """Whether that label is right."""
+    numbers: dict[str, int] = field(default_factory=dict)
+    """Slots, points, occlusions and ghosts counted, see `train.evaluation.metrics.LabelCounts.numbers`."""
 
 
 def evaluate_labeler(
@@ -156,4 +158,5 @@ class _Count:
             "error_without_least_sure": error_without(confidences, right),
         }
         by_marker = self.right_by_marker / max(1, frames)
-        return Report(figures, by_marker, frames, self.counts.confusion, confidences, right)
+        numbers = self.counts.numbers()
+        return Report(figures, by_marker, frames, self.counts.confusion, confidences, right, numbers)

@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class LabelCounts:
-    """Running counts; every figure is a share in [0, 1], NaN where there was nothing to count."""
+    """Running counts; every figure is a share in [0, 1], NaN where there was nothing to count.
+
+    Precision is NaN also where nothing was hidden, or no point a ghost: whatever was said is wrong then, and
+    its number says more than its share, zero.
+    """
 
     frames: int = 0
     frames_right: int = 0
@@ -80,13 +84,18 @@ class LabelCounts:
             "point_accuracy": _share(self.points_right, self.points),
             "frame_accuracy": _share(self.frames_right, self.frames),
             "occlusion_ratio": _share(self.occluded, self.slots),
-            "occlusion_precision": _share(self.occluded_right, self.occluded_given),
+            "occlusion_precision": _precision(self.occluded_right, self.occluded_given, self.occluded),
             "occlusion_recall": _share(self.occluded_right, self.occluded),
             "ghost_ratio": _share(self.ghosts, self.slots),
-            "ghost_precision": _share(self.ghosts_right, self.ghosts_given),
+            "ghost_precision": _precision(self.ghosts_right, self.ghosts_given, self.ghosts),
             "ghost_recall": _share(self.ghosts_right, self.ghosts),
             "macro_f1": macro_f1(self.confusion),
         }
+
+    def numbers(self) -> dict[str, int]:
+        """What the shares of occlusions and ghosts come from."""
+        names = ("occluded", "occluded_given", "occluded_right", "ghosts", "ghosts_given", "ghosts_right")
+        return {name: getattr(self, name) for name in ("slots", "points", *names)}
 
 
 def macro_f1(confusion: Int[np.ndarray, "K K"]) -> float:
@@ -113,6 +122,10 @@ def _slots(labels: Int[np.ndarray, "N"], num_labels: int) -> Int[np.ndarray, "M"
     labeled = np.flatnonzero(labels >= 0)
     slots[labels[labeled]] = labeled
     return slots
+
+
+def _precision(right: int, given: int, there: int) -> float:
+    return _share(right, given) if there else float("nan")
 
 
 def _share(part: int, whole: int) -> float:

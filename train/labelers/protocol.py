@@ -76,8 +76,7 @@ def label_in_batches(
     Raises:
         ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
     """
-    clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
-    check_unit(clouds)
+    clouds = check_clouds(frames)
     order = sorted(range(len(clouds)), key=lambda number: len(clouds[number]))
     results = [Labeling(np.zeros(0, dtype=np.int64), np.zeros(0)) for _ in clouds]
     for first in range(0, len(order), _BATCH):
@@ -87,6 +86,17 @@ def label_in_batches(
             for number, labeling in zip(chosen, labelings, strict=True):
                 results[number] = labeling
     return results
+
+
+def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.float64]]:
+    """The points of every frame [m], after a check.
+
+    Raises:
+        ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
+    """
+    clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
+    check_unit(clouds)
+    return clouds
 
 
 def pad_clouds(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from itertools import combinations
 from typing import TYPE_CHECKING, Final
 
+import numba
 import numpy as np
 
 from gloves.attachment import attach_markers
@@ -57,9 +58,7 @@ class SideClassifier:
         """
         markers = np.full((self._num_markers, 3), np.nan)
         markers[labels[labels >= 0]] = points[labels >= 0]
-        signs = np.nan_to_num(np.sign(_volumes(markers[self._fours])))
-        most = float(np.abs(self._votes[signs != 0.0]).sum())
-        vote = float(signs @ self._votes)
+        vote, most = _vote(markers, self._fours, self._votes)
         return ("left" if vote < 0.0 else "right"), abs(vote) / most if most else 0.0
 
 
@@ -75,3 +74,30 @@ def _volumes(fours: Float[np.ndarray, "*B 4 3"]) -> NDArray[np.float64]:
     a, b, c = (fours[..., k, :] - fours[..., 0, :] for k in (1, 2, 3))
     volumes: NDArray[np.float64] = (np.cross(a, b) * c).sum(-1)
     return volumes
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _vote(
+    markers: NDArray[np.float64], fours: NDArray[np.int64], votes: NDArray[np.float64]
+) -> tuple[float, float]:
+    """The sum of the votes of all groups of four, and the greatest sum that they could have.
+
+    Args:
+        markers: Markers (M, 3) [m], NaN where missing.
+        fours: Groups (F, 4) of markers.
+        votes: Vote (F,) of each group, if its orientation is that of most right hands.
+    """
+    vote, most = 0.0, 0.0
+    for number in range(len(fours)):
+        corner = markers[fours[number, 0]]
+        ax, ay, az = markers[fours[number, 1]] - corner
+        bx, by, bz = markers[fours[number, 2]] - corner
+        cx, cy, cz = markers[fours[number, 3]] - corner
+        volume = (ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz
+        if volume > 0.0:
+            vote += votes[number]
+            most += abs(votes[number])
+        elif volume < 0.0:
+            vote -= votes[number]
+            most += abs(votes[number])
+    return vote, most

@@ -1,0 +1,33 @@
+"""A check that no output is written over an input."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from handsim.errors import ArgumentError
+
+
+def check_outputs(inputs: Iterable[str | Path | None], outputs: Iterable[Path | None]) -> None:
+    """Refuse an output that names an input, also through a link or in another spelling.
+
+    Args:
+        inputs: Files and folders that a command reads, and names that may be none; None where not given.
+        outputs: What it writes; None where not given.
+
+    Raises:
+        ArgumentError: An output is one of the inputs.
+    """
+    read = [Path(name) for name in inputs if name is not None]
+    for output in outputs:
+        for source in read if output is not None else ():
+            if output is not None and _same(source, output):
+                raise ArgumentError(f"the output {output} is the input {source}, expected another file")
+
+
+def _same(source: Path, output: Path) -> bool:
+    try:
+        return os.path.samefile(source, output)
+    except (OSError, ValueError):  # one of them does not exist
+        return False
