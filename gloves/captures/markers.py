@@ -53,9 +53,7 @@ def select_hands(capture: Capture, names: Sequence[str]) -> list[Float[np.ndarra
     hands = []
     for prefix in sets:
         mine = [number for number, (other, _) in enumerate(columns) if other == prefix]
-        part = Capture(
-            tuple(columns[number][1] for number in mine), capture.positions[:, mine], capture.rate
-        )
+        part = Capture(tuple(columns[number][1] for number in mine), capture.positions[:, mine], capture.rate)
         try:
             markers = select_markers(part, names)
         except CaptureError as error:

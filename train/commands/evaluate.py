@@ -64,7 +64,8 @@ def evaluate(
     if not any(report.confusion[:-1].ravel()):
         given = ", ".join(str(path) for path in captures)
         raise CaptureError(
-            f"nothing to count: no frame of {given} holds a marker of glove '{glove}'; expected labeled captures"
+            f"nothing to count: no frame of {given} holds a marker of glove '{glove}', expected labeled "
+            "captures"
         )
     by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
     _print_report(report.figures, by_marker, title)
@@ -84,7 +85,9 @@ def _are_takes(captures: tuple[Path, ...]) -> bool:
         CaptureError: Nothing was given, or both.
     """
     if not captures:
-        raise CaptureError("no capture was given, expected labeled captures, folders or the .truth.npz of takes")
+        raise CaptureError(
+            "no capture was given, expected labeled captures, folders or the .truth.npz of takes"
+        )
     takes = [path for path in captures if path.suffix == ".npz"]
     if takes and len(takes) < len(captures):
         other = next(path for path in captures if path not in takes)
