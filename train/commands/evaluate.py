@@ -70,7 +70,8 @@ def evaluate(
     if not any(report.confusion[:-1].ravel()):
         given = ", ".join(str(path) for path in captures)
         raise CaptureError(
-            f"nothing to count: no frame of {given} holds a marker of glove '{glove}'; expected labeled captures"
+            f"nothing to count: no frame of {given} holds a marker of glove '{glove}', expected labeled "
+            "captures"
         )
     by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
     _print_report(report.figures, by_marker, title)

@@ -33,9 +33,9 @@ def label(
     labeler: str | None = None,
     threads: int = 1,
 ) -> None:
-    """Label the hands in every frame of a capture: none, one or two; names and order of its columns are not used.
+    """Label the hands in every frame of a capture: none, one or two; its columns' names are not used.
 
-    Where a frame holds two hands, the columns are called right:ThumbTip and so on, as handsim track calls them.
+    Where a frame holds two hands, the columns are called right:ThumbTip and so on, as by handsim track.
 
     Args:
         capture: A .trc, .c3d or Motive .csv file.
@@ -63,7 +63,8 @@ def label(
     points = sum(len(one.labels) for one in labelings)
     sure = f", median confidence {np.median(confidence):.3f}" if len(confidence) else ""
     Console().print(
-        f"{out}: {len(frames)} frames, {len(confidence)} of {points} points labeled{sure}; {_counts(labelings)}",
+        f"{out}: {len(frames)} frames, {len(confidence)} of {points} points labeled{sure}; "
+        f"{_counts(labelings)}",
         highlight=False,
         soft_wrap=True,
         markup=False,

@@ -2,8 +2,8 @@
 
 From both ends of such a stretch, frame by frame: a point that was a hand's a moment ago is that hand's. Each
 hand is labeled among its own points and those of which nothing is known; where both claim one, the more
-confident hand has it. A new point is a hand's own after some frames, and one that a hand does not want is free
-again. Where nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
+confident hand has it. A new point is a hand's own after some frames, and one that a hand does not want is
+free again. Where nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _CUT_EVERY: Final = 0.1  # [s]
 _BETTER: Final = 3.0  # points more that cut hands must explain
 _CERTAIN: Final = 0.75  # confidence of a hand of which nothing was known
 _CONFIDENT: Final = 0.7  # of a hand from which on its points are learnt
-_FOLLOWED: Final = Criteria(fewest=_FEWEST, confidence=0.4, fitting_share=0.6, misfit=0.012, clearness=0.0)
+FOLLOWED: Final = Criteria(fewest=_FEWEST, confidence=0.4, fitting_share=0.6, misfit=0.012, clearness=0.0)
 
 
 @dataclass(slots=True)
@@ -114,7 +114,7 @@ class Follower:
                     owners.append((front, side))
                     guesses.append(int((known == side).sum()) < _FEWEST)
         claims: dict[int, dict[int, FoundHand]] = {}
-        hands_found = self._finder.label(clouds, _FOLLOWED)
+        hands_found = self._finder.label(clouds, FOLLOWED)
         for (front, side), guess, hand in zip(owners, guesses, hands_found, strict=True):
             if hand is not None and not (guess and self._unlike(hand, side)):
                 claims.setdefault(id(front), {})[side] = hand

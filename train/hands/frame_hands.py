@@ -1,8 +1,8 @@
 """The hands of single frames: clusters of points, labeled, and checked whether they fit a hand.
 
 A labeler names the points of one hand, and it names something in any cloud. So a cluster is a hand only where
-most of its labels fit one, with confidence. Hands that are close to each other make one cluster; it is cut, and
-where a part fits a hand, the rest is labeled without that hand, and the hand without that rest.
+most of its labels fit one, with confidence. Hands that are close to each other make one cluster; it is cut,
+and where a part fits a hand, the rest is labeled without that hand, and the hand without that rest.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class HandFinder:
         self.measures = HandMeasures(layout, rng=rng)
         self._labeler = labeler
         self._classifier = SideClassifier(layout, rng=rng)
-        self._markers = layout.num_markers
+        self.num_markers = layout.num_markers
         self.certain = Criteria(self.fewest, 0.75, 0.8, 0.008, 0.3)
         """A hand without any history."""
         spread = np.arange(_CUTS) + 0.5
@@ -92,10 +92,10 @@ class HandFinder:
     @property
     def fewest(self) -> int:
         """Least number of labeled points of a hand."""
-        return max(_FEWEST, int(np.ceil(_LEAST_SHARE * self._markers)))
+        return max(_FEWEST, int(np.ceil(_LEAST_SHARE * self.num_markers)))
 
     def find(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[tuple[list[FoundHand], bool]]:
-        """The hands of each frame that stand apart, and whether they leave no other points that are near each other.
+        """The hands of each frame that stand apart, and whether these are all clusters of points.
 
         Args:
             frames: Points of each frame [m].
@@ -106,7 +106,7 @@ class HandFinder:
             groups = clusters(points, self.measures.link_distance)
             pending[number] = sum(len(group) >= _FEW for group in groups)
             for group in groups:
-                if self.fewest <= len(group) <= self._markers + _SPARE:
+                if self.fewest <= len(group) <= self.num_markers + _SPARE:
                     choices.append(number)
                     wanted.append((points, group))
         found: list[list[FoundHand]] = [[] for _ in frames]
@@ -128,7 +128,7 @@ class HandFinder:
 
     def is_merged(self, points: Float[np.ndarray, "N 3"]) -> bool:
         """Whether a cluster has more points than a hand."""
-        return any(len(group) > self._markers + _SPARE for group in self._groups(points))
+        return any(len(group) > self.num_markers + _SPARE for group in self._groups(points))
 
     def label(
         self, clouds: Sequence[tuple[NDArray[np.float64], Group]], criteria: Criteria
@@ -170,7 +170,7 @@ class HandFinder:
         return [group for group in groups if self.fewest <= len(group) <= _MOST]
 
     def _split(self, points: NDArray[np.float64], group: Group) -> list[Group]:
-        """Parts of a large cluster at the longest distance at which it has two; the cluster itself otherwise."""
+        """Parts of a cluster at the longest distance at which it has two; the cluster itself otherwise."""
         for share in _SHORTER_LINKS:
             parts = clusters(points[group], share * self.measures.link_distance)
             if len(parts) > 1 and len(parts[1]) >= self.fewest:
@@ -180,7 +180,7 @@ class HandFinder:
     def _cut(self, points: NDArray[np.float64], group: Group) -> list[FoundHand]:
         """The one or two hands of a cluster: what explains most of its points."""
         parts = [group]
-        if len(group) > self._markers + _SPARE:
+        if len(group) > self.num_markers + _SPARE:
             half = len(group) // 2
             parts += self._split(points, group)
             for direction in self._directions:

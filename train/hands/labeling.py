@@ -1,7 +1,7 @@
 """The hands of a capture with their labels: how many each frame holds, and which is left and right.
 
-Frames in which the hands stand apart are decided on their own (`train.hands.frame_hands`), all of them vote for
-left and right (`train.hands.sides`), and the other frames follow from these (`train.hands.following`).
+Frames in which the hands stand apart are decided on their own (`train.hands.frame_hands`), all of them vote
+for left and right (`train.hands.sides`), and the other frames follow from these (`train.hands.following`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from train.hands.following import Follower
+from train.hands.following import FOLLOWED, Follower
 from train.hands.frame_hands import FoundHand, HandFinder
 from train.hands.links import previous_points
 from train.hands.sides import sides_of
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 _CHUNK: Final = 512
 _SPEED, _ACCELERATION = 2.0, 80.0  # of a marker [m/s], [m/s^2]
+_REACH: Final = 1.5  # of a hand for single points, in distances within which most markers are linked
+_GAIN: Final = 0.3  # points more that a hand labeled once more must explain
 _NOISE, _FARTHEST = 0.004, 0.03  # of a step from frame to frame [m]
 
 
@@ -79,11 +81,37 @@ def label_hands(
     sides = sides_of(found, starts, previous)
     by_side = [dict(zip(side, hands, strict=True)) for side, hands in zip(sides, found, strict=True)]
     Follower(frames, by_side, finder, previous, rate).follow(settled)
+    _complete(frames, by_side, finder)
     return [_frame_labels(len(points), hands) for points, hands in zip(frames, by_side, strict=True)]
 
 
 def _two_best(hands: list[FoundHand]) -> list[FoundHand]:
     return sorted(hands, key=lambda hand: hand.weight, reverse=True)[:2]
+
+
+def _complete(
+    frames: Sequence[NDArray[np.float64]], by_side: list[dict[int, FoundHand]], finder: HandFinder
+) -> None:
+    """Label hands once more together with the points near them that have no label."""
+    clouds, owners = [], []
+    for number, (points, hands) in enumerate(zip(frames, by_side, strict=True)):
+        free = np.ones(len(points), dtype=bool)
+        for hand in hands.values():
+            free[hand.points] = False
+        if not free.any():
+            continue
+        rest = np.flatnonzero(free)
+        for side, hand in hands.items():
+            distance = np.linalg.norm(points[rest, None] - points[hand.points], axis=-1).min(axis=1)
+            near = rest[distance <= _REACH * finder.measures.link_distance]
+            if len(near) and len(hand.points) < finder.num_markers:
+                clouds.append((points, np.sort(np.concatenate([hand.points, near]))))
+                owners.append((number, side))
+    for first in range(0, len(clouds), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        for (number, side), hand in zip(owners[part], finder.label(clouds[part], FOLLOWED), strict=True):
+            if hand is not None and hand.weight > by_side[number][side].weight + _GAIN:
+                by_side[number][side] = hand
 
 
 def _frame_labels(count: int, hands: dict[int, FoundHand]) -> FrameLabels:

@@ -1,4 +1,4 @@
-"""Points that are near each other: clusters within a frame, and the same point in the next frame; compiled."""
+"""Points that are near each other: clusters within a frame, and a point in the next frame; compiled."""
 
 from __future__ import annotations
 
