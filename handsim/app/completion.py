@@ -49,7 +49,7 @@ def _words(target: str) -> list[str]:
 def _options(function: Any) -> list[str]:
     import tyro
 
-    parser: argparse.ArgumentParser = tyro.extras.get_parser(function)
+    parser: Any = tyro.extras.get_parser(function)
     return [
         option
         for action in parser._actions  # argparse has no other way to list them
