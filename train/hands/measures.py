@@ -1,8 +1,8 @@
 """How far the markers of a hand can be apart, and the check that labeled points fit a hand.
 
 Simulated hands of children and adults in random poses, in gloves that slipped, give the least and the
-greatest distance of each pair of markers. Points of something else that a labeler names like a hand break many
-of these.
+greatest distance of each pair of markers. Points of something else that a labeler names like a hand break
+many of these.
 """
 
 from __future__ import annotations
