@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import io
 import os
+import select
 import struct
 import sys
 import termios
@@ -28,9 +29,11 @@ def test_a_terminal_shows_what_fits_into_its_line(columns, monkeypatch):
             status.show(LINE)
             assert not status.due
             status.show("not yet")
-        shown = os.read(reader, 10_000).decode()
+        shown = b""
+        while select.select([reader], [], [], 0.2)[0]:
+            shown += os.read(reader, 10_000)
     os.close(reader)
-    assert shown == f"recording\r\n\r{LINE[: columns - 1]}\x1b[K\r\x1b[K"
+    assert shown.decode() == f"recording\r\n\r{LINE[: columns - 1]}\x1b[K\r\x1b[K"
 
 
 def test_a_log_gets_a_line_every_ten_seconds(monkeypatch, capsys):
