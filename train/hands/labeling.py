@@ -109,9 +109,9 @@ def _complete(
                 owners.append((number, side))
     for first in range(0, len(clouds), _CHUNK):
         part = slice(first, first + _CHUNK)
-        for (number, side), hand in zip(owners[part], finder.label(clouds[part], FOLLOWED), strict=True):
-            if hand is not None and hand.weight > by_side[number][side].weight + _GAIN:
-                by_side[number][side] = hand
+        for (number, side), found in zip(owners[part], finder.label(clouds[part], FOLLOWED), strict=True):
+            if found is not None and found.weight > by_side[number][side].weight + _GAIN:
+                by_side[number][side] = found
 
 
 def _frame_labels(count: int, hands: dict[int, FoundHand]) -> FrameLabels:
