@@ -13,7 +13,7 @@ import trimesh
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit, GlovedHand, attach
+from gloves.fit import GlovedHand, GloveFit, attach
 from gloves.layout import load_layout, save_layout, starter_layout
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import STATUSES, MarkedBody, TrackedTake
