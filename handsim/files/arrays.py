@@ -1,4 +1,4 @@
-"""Arrays from files of others: sizes are read and checked before anything is allocated, nothing is unpickled."""
+"""Arrays from files of others: sizes are checked before anything is allocated, and nothing is unpickled."""
 
 from __future__ import annotations
 

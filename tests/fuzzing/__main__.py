@@ -1,4 +1,4 @@
-"""`python -m tests.fuzzing`: many damaged files for every reader; exit code 1 if one of them broke the rule."""
+"""`python -m tests.fuzzing`: damaged files for every reader; exit code 1 if one broke the rule."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def main() -> int:
 
 
 def _told(failure: Failure | None, folder: Path | None, known: collections.Counter[str]) -> list[str]:
-    """The kind of a failure, by the last two lines of its traceback; the first of a kind is printed and kept."""
+    """The kind of a failure, by the end of its traceback; the first of a kind is printed and kept."""
     if failure is None:
         return []
     lines = failure.what.splitlines()

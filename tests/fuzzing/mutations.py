@@ -13,7 +13,8 @@ import numpy as np
 _NUMBER: Final = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _TEXTS: Final = (
     b"nan", b"inf", b"-inf", b"NaN", b"-Infinity", b"1e308", b"-1e308", b"1e-320", b"0", b"-1", b"-0.0", b"1",
-    b"2147483648", b"18446744073709551616", b"1" * 400, b"1" * 5000, b"", b"null", b"true", b"[]", b"{}", b'"x"',
+    b"2147483648", b"18446744073709551616", b"1" * 400, b"1" * 5000, b"", b"null", b"true", b"[]", b"{}",
+    b'"x"',
     b"'", b'"', b"\xff\xfe", b"\0", b"\n", b"\t\t\t", b",,,,",
 )  # fmt: skip
 _LONG: Final = (b"[", b"{", b"(", b'{"a":', b"[[", b"a.", b"\t", b",", b"\n", b"1\n", b"0\t", b"A", b"\0")

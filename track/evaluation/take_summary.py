@@ -66,8 +66,8 @@ def _suspicions_of(take: TrackedTake, side: Side) -> list[str]:
     filled, rms = float(take.filled[shown, hand].mean()), float(np.nanmedian(take.rms[:, hand]))
     if filled > _MOST_FILLED:
         found.append(
-            f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its pose; "
-            "name the glove worn (--glove) and the hands that are in the capture (--hands)"
+            f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its "
+            "pose; name the glove worn (--glove) and the hands that are in the capture (--hands)"
         )
     if rms > _MOST_RMS:
         found.append(

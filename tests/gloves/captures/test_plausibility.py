@@ -110,7 +110,7 @@ def test_points_far_away_are_counted(hand):
     with pytest.warns(HandSimWarning, match=r"30 of 570 points lie 1000 m or more from the origin"):
         check_place(Capture(NAMES, positions, 120.0), 1e3)
     far = Capture(NAMES, hand.positions + 1500.0, 120.0)
-    with pytest.raises(CaptureError, match="570 of 570 points lie 1000 m or more .*; move the origin"):
+    with pytest.raises(CaptureError, match=r"570 of 570 points lie 1000 m or more .*; move the origin"):
         check_place(far, 1e3)
 
 

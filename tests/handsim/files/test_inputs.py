@@ -90,5 +90,5 @@ def test_more_cells_than_a_text_file_can_hold_are_refused(tmp_path):
     names = "a\t\t\t" * 20_000
     header = f"PathFileType\t4\tx\ty\nDataRate\tUnits\n120\tmm\nFrame#\tTime\t{names}\n\t\tX\n"
     path.write_text(header + "1\n" * 20_000)
-    with pytest.raises(CaptureError, match="20000 rows of 59999 columns are more than"):
+    with pytest.raises(CaptureError, match="20000 rows of 60002 columns are more than"):
         read_capture(path)
