@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from gloves.takes.growing import GrownArchive, growing_path, is_growing
-from handsim.errors import CaptureError, HandSimError
+from handsim.errors import CaptureError, HandSimError, HandSimWarning
 from handsim.files.arrays import read_npz
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import check_regular
@@ -35,7 +35,7 @@ _DAMAGE: Final = (
 """Exceptions that reading a damaged file may raise."""
 
 
-class CutOffWarning(UserWarning):
+class CutOffWarning(HandSimWarning):
     """A recording was cut off: it is read up to its last whole half second."""
 
 

@@ -17,7 +17,7 @@ from handsim.errors import HandSimError
 from handsim.files.inputs import read_bytes
 
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
-_DOTTED: Final = re.compile(r"""(?:[\w"'-]\s{0,9}\.\s{0,9}[\w"'-]+){20}""")
+_DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 
 
 @contextmanager

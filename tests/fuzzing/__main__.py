@@ -1,4 +1,4 @@
-"""`python -m tests.fuzzing`: many damaged files for every reader; exit code 1 if one broke the rule."""
+"""`python -m tests.fuzzing`: damaged files for every reader; exit code 1 if one broke the rule."""
 
 from __future__ import annotations
 

@@ -14,7 +14,8 @@ _NUMBER: Final = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _TEXTS: Final = (
     b"nan", b"inf", b"-inf", b"NaN", b"-Infinity", b"1e308", b"-1e308", b"1e-320", b"0", b"-1", b"-0.0", b"1",
     b"2147483648", b"18446744073709551616", b"1" * 400, b"1" * 5000, b"", b"null", b"true", b"[]", b"{}",
-    b'"x"', b"'", b'"', b"\xff\xfe", b"\0", b"\n", b"\t\t\t", b",,,,",
+    b'"x"',
+    b"'", b'"', b"\xff\xfe", b"\0", b"\n", b"\t\t\t", b",,,,",
 )  # fmt: skip
 _LONG: Final = (b"[", b"{", b"(", b'{"a":', b"[[", b"a.", b"\t", b",", b"\n", b"1\n", b"0\t", b"A", b"\0")
 _WORDS: Final = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)

@@ -56,7 +56,8 @@ def label(
     confidence = [labeling.confidence[labeling.labels >= 0] for labeling in labelings]
     sure = f", median confidence {np.median(np.concatenate(confidence)):.3f}" if labeled else ""
     print_line(
-        f"{out}: {len(frames)} frames, {labeled} of {points} points labeled{sure}{_side(glove, frames, labels)}"
+        f"{out}: {len(frames)} frames, {labeled} of {points} points labeled{sure}"
+        f"{_side(glove, frames, labels)}"
     )
     if not labeled:
         told = (
