@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import zipfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 
 from gloves.optics.ghosts import MAX_GHOSTS
 from handsim.errors import DatasetError, choices
+from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write
 from handsim.files.json_files import load_json, save_json
 from handsim.hand.records import HAND_DTYPE, unpack_hand
@@ -242,10 +242,10 @@ def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
         DatasetError: The file holds something else.
     """
     try:
+        with file.open("rb") as content:
+            check_npy_header(content, file.stat().st_size)
         records: NDArray[np.void] = np.load(file, mmap_mode="r", allow_pickle=False)
-        if not isinstance(records, np.memmap):
-            raise ValueError("an archive, not an array")
-    except (ValueError, EOFError, TypeError, SyntaxError, RecursionError, zipfile.BadZipFile) as error:
+    except (ValueError, EOFError) as error:
         raise DatasetError(f"{file} is damaged: it is no .npy file") from error
     if records.dtype != dtype or records.ndim != 1:
         raise DatasetError(f"{file} holds other records than those of this set; expected {dtype.names}")

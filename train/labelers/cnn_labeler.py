@@ -9,7 +9,7 @@ import numpy as np
 from train.config import CNNConfig
 from train.labelers.depth_image import depth_images
 from train.labelers.matching import match_distances
-from train.labelers.protocol import Labeling, label_in_batches, pad_clouds
+from train.labelers.protocol import Labeling, check_output, label_in_batches, pad_clouds
 from train.labelers.views import MIRROR_IMAGE, MeanHand, spread_views
 
 if TYPE_CHECKING:
@@ -121,7 +121,9 @@ class CNNLabeler:
         for first in range(0, len(points), _IMAGES):
             part = slice(first, first + _IMAGES)
             images, frames = depth_images(points[part], present[part], views[part])
-            parts.append(frames.restore(self._positions(images[:, None]).astype(np.float64)))
+            normalized = self._positions(images[:, None]).astype(np.float64)
+            check_output(normalized)
+            parts.append(frames.restore(normalized))
         return np.concatenate(parts)
 
     def _better(self, best: _Match, markers: NDArray[np.float64], points: NDArray[np.float64]) -> _Match:

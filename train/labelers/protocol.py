@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 
 from gloves.captures.plausibility import check_unit
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, WeightsError
 from train.labelers.matching import match_scores
 
 if TYPE_CHECKING:
@@ -113,6 +113,18 @@ def pad_clouds(
     return points, present
 
 
+def check_output(numbers: Float[np.ndarray, "..."]) -> None:
+    """Refuse what a network with damaged weights gives.
+
+    Raises:
+        WeightsError: Some numbers are not numbers.
+    """
+    if np.isnan(numbers).any():
+        raise WeightsError(
+            "the labeler's network gives numbers that are NaN, expected weights that are whole"
+        )
+
+
 def label_by_scores(
     clouds: Sequence[NDArray[np.float64]],
     point_scores: Float[np.ndarray, "B N M+1"],
@@ -123,6 +135,8 @@ def label_by_scores(
     labelings = []
     for cloud, by_point, by_label in zip(clouds, point_scores, label_scores, strict=True):
         count = len(cloud)
+        check_output(by_point[:count])
+        check_output(by_label)
         labelings.append(Labeling(*match_scores(by_point[:count], by_label[:, [*range(count), longest]])))
     return labelings
 
