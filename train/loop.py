@@ -27,14 +27,14 @@ from train.config import Kind, TrainConfig
 from train.data.augmentation import Corruption
 from train.data.batches import Batch, draw_batch, paper_corruption
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler
+from train.evaluation.labeler_evaluation import Report, evaluate_labeler, paper_report
 from train.evaluation.matching_costs import choose_costs
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import labeler_of
 from train.labelers.storage import save_network
 from train.reports.run_page import write_run_page
 from train.threads import TrainingThreads, check_threads
-from train.training_state import TrainingState, paper_report, passed
+from train.training_state import TrainingState, passed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -16,11 +16,10 @@ from torch import nn
 from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
 from train.config import TrainConfig
-from train.data.batches import Batch, paper_corruption
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler
+from train.data.batches import Batch
+from train.evaluation.labeler_evaluation import paper_report
 from train.history import History
 from train.labelers.kinds import batch_loss, labeler_of, new_network, prepare_network
-from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -193,10 +192,3 @@ def passed(done: int, config: TrainConfig, parts: int) -> bool:
     """Whether the last step ended one of this many parts of the run, each at least one step long."""
     part = max(config.batch, config.samples // parts)
     return (done - config.batch) // part != done // part
-
-
-def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
-    """Evaluation of a labeler on these rows with the paper's corruption, the same each time."""
-    markers = rows["markers"].astype(np.float64)
-    corruption = paper_corruption(markers.shape[1])
-    return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))

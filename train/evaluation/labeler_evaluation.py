@@ -13,6 +13,7 @@ from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from train.data.augmentation import Corruption, corrupt
+from train.data.batches import paper_corruption
 from train.evaluation.metrics import LabelCounts
 from train.evaluation.reliability import error_without, expected_calibration_error
 from train.labelers.protocol import Labeler
@@ -72,6 +73,13 @@ def evaluate_labeler(
             [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
         )
     return count.report()
+
+
+def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
+    """Evaluation of a labeler on these rows with the paper's corruption, the same each time."""
+    markers = rows["markers"].astype(np.float64)
+    corruption = paper_corruption(markers.shape[1])
+    return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
 
 
 def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:

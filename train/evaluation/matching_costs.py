@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from train.config import CNNConfig
-from train.data.batches import paper_corruption
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler
+from train.evaluation.labeler_evaluation import Report, paper_report
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import cnn_labeler
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
 _REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # [m]
@@ -35,10 +33,7 @@ def choose_costs(network: DeepLabelCNN, marker_names: tuple[str, ...], rows: NDA
 
     def report(config: CNNConfig) -> Report:
         network.config = config
-        labeler = cnn_labeler(network, marker_names)
-        corruption = paper_corruption(config.num_labels)
-        markers = few["markers"].astype(np.float64)
-        return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
+        return paper_report(cnn_labeler(network, marker_names), few)
 
     config = network.config
     if config.reject is None:
