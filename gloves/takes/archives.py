@@ -57,7 +57,7 @@ def write_archive(
 
 
 def read_archive(
-    path: Path,
+    path: str | Path,
     kind: str,
     schema: int,
     unpack: Callable[[dict[str, Any], dict[str, np.ndarray]], Content],
@@ -73,6 +73,7 @@ def read_archive(
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
     """
+    path = Path(path)
     header, arrays = _read(path, kind)
     found = header.get("kind", _OLDEST_KIND)
     if found != kind and found in KINDS:
@@ -87,12 +88,13 @@ def read_archive(
         raise CaptureError(f"{path}: not a {kind}, or a damaged one") from error
 
 
-def archive_kind(path: Path) -> str:
+def archive_kind(path: str | Path) -> str:
     """Which of `KINDS` a file is.
 
     Raises:
         CaptureError: No such file, or none of them.
     """
+    path = Path(path)
     found = _read(path, "take")[0].get("kind", _OLDEST_KIND)
     if found not in KINDS:
         raise CaptureError(f"{path}: a {found}, expected {' or '.join(KINDS.values())}")

@@ -135,7 +135,7 @@ class Take:
         write_archive(path, KIND, SCHEMA, header, arrays)
 
 
-def load_take(path: Path) -> Take:
+def load_take(path: str | Path) -> Take:
     """Read a `.truth.npz`, which `handsim simulate` and `Take.save` write; nothing is unpickled.
 
     Args:

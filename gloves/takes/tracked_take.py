@@ -179,7 +179,7 @@ def take_header(
         "rate": rate,
         "layouts": [dataclasses.asdict(hand.layout) for hand in hands],
         "statuses": STATUSES,
-        "bodies": [{"name": body.name, "marker_names": body.marker_names} for body in bodies],
+        "bodies": [{"name": body.name, "marker_names": list(body.marker_names)} for body in bodies],
         "settings": settings,
     }
 
@@ -221,7 +221,7 @@ def usual_rate(times: Float[np.ndarray, "T"]) -> float:
     return 1.0 / float(np.median(np.diff(times[:RATED_FRAMES])))
 
 
-def load_tracked_take(path: Path) -> TrackedTake:
+def load_tracked_take(path: str | Path) -> TrackedTake:
     """Read the `.npz` that `handsim track` or `TrackedTake.save` wrote; nothing is unpickled.
 
     The `.npz.part` of a live recording that was cut off, or is still running, is read up to its last whole

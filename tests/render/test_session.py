@@ -240,7 +240,7 @@ def test_what_cannot_be_drawn_is_said_in_a_sentence(path, tmp_path):
     with pytest.raises(CaptureError, match="cannot be read"):
         render_take(tmp_path / "none.npz", tmp_path / "a", ["coco"], PLAIN)
     render_take(path, tmp_path / "b", ["png"], dataclasses.replace(PLAIN, passes=("depth",)), workers=1)
-    with pytest.raises(HandSimError, match="other settings \\(passes\\)"):
+    with pytest.raises(HandSimError, match="other settings \\(passes"):
         render_take(path, tmp_path / "b", ["png"], PLAIN, workers=1)
 
 
