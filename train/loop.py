@@ -41,6 +41,7 @@ _MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # of each of these evaluations
 _CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # of the last one
+_COST_FRAMES: Final = 400  # for the costs of the paper's network
 
 Progress = Callable[[int, int, float], None]
 """Called with samples done, samples expected, and the loss."""
@@ -91,7 +92,7 @@ def train_labeler(
         share = dataclasses.replace(config, batch=config.batch // fabric.world_size)
         loss = state.step(draw_batch(rows, share, rng=rng), rng=rng)
         if fabric.is_global_zero and passed(state.done, config, _NUM_EVALUATIONS):
-            state.evaluate(held_out[:: -(-len(held_out) // _CURVE_FRAMES[config.labeler])], names)
+            state.evaluate(_few(held_out, _CURVE_FRAMES[config.labeler]), names)
         if progress is not None and fabric.is_global_zero:
             progress(min(state.done, config.samples), config.samples, loss)
         if time.monotonic() - saved > save_every:
@@ -100,10 +101,8 @@ def train_labeler(
     state.save(out / CHECKPOINT)
     network = state.averaged()
     if isinstance(network, DeepLabelCNN):
-        choose_costs(network, names, held_out)
-    card, report = _card(
-        network, held_out[:: -(-len(held_out) // _CARD_FRAMES[config.labeler])], config, dataset
-    )
+        choose_costs(network, names, _few(held_out, _COST_FRAMES))
+    card, report = _card(network, _few(held_out, _CARD_FRAMES[config.labeler]), config, dataset)
     if fabric.is_global_zero:
         card["curve"] = state.history.accuracies
         save_network(out, network, card)
@@ -118,6 +117,11 @@ def _split(dataset: Dataset, batch: int) -> tuple[NDArray[np.void], NDArray[np.v
     if len(rows) - held_out < batch:
         raise DatasetError(f"{dataset.path} has {len(rows)} frames, expected at least {batch + held_out + 1}")
     return rows[:-held_out], rows[-held_out:]
+
+
+def _few(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
+    """Every nth of these rows, at most `count`."""
+    return rows[:: -(-len(rows) // count)]
 
 
 def start_fabric(config: TrainConfig, out: Path) -> Fabric:
