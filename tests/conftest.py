@@ -17,6 +17,11 @@ from handsim.errors import HandSimError
 ROOT = Path(__file__).resolve().parents[1]
 
 
+def pytest_configure() -> None:
+    """Two test processes with two threads each would wait for one another most of the time."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch reads it when it is imported
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20180810)

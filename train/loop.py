@@ -46,6 +46,7 @@ _MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # of each of these evaluations
 _CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # of the last one
+_COST_FRAMES: Final = 400  # for the costs of the paper's network
 
 Progress = Callable[[int, int, float], None]
 """Called with samples done, samples expected, and the loss."""
@@ -133,9 +134,7 @@ class _Run:
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         due = state.done > evaluated and passed(state.done, config, _NUM_EVALUATIONS)
         if due and state.fabric.is_global_zero:
-            state.evaluate(
-                self.held_out[:: -(-len(self.held_out) // _CURVE_FRAMES[config.labeler])], self.names
-            )
+            state.evaluate(_few(self.held_out, _CURVE_FRAMES[config.labeler]), self.names)
         return state.done < config.samples
 
     def step(self) -> float:
@@ -180,9 +179,8 @@ def _finish(run: _Run, dataset: Dataset, out: Path) -> dict[str, Any]:
     config, held_out = run.state.config, run.held_out
     network = run.state.averaged()
     if isinstance(network, DeepLabelCNN):
-        choose_costs(network, run.names, held_out)
-    few = held_out[:: -(-len(held_out) // _CARD_FRAMES[config.labeler])]
-    card, report = _card(network, few, config, dataset)
+        choose_costs(network, run.names, _few(held_out, _COST_FRAMES))
+    card, report = _card(network, _few(held_out, _CARD_FRAMES[config.labeler]), config, dataset)
     if run.state.fabric.is_global_zero:
         card["curve"] = run.state.history.accuracies
         save_network(out, network, card)
@@ -197,6 +195,11 @@ def _split(dataset: Dataset, batch: int) -> tuple[NDArray[np.void], NDArray[np.v
     if len(rows) - held_out < batch:
         raise DatasetError(f"{dataset.path} has {len(rows)} frames, expected at least {batch + held_out + 1}")
     return rows[:-held_out], rows[-held_out:]
+
+
+def _few(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
+    """Every nth of these rows, at most `count`."""
+    return rows[:: -(-len(rows) // count)]
 
 
 def start_fabric(config: TrainConfig, out: Path) -> Fabric:

@@ -6,7 +6,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
@@ -34,12 +33,6 @@ SMALL = [
     "--network.depth",
     "3",
 ]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Two test processes with two threads each would wait for one another most of the time."""
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")

@@ -25,11 +25,6 @@ FIXED = dataclasses.replace(CONFIG, cnn=CNNConfig(reject=0.04, spread=0.005))
 """Without the choice of these two, which takes as long as many steps."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"

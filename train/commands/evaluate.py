@@ -26,6 +26,7 @@ def evaluate(
     labeler: str | None = None,
     occlude: int = 0,
     ghosts: int = 0,
+    every: int = 1,
     seed: int = 0,
     json: Path | None = None,
     threads: int = 1,
@@ -39,6 +40,7 @@ def evaluate(
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
         occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).
         ghosts: Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2).
+        every: Take one frame of this many of captures; 1 takes all.
         seed: Seed of the corruption.
         json: File for the figures.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
@@ -48,22 +50,23 @@ def evaluate(
 
     if occlude < 0 or ghosts < 0:
         raise HandSimError(f"occlude is {occlude} and ghosts {ghosts}, expected 0 or more of each")
-    if seed < 0:
-        raise HandSimError(f"seed is {seed}, expected 0 or more")
+    if seed < 0 or every < 1:
+        raise HandSimError(f"seed is {seed} and every {every}, expected at least 0 and 1")
     label_on(threads)
     are_takes = _are_takes(captures)
     check_outputs((*captures, glove, labeler), [json])
     network = labeler_for_glove(glove, labeler)
     if are_takes:
-        if occlude or ghosts:
+        if occlude or ghosts or every > 1:
             raise HandSimError(
-                "a simulated take has its own gaps and ghosts: leave out --occlude and --ghosts"
+                "a simulated take is counted whole, with its own gaps and ghosts: leave out --occlude, "
+                "--ghosts and --every"
             )
         report = evaluate_takes(network, [load_take(path) for path in captures])
         title = f"{len(captures)} takes, {report.num_frames} frames of one hand"
     else:
         files = find_captures(captures)
-        markers = read_markers(files, network.marker_names)
+        markers = read_markers(files, network.marker_names)[::every]
         corruption = Corruption(occlude, ghosts)
         report = evaluate_labeler(network, markers, corruption, rng=np.random.default_rng(seed))
         title = f"{len(files)} captures, {report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
@@ -76,7 +79,7 @@ def evaluate(
     by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
     _print_report(report.figures, by_marker, title)
     if json is not None:
-        drawn = {"glove": glove, "occlude": occlude, "ghosts": ghosts, "seed": seed}
+        drawn = {"glove": glove, "occlude": occlude, "ghosts": ghosts, "every": every, "seed": seed}
         # JSON has no NaN, which stands where there was nothing to count.
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
         found = {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}

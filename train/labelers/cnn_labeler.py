@@ -15,22 +15,22 @@ from train.labelers.views import MIRROR_IMAGE, MeanHand, spread_views
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from jaxtyping import Bool, Float, Int
+    from jaxtyping import Bool, Float
     from numpy.typing import NDArray
 
-_REJECT: Final = 0.04  # cost of a point without a label before one is chosen [m]
+_SEARCH_REJECT: Final = 0.04  # cost of a point without a label while views are compared [m]
+_REJECT: Final = _SEARCH_REJECT  # in the labels, before one is chosen [m]
 _SPREAD: Final = 0.005  # of the confidence before one is chosen [m]
 _ACCEPTED: Final = 0.01  # mean distance of labeled points from which no further view is tried [m]
 _GHOSTS: Final = 2  # most points without a label then
-_TOGETHER: Final = (1, 2, 5)  # first views of a cloud that are tried at once
+_TOGETHER: Final = (1, 2)  # first views of a cloud that are tried at once, then all others
 _TURNS: Final = 2  # of each first view toward the mean hand
 _IMAGES: Final = 128  # that go through the network at once
 
 
-class _Match(NamedTuple):
-    """One way to label a cloud."""
+class _View(NamedTuple):
+    """How well the markers predicted from one view fit a cloud."""
 
-    labels: Int[np.ndarray, "N"]
     distances: Float[np.ndarray, "N M"]
     """Of the points from the predicted markers [m]."""
     cost: float
@@ -39,7 +39,7 @@ class _Match(NamedTuple):
     """Whether it fits so well that no further view is tried."""
 
 
-_NONE: Final = _Match(np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.inf, False)
+_NONE: Final = _View(np.zeros((0, 0)), np.inf, False)
 
 
 class CNNLabeler:
@@ -74,6 +74,12 @@ class CNNLabeler:
 
     def label_batch(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
         """Label the points [m] of frames that are small enough to go through the network together."""
+        return [
+            label_by_distance(distances, self._reject, self._spread) for distances in self.distances(clouds)
+        ]
+
+    def distances(self, clouds: list[NDArray[np.float64]]) -> list[Float[np.ndarray, "N M"]]:
+        """Distances of the points of each cloud from its predicted markers in the best view [m]."""
         padded, present = pad_clouds(clouds)
         points = padded.astype(np.float64)
         views = self._first_views(points, present)
@@ -83,11 +89,12 @@ class CNNLabeler:
             rows = np.repeat(pending, len(tried))
             predicted = self.predict(points[rows], present[rows], views[pending][:, tried].reshape(-1, 3, 3))
             for row, markers in zip(rows, predicted, strict=True):
-                best[row] = self._better(best[row], markers, points[row, present[row]])
+                view = _compare(points[row, present[row]], markers)
+                best[row] = min(best[row], view, key=lambda each: each.cost)
             pending = pending[[not best[row].accepted for row in pending]]
             if not len(pending):
                 break
-        return [self._labeling(match) for match in best]
+        return [view.distances for view in best]
 
     def _first_views(
         self, points: NDArray[np.float64], present: NDArray[np.bool_]
@@ -126,21 +133,29 @@ class CNNLabeler:
             parts.append(frames.restore(normalized))
         return np.concatenate(parts)
 
-    def _better(self, best: _Match, markers: NDArray[np.float64], points: NDArray[np.float64]) -> _Match:
-        """The cheaper of a match and the best one with these predicted markers (M, 3) [m]."""
-        distances = np.linalg.norm(points[:, None] - markers, axis=-1)
-        labels = match_distances(distances, self._reject)
-        costs = np.where(labels >= 0, distances[np.arange(len(points)), labels], self._reject)
-        labeled = labels >= 0
-        near = len(points) == 0 or (labeled.any() and float(costs[labeled].mean()) <= _ACCEPTED)
-        accepted = bool(near and (~labeled).sum() <= _GHOSTS)
-        match = _Match(labels, distances, float(costs.mean()) if len(costs) else 0.0, accepted)
-        return match if match.cost < best.cost else best
 
-    def _labeling(self, match: _Match) -> Labeling:
-        """Labels, and the weight of each as a share of the weights of all labels of its point."""
-        rejects = np.full((len(match.distances), 1), self._reject)
-        costs = np.concatenate([match.distances, rejects], axis=1)
-        weights = np.exp(-(costs - costs.min(axis=1, keepdims=True)) / self._spread)
-        taken = weights[np.arange(len(weights)), match.labels]  # GHOST, -1, is the last column
-        return Labeling(match.labels, taken / weights.sum(axis=1))
+def _compare(points: NDArray[np.float64], markers: NDArray[np.float64]) -> _View:
+    """How well predicted markers (M, 3) [m] fit points (N, 3) [m]."""
+    distances = np.linalg.norm(points[:, None] - markers, axis=-1)
+    labels = match_distances(distances, _SEARCH_REJECT)
+    labeled = labels >= 0
+    costs = np.where(labeled, distances[np.arange(len(points)), labels], _SEARCH_REJECT)
+    near = len(points) == 0 or (labeled.any() and float(costs[labeled].mean()) <= _ACCEPTED)
+    accepted = bool(near and (~labeled).sum() <= _GHOSTS)
+    return _View(distances, float(costs.mean()) if len(costs) else 0.0, accepted)
+
+
+def label_by_distance(distances: Float[np.ndarray, "N M"], reject: float, spread: float) -> Labeling:
+    """Labels of equation 1, and the weight of each as a share of the weights of all labels of its point.
+
+    Args:
+        distances: Of points from predicted markers [m].
+        reject: Cost of a point without a label [m].
+        spread: Difference of costs at which a weight falls to 1/e [m].
+    """
+    labels = match_distances(distances, reject)
+    rejects = np.full((len(distances), 1), reject)
+    costs = np.concatenate([distances, rejects], axis=1)
+    weights = np.exp(-(costs - costs.min(axis=1, keepdims=True)) / spread)
+    taken = weights[np.arange(len(weights)), labels]  # GHOST, -1, is the last column
+    return Labeling(labels, taken / weights.sum(axis=1))

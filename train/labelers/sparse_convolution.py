@@ -51,8 +51,9 @@ def filter_sparse(images: Float[Tensor, "B 1 S S"], filters: Sequence[nn.Module]
             2x2 max-poolings. Running statistics are updated as the dense layers do while they are trained.
     """
     pictures = images[:, 0].numpy()
-    pixels, count = _number(pictures)
-    values = torch.from_numpy(pictures[pixels >= 0]).view(count, 1)
+    there = pictures != 0.0
+    pixels = np.where(there, np.cumsum(there, dtype=np.int32).reshape(there.shape) - 1, np.int32(-1))
+    values = torch.from_numpy(pictures[there]).view(-1, 1)
     features = SparseFeatures(pixels, values, values.new_zeros(1))
     for layer in filters:
         if isinstance(layer, nn.Conv2d):
@@ -136,20 +137,6 @@ def _pool(features: SparseFeatures) -> SparseFeatures:
     values = torch.cat([features.values, features.values.new_zeros(1, features.values.shape[1])])
     fours = values.index_select(0, torch.from_numpy(sources).view(-1)).view(len(sources), 4, values.shape[1])
     return SparseFeatures(pixels, fours.amax(1), features.background)
-
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _number(pictures: NDArray[np.float32]) -> tuple[NDArray[np.int32], int]:
-    """Rows (B, S, S) of the pixels of (B, S, S) that are not 0, -1 elsewhere; and their number P."""
-    pixels = np.full(pictures.shape, -1, np.int32)
-    count = 0
-    for image in range(len(pictures)):
-        for row in range(pictures.shape[1]):
-            for column in range(pictures.shape[2]):
-                if pictures[image, row, column] != 0.0:
-                    pixels[image, row, column] = count
-                    count += 1
-    return pixels, count
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]

@@ -7,7 +7,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from handsim.app.cli import main
 from handsim.errors import ArgumentError
@@ -31,12 +30,6 @@ from train.simulation.takes import TakeConfig, simulate_take
 
 METHODS = (OURS, PAPERS_LOOP, *NEED_FIRST_LABELS)
 WITH_BODY = "handsim, controller too"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Two test processes with two threads each would wait for one another most of the time."""
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,6 @@ import time
 
 import numpy as np
 import pytest
-import torch
 
 from gloves.attachment import wear
 from gloves.captures.capture import Capture
@@ -36,11 +35,6 @@ from track.user import load_user
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
 FRAMES = 60
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")

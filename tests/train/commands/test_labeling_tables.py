@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from handsim.app.cli import main
 from train.commands import labeling_tables
@@ -15,12 +14,6 @@ from train.labelers.storage import load_labeler
 from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS
 from train.simulation.takes import TakeConfig, simulate_take
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Two test processes with two threads each would wait for one another most of the time."""
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")

@@ -8,20 +8,16 @@ import os
 
 import numpy as np
 import pytest
-import torch
 
-from gloves.captures.formats import read_capture
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.layout import load_layout
 from gloves.takes.take import load_take
 from handsim.app.cli import main
+from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
 
 FRAMES = 60
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Two test processes with two threads each would wait for one another most of the time."""
-    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="module")
@@ -133,12 +129,23 @@ def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsy
     assert found["frames"] == 2 * FRAMES
     assert found["figures"]["slot_accuracy"] > 0.8
     assert set(found["slot_accuracy_by_marker"]) == set(load_take(truth).hands[0].layout.names)
-    for option in (["--occlude", "3"], ["--ghosts", "1"]):
+    for option in (["--occlude", "3"], ["--ghosts", "1"], ["--every", "2"]):
         assert main(["evaluate", str(truth), *option]) == 1
         said = capsys.readouterr().err
-        assert said.count("\n") == 1 and "leave out --occlude and --ghosts" in said
+        assert said.count("\n") == 1 and "leave out --occlude, --ghosts and --every" in said
     assert main(["evaluate", str(truth), str(truth)]) == 0
     assert "2 takes, 240 frames of one hand" in capsys.readouterr().out
+
+
+def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
+    capture, figures = tmp_path / "capture.trc", tmp_path / "figures.json"
+    markers = held_out_markers("dense19", 40, seed=0)
+    write_capture(capture, Capture(load_layout("dense19").names, markers, 100.0))
+    assert main(["evaluate", str(capture), "--every", "15", "--json", str(figures)]) == 0
+    found = json.loads(figures.read_text())
+    assert (found["every"], found["frames"]) == (15, 3)
+    assert main(["evaluate", str(capture), "--every", "0"]) == 1
+    assert "every 0, expected at least 0 and 1" in capsys.readouterr().err
 
 
 def test_a_take_and_a_capture_are_not_measured_together(taken, capsys):

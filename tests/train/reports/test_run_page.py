@@ -36,11 +36,6 @@ def pictures(page: Path) -> list[str]:
     return [base64.b64decode(picture).decode() for picture in found]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
