@@ -15,10 +15,12 @@ from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout, stored_layout
 from handsim.errors import ArgumentError, FileError, HandSimError
 from handsim.files.atomic import atomic_write
+from handsim.files.inputs import read_bytes
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 
 SCHEMA: Final = 1
+_MOST: Final = 1 << 24  # bytes; a user of two hands has 40,000
 _ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
 """The stored arrays of an attachment and their types; indices keep theirs, so that fractions are refused."""
 _DAMAGE: Final = (
@@ -83,9 +85,7 @@ def load_user(path: str | Path) -> tuple[GloveFit, ...]:
     """
     path = Path(path)
     try:
-        content = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read: {error.strerror or error}") from error
+        content = json.loads(read_bytes(path, error=UserError, most=_MOST))
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not a user's file: it is not JSON text") from error
     if not isinstance(content, dict) or "schema" not in content:

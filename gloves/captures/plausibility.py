@@ -39,13 +39,14 @@ class UnitFault(NamedTuple):
         return "; scaled twice?" if self.guess == "meters" else f"; {self.guess}?"
 
 
-def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> UnitFault | None:
+def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> UnitFault | None:
     """What tells that clouds are not in meters, if anything does.
 
     Medians over the frames decide, since strays of a real system lie anywhere.
 
     Args:
         clouds: Points of each frame [m].
+        only_wide: Ask only whether they span more than a room, since they may be parts of one frame.
     """
     shown = [cloud for cloud in clouds if len(cloud) >= _MIN_POINTS]
     step = -(-len(shown) // _SAMPLED) or 1
@@ -55,7 +56,7 @@ def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> UnitFault | None:
     span = float(np.median([np.ptp(cloud, axis=0).max() for cloud in shown]))
     if span > MAX_SPAN:
         return UnitFault(f"the points of a frame span {span:.0f} m", "millimeters")
-    if len(shown) < _MIN_FRAMES:
+    if only_wide or len(shown) < _MIN_FRAMES:
         return None
     if span < _MIN_SPAN:
         return UnitFault(f"the points of a frame span {1e3 * span:.2g} mm", "meters")
@@ -70,16 +71,17 @@ def _spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
     return float(np.median(cKDTree(cloud).query(cloud, k=2)[0][:, 1]))
 
 
-def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> None:
+def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> None:
     """Refuse clouds that are not in meters.
 
     Args:
         clouds: Points of each frame [m].
+        only_wide: See `unit_fault`.
 
     Raises:
         ArgumentError: They cannot be, see `unit_fault`.
     """
-    fault = unit_fault(clouds)
+    fault = unit_fault(clouds, only_wide=only_wide)
     if fault is not None:
         raise ArgumentError(f"{fault.found}, expected a hand in meters{fault.hint}")
 

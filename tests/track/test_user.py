@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 
 import numpy as np
 import pytest
@@ -137,3 +138,9 @@ def test_other_files_are_told(text, tmp_path):
 def test_a_missing_file_is_told(tmp_path):
     with pytest.raises(UserError, match="cannot be read"):
         load_user(tmp_path / "nobody.json")
+
+
+def test_a_pipe_is_no_user(tmp_path):
+    os.mkfifo(tmp_path / "user.json")
+    with pytest.raises(UserError, match="this is a pipe, expected a regular file"):
+        load_user(tmp_path / "user.json")

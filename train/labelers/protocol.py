@@ -95,7 +95,7 @@ def check_clouds(frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[NDArray[np.
         ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points.
     """
     clouds = [_check_cloud(points, number) for number, points in enumerate(frames)]
-    check_unit(clouds)
+    check_unit(clouds, only_wide=True)
     return clouds
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from gloves.layout import load_layout
 from handsim.errors import HandSimError, WeightsError, choices
 from handsim.files.atomic import atomic_write
+from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 from train.labelers.protocol import Labeler, checked_names
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
+_MOST_CARD: Final = 1 << 24  # bytes
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
 
@@ -76,7 +78,7 @@ def _read_network(weights: Path, card: Path) -> tuple[nn.Module, dict[str, Any]]
     from train.labelers.kinds import new_network
 
     try:
-        content = json.loads(card.read_text(encoding="utf-8"))
+        content = json.loads(read_bytes(card, error=WeightsError, most=_MOST_CARD))
         names = checked_names(content["marker_names"])
         config = _CONFIGS[content.get("labeler", "set")](**content["network"])
         if len(names) != config.num_labels:
