@@ -103,6 +103,7 @@ def archive_kind(path: str | Path) -> str:
 
 def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of any kind."""
+    check_regular(path, error=CaptureError)
     if is_growing(path):
         return _read_cut_off(path, kind)
     if not path.exists() and growing_path(path).exists():
@@ -111,7 +112,6 @@ def _read(path: Path, kind: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]
             "running, and can be read"
         )
     try:
-        check_regular(path, error=CaptureError)
         arrays = read_npz(path)
         header = json.loads(_text(arrays["header"]))
         if not isinstance(header, dict):
