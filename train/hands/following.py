@@ -3,7 +3,7 @@
 From both ends of such a stretch, frame by frame: a point that was a hand's a moment ago is that hand's. Each
 hand is labeled among its own points and those of which nothing is known; where both claim one, the more
 confident hand has it. A new point is a hand's own after some frames, and one that a hand does not want is
-free again. Where nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
+free again. Some frames are passed over: the votes of the others decide there (`train.hands.voting`). Where nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 SIDES: Final = (1, -1)
 """Right, left."""
 _KNOWN: Final = 0.5  # value of a point from which on it is a hand's own; 1 at most
-_GUESSED: Final = 0.2  # added in each frame in which a hand claims a point
-_UNWANTED: Final = 0.85  # left of the value of a point that its hand does not claim
+_LABEL_EVERY: Final = 0.02  # [s]
+_GUESSED: Final = 0.3  # added in each labeled frame in which a hand claims a point
+_UNWANTED: Final = 0.7  # left of the value of a point that its hand does not claim
 _MEMORY: Final = 0.5  # time in which a value that nothing confirms fades [s]
 _FEWEST: Final = 4
+_BESIDE: Final = 0.2  # distance within which the points of a second hand are from the first [m]
 _CUT_EVERY: Final = 0.1  # [s]
 _BETTER: Final = 3.0  # points more that cut hands must explain
 _CERTAIN: Final = 0.75  # confidence of a hand of which nothing was known
@@ -74,6 +76,9 @@ class Follower:
         self._links = {1: previous, -1: following_points(previous)}
         self._keep = float(np.exp(-1.0 / (_MEMORY * rate)))
         self._cut_every = max(1, round(_CUT_EVERY * rate))
+        self._label_every = max(1, round(_LABEL_EVERY * rate))
+        self.labeled = np.ones(len(frames), dtype=bool)
+        """Frames that were not passed over."""
 
     def follow(self, settled: Sequence[bool]) -> None:
         """Follow the hands through every stretch of frames that are not settled."""
@@ -106,6 +111,9 @@ class Follower:
         clouds, owners, guesses = [], [], []
         for front in fronts:
             self._carry(front)
+            if front.left % self._label_every:
+                self.labeled[front.frame] = False
+                continue
             points, there = self._frames[front.frame], self._by_side[front.frame]
             known = np.where(np.abs(front.values) >= _KNOWN, np.sign(front.values), 0.0)
             for side in SIDES:
@@ -119,6 +127,8 @@ class Follower:
             if hand is not None and not (guess and self._unlike(hand, side)):
                 claims.setdefault(id(front), {})[side] = hand
         for front in fronts:
+            if not self.labeled[front.frame]:
+                continue
             hands = _settle(claims.get(id(front), {}))
             self._by_side[front.frame].update(hands)
             _learn(front.values, hands)
@@ -169,13 +179,22 @@ class Follower:
         """The points of one side, and near them those of which nothing is known; None if they are too few."""
         mine, free = known == side, known == 0.0
         if mine.sum() < _FEWEST:
-            others = free & ~mine
-            return np.flatnonzero(others) if others.sum() >= self._finder.fewest else None
+            return self._rest(points, free, known == -side)
         if not free.any():
             return np.flatnonzero(mine)
         distance = np.linalg.norm(points[free, None] - points[mine], axis=-1).min(axis=1)
         near = np.flatnonzero(free)[distance <= self._finder.measures.link_distance]
         return np.sort(np.concatenate([np.flatnonzero(mine), near]))
+
+    def _rest(
+        self, points: NDArray[np.float64], free: NDArray[np.bool_], other: NDArray[np.bool_]
+    ) -> NDArray[np.int64] | None:
+        """The points near the other hand of which nothing is known: this hand may be among them."""
+        if other.sum() < _FEWEST or free.sum() < self._finder.fewest:
+            return None
+        distance = np.linalg.norm(points[free, None] - points[other], axis=-1).min(axis=1)
+        near = np.flatnonzero(free)[distance <= _BESIDE]
+        return near if len(near) >= self._finder.fewest else None
 
 
 def _settle(hands: dict[int, FoundHand]) -> dict[int, FoundHand]:

@@ -29,6 +29,7 @@ _LEAST_SHARE: Final = 0.4  # of a hand's markers that must be labeled
 _FEWEST: Final = 5
 _FEW: Final = 4  # points near each other that may be of a hidden hand
 _SPARE: Final = 6  # points beyond a hand's markers from which on a cluster may be two hands
+_SMALLEST: Final = 0.03  # extent of a hand's points [m]
 _MOST: Final = 120  # points of a cluster; larger ones are not hands
 _SHORTER_LINKS: Final = (0.8, 0.65, 0.5)  # at which hands that are close to each other come apart
 _CUTS: Final = 12
@@ -139,10 +140,13 @@ class HandFinder:
             clouds: Points of a frame [m], and which of them.
             criteria: What a hand must satisfy.
         """
-        labelings = self._labeler.label_frames([points[group] for points, group in clouds])
-        found: list[FoundHand | None] = []
-        for (points, group), labeling in zip(clouds, labelings, strict=True):
-            found.append(self._check(points, group, labeling.labels, labeling.confidence, criteria))
+        found: list[FoundHand | None] = [None] * len(clouds)
+        parts = [points[group] for points, group in clouds]
+        large = [number for number, part in enumerate(parts) if _extent(part) >= _SMALLEST]
+        labelings = self._labeler.label_frames([parts[number] for number in large])
+        for number, labeling in zip(large, labelings, strict=True):
+            points, group = clouds[number]
+            found[number] = self._check(points, group, labeling.labels, labeling.confidence, criteria)
         return found
 
     def _check(
@@ -206,3 +210,7 @@ class HandFinder:
 
     def _label_parts(self, points: NDArray[np.float64], parts: Iterable[Group]) -> list[FoundHand | None]:
         return self.label([(points, part) for part in parts], self.certain)
+
+
+def _extent(points: NDArray[np.float64]) -> float:
+    return float(np.ptp(points, axis=0).max()) if len(points) else 0.0

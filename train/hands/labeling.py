@@ -2,6 +2,7 @@
 
 Frames in which the hands stand apart are decided on their own (`train.hands.frame_hands`), all of them vote
 for left and right (`train.hands.sides`), and the other frames follow from these (`train.hands.following`).
+At the end all labels of a point's path vote for its label in each frame (`train.hands.voting`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from train.hands.following import FOLLOWED, Follower
 from train.hands.frame_hands import FoundHand, HandFinder
 from train.hands.links import previous_points
 from train.hands.sides import sides_of
+from train.hands.voting import vote
 from train.labelers.protocol import check_clouds
 
 if TYPE_CHECKING:
@@ -26,8 +28,6 @@ if TYPE_CHECKING:
 
 _CHUNK: Final = 512
 _SPEED, _ACCELERATION = 2.0, 80.0  # of a marker [m/s], [m/s^2]
-_REACH: Final = 1.5  # of a hand for single points, in distances within which most markers are linked
-_GAIN: Final = 0.3  # points more that a hand labeled once more must explain
 _NOISE, _FARTHEST = 0.004, 0.03  # of a step from frame to frame [m]
 
 
@@ -80,45 +80,46 @@ def label_hands(
     )
     sides = sides_of(found, starts, previous)
     by_side = [dict(zip(side, hands, strict=True)) for side, hands in zip(sides, found, strict=True)]
-    Follower(frames, by_side, finder, previous, rate).follow(settled)
-    _complete(frames, by_side, finder)
-    return [_frame_labels(len(points), hands) for points, hands in zip(frames, by_side, strict=True)]
+    follower = Follower(frames, by_side, finder, previous, rate)
+    follower.follow(settled)
+    labels, confidence = _in_a_row(starts, by_side, finder.num_markers)
+    labels, confidence = vote(
+        labels,
+        confidence,
+        np.repeat(follower.labeled, np.diff(starts)),
+        starts,
+        previous,
+        count=2 * finder.num_markers,
+        rate=rate,
+    )
+    ends = list(zip(starts, starts[1:], strict=False))
+    return [_frame_labels(labels[a:b], confidence[a:b], finder.num_markers) for a, b in ends]
 
 
 def _two_best(hands: list[FoundHand]) -> list[FoundHand]:
     return sorted(hands, key=lambda hand: hand.weight, reverse=True)[:2]
 
 
-def _complete(
-    frames: Sequence[NDArray[np.float64]], by_side: list[dict[int, FoundHand]], finder: HandFinder
-) -> None:
-    """Label hands once more together with the points near them that have no label."""
-    clouds, owners = [], []
-    for number, (points, hands) in enumerate(zip(frames, by_side, strict=True)):
-        free = np.ones(len(points), dtype=bool)
-        for hand in hands.values():
-            free[hand.points] = False
-        if not free.any():
-            continue
-        rest = np.flatnonzero(free)
+def _in_a_row(
+    starts: NDArray[np.int64], by_side: Sequence[dict[int, FoundHand]], num_markers: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Label of each point of all frames, those of the left hand after those of the right one; its confidence.
+
+    Of two hands with a point the more confident one has it.
+    """
+    labels, confidence = np.full(starts[-1], -1), np.zeros(starts[-1])
+    for start, hands in zip(starts, by_side, strict=False):
         for side, hand in hands.items():
-            distance = np.linalg.norm(points[rest, None] - points[hand.points], axis=-1).min(axis=1)
-            near = rest[distance <= _REACH * finder.measures.link_distance]
-            if len(near) and len(hand.points) < finder.num_markers:
-                clouds.append((points, np.sort(np.concatenate([hand.points, near]))))
-                owners.append((number, side))
-    for first in range(0, len(clouds), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        for (number, side), found in zip(owners[part], finder.label(clouds[part], FOLLOWED), strict=True):
-            if found is not None and found.weight > by_side[number][side].weight + _GAIN:
-                by_side[number][side] = found
+            here = start + hand.points
+            mine = hand.confidence > confidence[here]
+            labels[here[mine]] = hand.labels[mine] + (num_markers if side < 0 else 0)
+            confidence[here[mine]] = hand.confidence[mine]
+    return labels, confidence
 
 
-def _frame_labels(count: int, hands: dict[int, FoundHand]) -> FrameLabels:
-    """Labels of a frame with `count` points; of two hands with a point the more confident one has it."""
-    sides, labels, confidence = np.zeros(count, dtype=np.int64), np.full(count, -1), np.zeros(count)
-    for side, hand in hands.items():
-        mine = hand.confidence > confidence[hand.points]
-        here = hand.points[mine]
-        sides[here], labels[here], confidence[here] = side, hand.labels[mine], hand.confidence[mine]
-    return FrameLabels(sides, labels, confidence)
+def _frame_labels(
+    labels: NDArray[np.int64], confidence: NDArray[np.float64], num_markers: int
+) -> FrameLabels:
+    there = labels >= 0
+    sides = np.where(there, np.where(labels < num_markers, 1, -1), 0)
+    return FrameLabels(sides, np.where(there, labels % num_markers, -1), confidence)
