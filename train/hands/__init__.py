@@ -5,5 +5,6 @@
 - frame_hands: the hands of single frames, from clusters of points, their labels and that check.
 - sides: left or right, from the frames in which a hand is followed.
 - following: hands that are close to each other, followed from where they stand apart.
+- voting: the labels along a point's path vote for the label in each frame.
 - labeling: the hands of a capture with their labels, over all its frames.
 """

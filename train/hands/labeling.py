@@ -89,7 +89,7 @@ def label_hands(
         np.repeat(follower.labeled, np.diff(starts)),
         starts,
         previous,
-        count=2 * finder.num_markers,
+        num_markers=finder.num_markers,
         rate=rate,
     )
     ends = list(zip(starts, starts[1:], strict=False))

@@ -1,7 +1,8 @@
 """Points vote for their labels along their paths: each label counts in the frames around it as well.
 
-A label that a point has in most of the frames around holds also where the point had none or another one,
-and one that it has in a few of them is dropped.
+A label that a point has in many of the frames around holds also where the point had none or another one,
+and one that it has in a few of them is dropped. Where labels and paths disagree, as in frames that do not
+follow each other in time, no vote is passed on.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ _MARGIN: Final = 5  # of these times, beyond which no vote counts
 _FRAMES: Final = 1024  # that are counted at once
 _NO_LABEL: Final = 0.5  # weight of a frame in which a point has no label
 _SHARE: Final = 0.35  # of the votes that a label needs
+_AGREEING: Final = 0.7  # share of the paths between two frames that must lead from a marker to the same one
 
 
 def vote(
@@ -30,21 +32,23 @@ def vote(
     starts: Int[np.ndarray, "T+1"],
     previous: Int[np.ndarray, "P"],
     *,
-    count: int,
+    num_markers: int,
     rate: float,
 ) -> tuple[Int[np.ndarray, "P"], Float[np.ndarray, "P"]]:
     """The labels of all points after the vote, and the share of the votes that each has.
 
     Args:
-        labels: Label of each point of all frames in a row, -1 for none.
+        labels: Label of each point of all frames in a row, those of the left hand after those of the right
+            one, -1 for none; no two points of a frame have the same.
         confidence: Of each label.
         asked: Whether its frame was labeled; where not, no label says nothing.
         starts: Where each frame starts among the points, and where the last one ends.
         previous: Which point of the frame before each point was, see `train.hands.links.previous_points`.
-        count: Number of labels; no two points of a frame have the same.
+        num_markers: Markers of a hand.
         rate: Frames per second [Hz].
     """
     margin = int(np.ceil(_MARGIN * _FADING * rate))
+    previous = _agreeing(labels % num_markers, labels >= 0, starts, previous)
     elected, shares = np.full(len(labels), -1), np.zeros(len(labels))
     for first in range(0, len(starts) - 1, _FRAMES):
         last = min(first + _FRAMES, len(starts) - 1)
@@ -54,7 +58,7 @@ def vote(
             confidence[low:high],
             np.where(asked[low:high], _NO_LABEL, 0.0),
             previous[low:high] - low,
-            count,
+            2 * num_markers,
             float(np.exp(-1.0 / (_FADING * rate))),
         )
         for begin, end in zip(starts[first:last], starts[first + 1 : last + 1], strict=True):
@@ -64,6 +68,21 @@ def vote(
             elected[begin + points[won]] = chosen[won]
             shares[begin + points[won]] = here[points[won], chosen[won]]
     return elected, shares
+
+
+def _agreeing(
+    names: NDArray[np.int64],
+    named: NDArray[np.bool_],
+    starts: NDArray[np.int64],
+    previous: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """The links (P,) without those to a frame whose labels say otherwise; -1 for none."""
+    frame = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    linked = np.flatnonzero((previous >= 0) & named)
+    linked = linked[named[previous[linked]]]
+    same = linked[names[linked] == names[previous[linked]]]
+    links, agreeing = (np.bincount(frame[some], minlength=len(starts) - 1) for some in (linked, same))
+    return np.where((agreeing < _AGREEING * links)[frame], -1, previous)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
