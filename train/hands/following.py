@@ -3,7 +3,8 @@
 From both ends of such a stretch, frame by frame: a point that was a hand's a moment ago is that hand's. Each
 hand is labeled among its own points and those of which nothing is known; where both claim one, the more
 confident hand has it. A new point is a hand's own after some frames, and one that a hand does not want is
-free again. Some frames are passed over: the votes of the others decide there (`train.hands.voting`). Where nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
+free again. Some frames are passed over: the votes of the others decide there (`train.hands.voting`). Where
+nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
 """
 
 from __future__ import annotations

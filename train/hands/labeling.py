@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from train.hands.following import FOLLOWED, Follower
+from train.hands.following import Follower
 from train.hands.frame_hands import FoundHand, HandFinder
 from train.hands.links import previous_points
 from train.hands.sides import sides_of
@@ -92,8 +93,10 @@ def label_hands(
         num_markers=finder.num_markers,
         rate=rate,
     )
-    ends = list(zip(starts, starts[1:], strict=False))
-    return [_frame_labels(labels[a:b], confidence[a:b], finder.num_markers) for a, b in ends]
+    return [
+        _frame_labels(labels[first:last], confidence[first:last], finder.num_markers)
+        for first, last in pairwise(starts)
+    ]
 
 
 def _two_best(hands: list[FoundHand]) -> list[FoundHand]:
