@@ -7,6 +7,7 @@ and where a part fits a hand, the rest is labeled without that hand, and the han
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -32,6 +33,7 @@ _SPARE: Final = 6  # points beyond a hand's markers from which on a cluster may 
 _SMALLEST: Final = 0.03  # extent of a hand's points [m]
 _MOST: Final = 120  # points of a cluster; larger ones are not hands
 _SHORTER_LINKS: Final = (0.8, 0.65, 0.5)  # at which hands that are close to each other come apart
+_MISSED: Final = 0.02  # share of simulated hands below each criterion for a weak labeler
 _CUTS: Final = 12
 _TRIED: Final = 3  # parts whose rest is labeled
 
@@ -83,7 +85,7 @@ class HandFinder:
         self._labeler = labeler
         self._classifier = SideClassifier(layout, rng=rng)
         self.num_markers = layout.num_markers
-        self.certain = Criteria(self.fewest, 0.75, 0.8, 0.008, 0.3)
+        self.certain = self._certain(rng)
         """A hand without any history."""
         spread = np.arange(_CUTS) + 0.5
         height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
@@ -94,6 +96,29 @@ class HandFinder:
     def fewest(self) -> int:
         """Least number of labeled points of a hand."""
         return max(_FEWEST, int(np.ceil(_LEAST_SHARE * self.num_markers)))
+
+    def _certain(self, rng: np.random.Generator) -> Criteria:
+        """The usual criteria, or milder ones that most simulated hands meet with this labeler."""
+        usual = Criteria(self.fewest, 0.75, 0.8, 0.008, 0.3)
+        seen = rng.permuted(np.tile(np.arange(self.num_markers), (len(self.measures.examples), 1)), axis=1)
+        seen = seen[:, self.num_markers // 6 :]
+        hands = list(np.take_along_axis(self.measures.examples, seen[..., None], axis=1))
+        measured = []
+        for points, labeling in zip(hands, self._labeler.label_frames(hands), strict=True):
+            keep = self.measures.fitting(points, labeling.labels)
+            if keep.sum() >= self.fewest:
+                share = keep.sum() / (labeling.labels >= 0).sum()
+                misfit = self.measures.misfit(points[keep], labeling.labels[keep])
+                measured.append((labeling.confidence[keep].mean(), share, -misfit))
+        if not measured:
+            return usual
+        confidence, share, misfit = np.quantile(measured, _MISSED, axis=0)
+        return dataclasses.replace(
+            usual,
+            confidence=min(usual.confidence, float(confidence)),
+            fitting_share=min(usual.fitting_share, float(share)),
+            misfit=max(usual.misfit, -float(misfit)),
+        )
 
     def find(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[tuple[list[FoundHand], bool]]:
         """The hands of each frame that stand apart, and whether these are all clusters of points.

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _PEOPLE, _POSES = 60, 30
+_EXAMPLES: Final = 180  # hands that are kept
 _CHILDREN: Final = 0.3
 _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)
 _SHARE, _MARGIN = 0.05, 0.005  # by which distances may be beyond those of the simulated hands; [m]
@@ -45,6 +46,8 @@ class HandMeasures:
     def __init__(self, layout: MarkerLayout, *, rng: np.random.Generator) -> None:
         markers = np.concatenate([_sample_markers(layout, rng) for _ in range(_PEOPLE)])
         self.num_markers = layout.num_markers
+        self.examples: NDArray[np.float64] = markers[:: len(markers) // _EXAMPLES]
+        """Markers (E, M, 3) of some of the hands [m]."""
         distances = np.linalg.norm(markers[:, :, None] - markers[:, None], axis=-1)
         self._least: NDArray[np.float64] = distances.min(axis=0) * (1.0 - _SHARE) - _MARGIN
         self._most: NDArray[np.float64] = distances.max(axis=0) * (1.0 + _SHARE) + _MARGIN

@@ -11,6 +11,7 @@ from gloves.layout import load_layout
 from train.evaluation.labeler_evaluation import evaluate_takes
 from train.hands.frame_hands import HandFinder
 from train.hands.labeling import label_hands
+from train.labelers.protocol import Labeling
 from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig, simulate_take
 
@@ -87,3 +88,22 @@ def test_no_frames_and_empty_frames(finder):
     assert label_hands([], finder, 120.0) == []
     (one,) = label_hands([np.zeros((0, 3))], finder, 120.0)
     assert one.hands == (False, False) and one.labels.shape == (0,)
+
+
+class Unsure:
+    """The shipped labeler, half as confident."""
+
+    def __init__(self, labeler):
+        self.marker_names, self._labeler = labeler.marker_names, labeler
+
+    def label_frames(self, frames):
+        labelings = self._labeler.label_frames(frames)
+        return [Labeling(one.labels, 0.5 * one.confidence) for one in labelings]
+
+
+def test_a_labeler_of_little_confidence_finds_hands(finder):
+    rng = np.random.default_rng(0)
+    unsure = HandFinder(Unsure(load_labeler("dense19")), load_layout("dense19"), rng=rng)
+    assert unsure.certain.confidence < 0.5 < finder.certain.confidence == 0.75
+    take = simulate_take(TakeConfig(num_frames=5))
+    assert all(all(one.hands) for one in label_hands(unlabeled_frames(take.capture()), unsure, take.rate))
