@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
+from gloves.captures.capture import Capture
 from gloves.captures.formats import WRITABLE, check_suffix, read_capture, write_capture
 from gloves.captures.markers import labeled_capture, unlabeled_frames
 from gloves.layout import load_layout
@@ -16,10 +18,13 @@ from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
 from handsim.files.outputs import check_outputs
+from train.hands.frame_hands import HandFinder
+from train.hands.labeling import FrameLabels, label_hands
 from train.labelers.storage import labeler_for_glove
 from train.threads import label_on
 
-_SIDE_FRAMES: Final = 100
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 def label(
@@ -29,7 +34,9 @@ def label(
     labeler: str | None = None,
     threads: int = 1,
 ) -> None:
-    """Label every frame of a capture on its own; names and order of its columns are not used.
+    """Label the hands in every frame of a capture: none, one or two; its columns' names are not used.
+
+    Where a frame holds two hands, the columns are called right:ThumbTip and so on, as by handsim track.
 
     Args:
         capture: A .trc, .c3d or Motive .csv file.
@@ -44,34 +51,45 @@ def label(
     network = labeler_for_glove(glove, labeler)
     source = read_capture(capture)
     frames = unlabeled_frames(source)
+    finder = HandFinder(network, load_layout(glove), rng=np.random.default_rng(0))
     with progress_bar("frames") as (bar, task):
-        labelings = []
-        for first in range(0, len(frames), 1024):
-            labelings += network.label_frames(frames[first : first + 1024])
-            bar.update(task, completed=len(labelings), total=len(frames))
-    labels = [labeling.labels for labeling in labelings]
-    write_capture(out, labeled_capture(frames, labels, network.marker_names, source.rate))
-    labeled = sum(int((label >= 0).sum()) for label in labels)
-    points = sum(len(label) for label in labels)
-    confidence = [labeling.confidence[labeling.labels >= 0] for labeling in labelings]
-    sure = f", median confidence {np.median(np.concatenate(confidence)):.3f}" if labeled else ""
-    print_line(
-        f"{out}: {len(frames)} frames, {labeled} of {points} points labeled{sure}"
-        f"{_side(glove, frames, labels)}"
-    )
-    if not labeled:
-        told = (
-            f"no point of {capture} was labeled, expected a hand in glove '{glove}' (--glove names another)"
+        labelings = label_hands(
+            frames,
+            finder,
+            source.rate,
+            progress=lambda done: bar.update(task, completed=done, total=len(frames)),
         )
+    write_capture(out, _labeled(frames, labelings, network.marker_names, source.rate))
+    confidence = [value for one in labelings for value in one.confidence[one.labels >= 0]]
+    points = sum(len(one.labels) for one in labelings)
+    sure = f", median confidence {np.median(confidence):.3f}" if confidence else ""
+    print_line(
+        f"{out}: {len(frames)} frames, {len(confidence)} of {points} points labeled{sure}; "
+        f"{_counts(labelings)}"
+    )
+    if not confidence:
+        told = f"no hand in {capture}, expected hands in glove '{glove}' (--glove names another)"
         warnings.warn(told, HandSimWarning, stacklevel=2)
 
 
-def _side(glove: str, frames: list[np.ndarray], labels: list[np.ndarray]) -> str:
-    """Which hand it probably is, from the frames with the most markers."""
-    from train.labelers.side import SideClassifier
+def _labeled(
+    frames: Sequence[NDArray[np.float64]],
+    labelings: Sequence[FrameLabels],
+    names: tuple[str, ...],
+    rate: float,
+) -> Capture:
+    """The labeled points: plain marker names, or right:ThumbTip and so on if a frame holds two hands."""
+    labels = [one.labels for one in labelings]
+    if any(all(one.hands) for one in labelings):
+        labels = [np.where(one.sides < 0, one.labels + len(names), one.labels) for one in labelings]
+        names = tuple(f"{side}:{name}" for side in ("right", "left") for name in names)
+    return labeled_capture(frames, labels, names, rate)
 
-    best = sorted(range(len(frames)), key=lambda frame: -int((labels[frame] >= 0).sum()))[:_SIDE_FRAMES]
-    classifier = SideClassifier(load_layout(glove), rng=np.random.default_rng(0))
-    sides = [classifier.classify(frames[frame], labels[frame]) for frame in best]
-    votes = sum(clear if side == "right" else -clear for side, clear in sides)
-    return "" if votes == 0.0 else f", a {'right' if votes > 0.0 else 'left'} hand"
+
+def _counts(labelings: Sequence[FrameLabels]) -> str:
+    """How many frames hold how many hands, and which."""
+    right, left = np.array([one.hands for one in labelings], dtype=bool).reshape(-1, 2).T
+    counts = ((right & left, "two hands"), (right & ~left, "a right hand"), (left & ~right, "a left hand"))
+    said = [f"{words} in {there.sum()} frames" for there, words in counts if there.any()]
+    none = (~right & ~left).sum()
+    return ", ".join([*said, f"no hand in {none} frames"] if none or not said else said)

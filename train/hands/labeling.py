@@ -1,0 +1,128 @@
+"""The hands of a capture with their labels: how many each frame holds, and which is left and right.
+
+Frames in which the hands stand apart are decided on their own (`train.hands.frame_hands`), all of them vote
+for left and right (`train.hands.sides`), and the other frames follow from these (`train.hands.following`).
+At the end all labels of a point's path vote for its label in each frame (`train.hands.voting`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from train.hands.following import Follower
+from train.hands.frame_hands import FoundHand, HandFinder
+from train.hands.links import previous_points
+from train.hands.sides import sides_of
+from train.hands.voting import vote
+from train.labelers.protocol import check_clouds
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+    Frames = Sequence[NDArray[np.float64]]
+
+_CHUNK: Final = 512
+_SPEED, _ACCELERATION = 2.0, 80.0  # of a marker [m/s], [m/s^2]
+_NOISE, _FARTHEST = 0.004, 0.03  # of a step from frame to frame [m]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameLabels:
+    """The labels of one frame with any number of hands up to two."""
+
+    sides: Int[np.ndarray, "N"]
+    """1 for a point of a right hand, -1 for one of a left hand, 0 for one of no hand."""
+    labels: Int[np.ndarray, "N"]
+    """Marker of each point, -1 for none."""
+    confidence: Float[np.ndarray, "N"]
+    """Of each label, 0 to 1; 0 for a point without one."""
+
+    @property
+    def hands(self) -> tuple[bool, bool]:
+        """Whether there is a right hand, and a left one."""
+        return bool((self.sides > 0).any()), bool((self.sides < 0).any())
+
+
+def label_hands(
+    frames: Frames, finder: HandFinder, rate: float, *, progress: Callable[[int], None] | None = None
+) -> list[FrameLabels]:
+    """Label the hands of every frame.
+
+    Args:
+        frames: Points of each frame [m].
+        finder: Finds the hands of single frames.
+        rate: Frames per second [Hz].
+        progress: Called with the number of frames that are done.
+
+    Raises:
+        ArgumentError: The points are not in meters, or a frame holds more than 512.
+    """
+    check_clouds(frames)
+    found: list[list[FoundHand]] = []
+    settled: list[bool] = []
+    for first in range(0, len(frames), _CHUNK):
+        for hands, complete in finder.find(frames[first : first + _CHUNK]):
+            found.append(_two_best(hands))
+            settled.append(complete or len(hands) >= 2)
+        if progress is not None:
+            progress(len(found))
+    starts = np.concatenate([[0], np.cumsum([len(points) for points in frames])]).astype(np.int64)
+    previous = previous_points(
+        np.concatenate([np.zeros((0, 3)), *frames]),
+        starts,
+        min(_FARTHEST, _SPEED / rate + _NOISE),
+        min(_FARTHEST, 0.5 * _ACCELERATION / rate**2 + _NOISE),
+    )
+    sides = sides_of(found, starts, previous)
+    by_side = [dict(zip(side, hands, strict=True)) for side, hands in zip(sides, found, strict=True)]
+    follower = Follower(frames, by_side, finder, previous, rate)
+    follower.follow(settled)
+    labels, confidence = _in_a_row(starts, by_side, finder.num_markers)
+    labels, confidence = vote(
+        labels,
+        confidence,
+        np.repeat(follower.labeled, np.diff(starts)),
+        starts,
+        previous,
+        num_markers=finder.num_markers,
+        rate=rate,
+    )
+    return [
+        _frame_labels(labels[first:last], confidence[first:last], finder.num_markers)
+        for first, last in pairwise(starts)
+    ]
+
+
+def _two_best(hands: list[FoundHand]) -> list[FoundHand]:
+    return sorted(hands, key=lambda hand: hand.weight, reverse=True)[:2]
+
+
+def _in_a_row(
+    starts: NDArray[np.int64], by_side: Sequence[dict[int, FoundHand]], num_markers: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Label of each point of all frames, those of the left hand after those of the right one; its confidence.
+
+    Of two hands with a point the more confident one has it.
+    """
+    labels, confidence = np.full(starts[-1], -1), np.zeros(starts[-1])
+    for start, hands in zip(starts, by_side, strict=False):
+        for side, hand in hands.items():
+            here = start + hand.points
+            mine = hand.confidence > confidence[here]
+            labels[here[mine]] = hand.labels[mine] + (num_markers if side < 0 else 0)
+            confidence[here[mine]] = hand.confidence[mine]
+    return labels, confidence
+
+
+def _frame_labels(
+    labels: NDArray[np.int64], confidence: NDArray[np.float64], num_markers: int
+) -> FrameLabels:
+    there = labels >= 0
+    sides = np.where(there, np.where(labels < num_markers, 1, -1), 0)
+    return FrameLabels(sides, np.where(there, labels % num_markers, -1), confidence)

@@ -1,0 +1,98 @@
+"""Points that are near each other: clusters within a frame, and a point in the next frame; compiled."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, Int
+    from numpy.typing import NDArray
+
+
+def clusters(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
+    """Groups of points that are linked by steps of at most `distance` [m], the largest first.
+
+    Args:
+        points: Points of a frame [m].
+        distance: Longest step [m].
+    """
+    number = _single_linkage(points, distance)
+    groups = [np.flatnonzero(number == one) for one in range(int(number.max(initial=-1)) + 1)]
+    return sorted(groups, key=len, reverse=True)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _single_linkage(points: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
+    """Number of the group of each point."""
+    number = np.full(len(points), -1)
+    stack = np.zeros(len(points), dtype=np.int64)
+    groups = 0
+    for first in range(len(points)):
+        if number[first] >= 0:
+            continue
+        number[first], stack[0], height = groups, first, 1
+        while height > 0:
+            height -= 1
+            here = stack[height]
+            for other in range(len(points)):
+                if number[other] < 0 and _squared(points[here], points[other]) <= distance**2:
+                    number[other] = groups
+                    stack[height] = other
+                    height += 1
+        groups += 1
+    return number
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def previous_points(
+    points: Float[np.ndarray, "P 3"], starts: Int[np.ndarray, "T+1"], reach: float, expected_reach: float
+) -> Int[np.ndarray, "P"]:
+    """Which point of the frame before each point was, -1 where none is: the nearest both ways.
+
+    A point that was followed once is expected where its last step leads it.
+
+    Args:
+        points: Points of all frames in a row [m].
+        starts: Where each frame starts among them, and where the last one ends.
+        reach: Longest first step [m].
+        expected_reach: Longest distance from where a point is expected [m].
+    """
+    previous = np.full(len(points), -1)
+    expected = points.copy()
+    reaches = np.full(len(points), reach)
+    for frame in range(1, len(starts) - 1):
+        before, now, end = starts[frame - 1], starts[frame], starts[frame + 1]
+        back = np.full(end - now, -1)
+        nearest = np.full(end - now, reach**2)
+        for old in range(before, now):
+            best, least = -1, reaches[old] ** 2
+            for new in range(now, end):
+                squared = _squared(expected[old], points[new])
+                if squared < least:
+                    best, least = new, squared
+            if best >= 0 and least < nearest[best - now]:
+                back[best - now], nearest[best - now] = old, least
+        for new in range(now, end):
+            old = back[new - now]
+            if old >= 0:
+                previous[new], reaches[new] = old, expected_reach
+                for axis in range(3):
+                    expected[new, axis] = 2.0 * points[new, axis] - points[old, axis]
+    return previous
+
+
+def following_points(previous: Int[np.ndarray, "P"]) -> Int[np.ndarray, "P"]:
+    """Which point of the next frame each point is, -1 where none is; see `previous_points`."""
+    following = np.full(len(previous), -1)
+    linked = np.flatnonzero(previous >= 0)
+    following[previous[linked]] = linked
+    return following
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator]
+def _squared(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    squared: float = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+    return squared
