@@ -63,7 +63,9 @@ def label_hands(
     Raises:
         ArgumentError: The points are not in meters, or a frame holds more than 512.
     """
-    check_clouds(frames)
+    # In an order of their own, so that the columns of a capture do not matter where choices are equally good.
+    orders = [np.lexsort(points.T) for points in check_clouds(frames)]
+    frames = [points[order] for points, order in zip(frames, orders, strict=True)]
     found: list[list[FoundHand]] = []
     settled: list[bool] = []
     for first in range(0, len(frames), _CHUNK):
@@ -94,8 +96,8 @@ def label_hands(
         rate=rate,
     )
     return [
-        _frame_labels(labels[first:last], confidence[first:last], finder.num_markers)
-        for first, last in pairwise(starts)
+        _frame_labels(labels[first:last][back], confidence[first:last][back], finder.num_markers)
+        for (first, last), back in zip(pairwise(starts), map(np.argsort, orders), strict=True)
     ]
 
 
