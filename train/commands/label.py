@@ -53,11 +53,9 @@ def label(
     frames = unlabeled_frames(source)
     finder = HandFinder(network, load_layout(glove), rng=np.random.default_rng(0))
     with progress_bar("frames") as (bar, task):
+        bar.update(task, total=len(frames))
         labelings = label_hands(
-            frames,
-            finder,
-            source.rate,
-            progress=lambda done: bar.update(task, completed=done, total=len(frames)),
+            frames, finder, source.rate, told=lambda count: bar.update(task, advance=count)
         )
     write_capture(out, _labeled(frames, labelings, network.marker_names, source.rate))
     confidence = [value for one in labelings for value in one.confidence[one.labels >= 0]]

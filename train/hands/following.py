@@ -10,7 +10,7 @@ nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -81,11 +81,17 @@ class Follower:
         self.labeled = np.ones(len(frames), dtype=bool)
         """Frames that were not passed over."""
 
-    def follow(self, settled: Sequence[bool]) -> None:
-        """Follow the hands through every stretch of frames that are not settled."""
+    def follow(self, settled: Sequence[bool], told: Callable[[int], None] = lambda count: None) -> None:
+        """Follow the hands through every stretch of frames that are not settled.
+
+        Args:
+            settled: Which frames are.
+            told: Called with the number of frames that were done since the last call.
+        """
         fronts = self._fronts(np.asarray(settled, dtype=bool))
         while fronts:
             self._advance(fronts)
+            told(len(fronts))
             fronts = [front for front in fronts if front.left > 0]
 
     def _fronts(self, settled: NDArray[np.bool_]) -> list[_Front]:

@@ -50,7 +50,7 @@ class FrameLabels:
 
 
 def label_hands(
-    frames: Frames, finder: HandFinder, rate: float, *, progress: Callable[[int], None] | None = None
+    frames: Frames, finder: HandFinder, rate: float, *, told: Callable[[int], None] = lambda count: None
 ) -> list[FrameLabels]:
     """Label the hands of every frame.
 
@@ -58,7 +58,7 @@ def label_hands(
         frames: Points of each frame [m].
         finder: Finds the hands of single frames.
         rate: Frames per second [Hz].
-        progress: Called with the number of frames that are done.
+        told: Called with the number of frames that were done since the last call.
 
     Raises:
         ArgumentError: The points are not in meters, or a frame holds more than 512.
@@ -72,8 +72,7 @@ def label_hands(
         for hands, complete in finder.find(frames[first : first + _CHUNK]):
             found.append(_two_best(hands))
             settled.append(complete or len(hands) >= 2)
-        if progress is not None:
-            progress(len(found))
+        told(sum(settled[first:]))
     starts = np.concatenate([[0], np.cumsum([len(points) for points in frames])]).astype(np.int64)
     previous = previous_points(
         np.concatenate([np.zeros((0, 3)), *frames]),
@@ -84,7 +83,7 @@ def label_hands(
     sides = sides_of(found, starts, previous)
     by_side = [dict(zip(side, hands, strict=True)) for side, hands in zip(sides, found, strict=True)]
     follower = Follower(frames, by_side, finder, previous, rate)
-    follower.follow(settled)
+    follower.follow(settled, told)
     labels, confidence = _in_a_row(starts, by_side, finder.num_markers)
     labels, confidence = vote(
         labels,
