@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -104,7 +103,7 @@ def render_take(
     except KeyboardInterrupt as stop:
         remove_leftovers(out)  # of workers that had no time to
         drawn_so_far = f"{count} of {total} images are in {out}, and the same command goes on after them"
-        raise Stopped(stop.number if isinstance(stop, Stopped) else signal.SIGINT, drawn_so_far) from stop
+        raise Stopped.again(stop, drawn_so_far) from stop
     for name in formats:
         open_writer(name, _folder(out, formats, name)).finish()
     lost = frozenset(left_out_frames(out))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import signal
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -167,8 +166,8 @@ class _Run:
         except KeyboardInterrupt as stop:
             self.state.save(checkpoint)
             done, expected = self.state.done, self.state.config.samples
-            raise Stopped(
-                stop.number if isinstance(stop, Stopped) else signal.SIGINT,
+            raise Stopped.again(
+                stop,
                 f"{min(done, expected)} of {expected} samples are kept in {checkpoint}, and the same command "
                 "goes on after them",
             ) from stop

@@ -28,6 +28,11 @@ class Stopped(KeyboardInterrupt):
         self.number = number
         self.kept = kept
 
+    @classmethod
+    def again(cls, stop: KeyboardInterrupt, kept: str) -> Stopped:
+        """The same signal, with what is kept."""
+        return cls(stop.number if isinstance(stop, Stopped) else signal.SIGINT, kept)
+
 
 class InterruptFlag:
     """Whether a signal to end came; called, it answers."""

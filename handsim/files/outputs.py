@@ -20,9 +20,9 @@ def check_outputs(inputs: Iterable[str | Path | None], outputs: Iterable[Path | 
         ArgumentError: An output is one of the inputs.
     """
     read = [Path(name) for name in inputs if name is not None]
-    for output in outputs:
-        for source in read if output is not None else ():
-            if output is not None and _same(source, output):
+    for output in (path for path in outputs if path is not None):
+        for source in read:
+            if _same(source, output):
                 raise ArgumentError(f"the output {output} is the input {source}, expected another file")
 
 

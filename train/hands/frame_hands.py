@@ -218,13 +218,8 @@ class HandFinder:
         first = [hand for hand in self._label_parts(points, parts) if hand is not None]
         first = sorted(first, key=lambda hand: hand.weight, reverse=True)[:_TRIED]
         second = self._label_parts(points, (np.setdiff1d(group, hand.points) for hand in first))
-        again = self._label_parts(
-            points,
-            (
-                group if other is None else np.setdiff1d(group, other.points)
-                for other in second
-            ),
-        )  # fmt: skip
+        rests = [group if other is None else np.setdiff1d(group, other.points) for other in second]
+        again = self._label_parts(points, rests)
         best: list[FoundHand] = []
         for hand, other, improved in zip(first, second, again, strict=True):
             larger = hand if improved is None or improved.weight < hand.weight else improved

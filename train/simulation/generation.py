@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import signal
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -117,10 +116,8 @@ def generate_dataset(
 def _stopped(stop: KeyboardInterrupt, out: Path, done: int, expected: int) -> Stopped:
     """The same signal, with what is kept."""
     remove_leftovers(out)  # of workers that had no time to
-    number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
-    return Stopped(
-        number, f"{done} of {expected} frames are in {out}, and the same command goes on after them"
-    )
+    kept = f"{done} of {expected} frames are in {out}, and the same command goes on after them"
+    return Stopped.again(stop, kept)
 
 
 def _check_space(config: DatasetConfig, out: Path, num_markers: int) -> None:
