@@ -179,9 +179,17 @@ class GatingConfig(_Settings):
     """Tests of labels that go along with IDs (`track.association.label_consistency`)."""
 
     gate: float = 16.0
-    """Squared Mahalanobis distance beyond which a label is dropped: four standard deviations."""
+    """Squared Mahalanobis distance beyond which a point is not fitted: four standard deviations."""
     prediction_spread: float = 0.004
-    """Standard deviation of a predicted marker beside its own spread [m]."""
+    """Least standard deviation of a predicted marker beside its own spread [m]."""
+    prediction_factor: float = 2.0
+    """The same as a multiple of what the hand's other markers show in this frame."""
+    exchange_margin: float = 8.0
+    """Log-odds from which on two labels are exchanged; systems rarely exchange IDs."""
+    exchange_distance: float = 0.04
+    """Distance of two points within which their IDs may be exchanged [m]."""
+    exchange_spread: float = 0.002
+    """Least standard deviation of the offset of two predicted markers [m]."""
     fit_spread: float = 0.0015
     """Standard deviation of a fitted marker beside its own spread [m]."""
     most_gated: float = _share(0.3)
@@ -281,23 +289,23 @@ class TrackConfig(_Settings):
 
 
 @dataclass(frozen=True)
-class QueryConfig(_Settings):
-    """Queries to the labeler on points without a label (`track.association.labeler_queries`)."""
+class ReviewConfig(_Settings):
+    """Reviews of a hand's labels by the labeler (`track.association.labeler_review`)."""
 
     radius: float = 0.06
-    """Distance from a hand's markers within which points are shown to the labeler [m]."""
-    first_age: float = 0.05
-    """Age of a point before the first query [s]; most strays are gone by then."""
-    next_age_factor: float = 3.0
-    """Factor of a point's age between two queries."""
-    rate: float = 0.9
-    """Queries per second in the long run [1/s]; one takes longer than the rest of a frame."""
-    burst: float = 6.0
-    """Queries that can be saved up."""
-    most_log_odds: float = 12.0
-    """Largest log-odds that the answers on one point sum up to."""
-    most_answer_log_odds: float = 4.0
-    """Largest log-odds of one answer."""
+    """Distance from a missing marker within which points without a label are shown to the labeler [m]."""
+    first_wait: float = 0.01
+    """Time from a review that changed something to the next one [s]."""
+    wait_factor: float = 1.6
+    """Factor of that time after each review that changed nothing."""
+    longest_wait: float = 0.25
+    """Longest time between two reviews [s]."""
+    seen_elsewhere: float = _any_sign(-2.0)
+    """Log probability that a point is a marker that the track saw elsewhere while this one was visible."""
+    margin: float = 8.0
+    """Log-odds by which the labeler's labels must be likelier than those of the track."""
+    most_answer_log_odds: float = 7.0
+    """Largest log-odds that the labeler's confidence in a label contributes."""
 
 
 @dataclass(frozen=True)
@@ -325,8 +333,8 @@ class TrackerConfig(_Settings):
     """Tests of labels that go along with IDs."""
     association: AssociationConfig = AssociationConfig()
     """Association of new points with markers."""
-    queries: QueryConfig = QueryConfig()
-    """Queries to the labeler."""
+    review: ReviewConfig = ReviewConfig()
+    """Reviews of labels by the labeler."""
     initialization: InitializationConfig = InitializationConfig()
     """Hands without any history."""
     track: TrackConfig = TrackConfig()

@@ -16,11 +16,11 @@ from gloves.fit import GloveFit
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 from track.association.frame_state import FrameState
-from track.association.hand_state import Estimate, HandState
+from track.association.hand_state import Estimate, HandState, Prediction
 from track.association.initialization import HandInitializer, InitializedHand
-from track.association.label_consistency import fit_labels, gate_labels, targets_of
+from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, targets_of
 from track.association.label_new_points import HandTrack, label_new_points
-from track.association.labeler_queries import LabelerQueries
+from track.association.labeler_review import LabelerReview
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
 from track.intake import IncomingFrame, Intake
@@ -56,7 +56,7 @@ class Tracker:
         self._bodies = [BodyTracker(body) for body in bodies]
         self._states = [HandState(hand, config) for hand in hands]
         self._initializer = HandInitializer(self._states, labeler, config)
-        self._queries = LabelerQueries(labeler, config.queries)
+        self._review = LabelerReview(labeler, len(hands), config)
         sizes = [state.num_markers for state in self._states]
         self._first = np.cumsum([0, *sizes, *(len(body.marker_names) for body in bodies)])
         self._labels: dict[int, tuple[int, float]] = {}  # label and evidence of each ID
@@ -129,7 +129,7 @@ class Tracker:
 
     def _associate(self, frame: FrameState) -> dict[int, Estimate]:
         """Predict the hands that have a pose, test and complete their labels, and fit their poses."""
-        hands = []
+        predictions: dict[int, Prediction] = {}
         for index, state in enumerate(self._states):
             labels = frame.labels[index]
             if (labels >= 0).sum() < self.config.track.fewest_labels and self._coasted_out(state, frame.time):
@@ -137,12 +137,16 @@ class Tracker:
             if state.qpos is None:
                 labels[:] = -1
                 continue
-            prediction = state.predict(frame.time)
+            predictions[index] = state.predict(frame.time)
+        self._exchange(frame, predictions)
+        hands = []
+        for index, prediction in predictions.items():
+            state, labels = self._states[index], frame.labels[index]
             gate_labels(state, frame.points, labels, prediction, self.config.gating)
             estimate = fit_labels(state, frame.points, labels, prediction, self.config.gating)
             hands.append(HandTrack(index, state, prediction, estimate))
         before = frame.labels.copy()
-        confidence = label_new_points(hands, frame, self._queries.log_odds(hands, frame))
+        confidence = label_new_points(hands, frame)
         changed = np.isfinite(confidence)
         frame.evidence[changed], frame.confidence[changed] = 0.0, confidence[changed]
         estimates = {}
@@ -151,7 +155,30 @@ class Tracker:
             if (labels != before[hand.index]).any():
                 estimate = fit_labels(hand.state, frame.points, labels, hand.prediction, self.config.gating)
             estimates[hand.index] = estimate
+            proposal = self._review.review(hand, estimates[hand.index], frame)
+            if proposal is not None:
+                changed = (proposal.labels != labels) & (proposal.labels >= 0)
+                frame.evidence[changed], frame.confidence[changed] = 0.0, proposal.confidence[changed]
+                labels[:], estimates[hand.index] = proposal.labels, proposal.estimate
         return estimates
+
+    def _exchange(self, frame: FrameState, predictions: dict[int, Prediction]) -> None:
+        """Exchange labels of points whose IDs the system has exchanged."""
+        if not predictions:
+            return
+        indices = list(predictions)
+        first = self._first[indices, None]
+        own = frame.labels[indices]
+        assigned = np.where(own >= 0, own + first, -1).max(axis=0, initial=-1)
+        positions = np.full((self._first[len(self._states)], 3), np.nan)
+        for index, prediction in predictions.items():
+            positions[self._first[index] : self._first[index + 1]] = prediction.positions
+        changed = exchange_labels(frame.points, assigned, positions, self.config.gating)
+        if len(changed):
+            frame.evidence[changed] = 0.0
+            frame.confidence[changed] = 0.5
+            last = self._first[np.array(indices) + 1, None]
+            frame.labels[indices] = np.where((assigned >= first) & (assigned < last), assigned - first, -1)
 
     def _coasted_out(self, state: HandState, time: float) -> bool:
         """Whether a pose is too old to be predicted on."""
@@ -224,6 +251,7 @@ class Tracker:
         labels[among] = hand.labels
         targets = targets_of(frame.points, labels, state.num_markers)
         estimate = state.initialize(hand.fit.qpos[0], targets, frame.time)
+        self._review.restart(hand.index, frame.time)
         return _tracked(state, Status.INITIALIZED, frame.points, labels, estimate)
 
 

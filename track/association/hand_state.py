@@ -33,6 +33,8 @@ class Prediction(NamedTuple):
 
     qpos: Float[np.ndarray, "27"]
     """The predicted pose."""
+    positions: Float[np.ndarray, "M 3"]
+    """Its markers in the world [m]."""
     joint_prior: JointPrior
     """Distribution of the hinges."""
     wrist_spread: tuple[float, float]
@@ -121,7 +123,7 @@ class HandState:
             motion.wrist_rotation_spread + 0.5 * motion.wrist_angular_acceleration * span**2,
         )
         joint_prior = predict_joints(moved[7:], self._joint_covariance, span, motion)
-        return Prediction(moved, joint_prior, wrist_spread)
+        return Prediction(moved, self.solver.marker_positions(moved), joint_prior, wrist_spread)
 
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
@@ -212,7 +214,8 @@ class HandState:
         self._velocity[:] = 0.0
         self._last_seen[:] = time
         self.confirmed[:] = False
-        unknown = Prediction(qpos, self._resting_prior, (1.0, 1.0))
+        positions = self.solver.marker_positions(qpos)
+        unknown = Prediction(qpos, positions, self._resting_prior, (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
         if not (self._bias_frames.any() and estimate.rms < noise.bias_reuse_rms):
             self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0

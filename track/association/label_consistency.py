@@ -1,11 +1,11 @@
-"""Tests of the labels that go along with IDs: gating by the predicted pose, then by the fitted one.
+"""Tests of the labels that go along with IDs: exchanged ones, gating by the predicted pose, then by the fit.
 
 Labels are indices into the hand's layout; -1 is a point that is none of its markers.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from track.config import GatingConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
+
+
+_MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
 
 
 def targets_of(
@@ -40,7 +43,8 @@ def gate_labels(
 ) -> None:
     """Drop labels whose points are outside the gate around their markers at the predicted pose.
 
-    Where that concerns too many labels, the prediction is wrong, and all labels stay.
+    The gate is as wide as the innovations of the hand's other markers in this frame are large. Where too many
+    labels are outside, the prediction is wrong, and all labels stay.
 
     Args:
         state: The hand.
@@ -50,12 +54,57 @@ def gate_labels(
         config: The gate.
     """
     labeled = np.flatnonzero(labels >= 0)
-    positions = state.solver.marker_positions(prediction.qpos)
-    innovation = ((points[labeled] - positions[labels[labeled]]) ** 2).sum(axis=1)
-    variance = state.variance[labels[labeled]] + config.prediction_spread**2
-    gated = labeled[innovation > config.gate * variance]
+    if len(labeled) == 0:
+        return
+    squares = ((points[labeled] - prediction.positions[labels[labeled]]) ** 2).sum(axis=1)
+    shown = config.prediction_factor**2 * np.median(squares) / _MEDIAN_SQUARE
+    variance = state.variance[labels[labeled]] + max(config.prediction_spread**2, shown)
+    gated = labeled[squares > config.gate * variance]
     if len(gated) <= config.most_gated * len(labeled):
         labels[gated] = -1
+
+
+def exchange_labels(
+    points: Float[np.ndarray, "N 3"],
+    assigned: Int[np.ndarray, "N"],
+    positions: Float[np.ndarray, "K 3"],
+    config: GatingConfig,
+) -> Int[np.ndarray, "E"]:
+    """Exchange the labels of two points where that explains both much better.
+
+    A motion that the prediction misses moves both points alike and cancels in the comparison.
+
+    Args:
+        points: The frame's points [m].
+        assigned: Marker of each point, -1 for none; overwritten.
+        positions: Predicted positions of the markers [m].
+        config: The margin.
+
+    Returns:
+        The points whose label has changed.
+    """
+    changed: list[int] = []
+    labeled = np.flatnonzero(assigned >= 0)
+    if len(labeled) < 2:
+        return np.array(changed, dtype=np.int64)
+    seen, markers = points[labeled], positions[assigned[labeled]]
+    offsets = seen - markers
+    offsets -= np.median(offsets, axis=0)
+    shown = config.prediction_factor**2 * np.median((offsets**2).sum(axis=1)) / _MEDIAN_SQUARE
+    variance = max(config.exchange_spread**2, shown)
+    # What an exchange of i and j gains: (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2).
+    cross = seen @ markers.T
+    own = np.diag(cross)
+    gains = (cross + cross.T - own[:, None] - own) / variance
+    apart = ((seen[:, None] - seen) ** 2).sum(axis=-1) > config.exchange_distance**2
+    gains[apart] = 0.0
+    while gains.max() > config.exchange_margin:
+        one, other = np.unravel_index(gains.argmax(), gains.shape)
+        pair = labeled[[one, other]]
+        assigned[pair] = assigned[pair[::-1]]
+        changed += pair.tolist()
+        gains[[one, other]], gains[:, [one, other]] = 0.0, 0.0
+    return np.array(changed, dtype=np.int64)
 
 
 def fit_labels(

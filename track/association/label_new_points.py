@@ -8,7 +8,7 @@ reassigned.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -41,15 +41,12 @@ class HandTrack:
     """The pose fitted to the labels that IDs carried over."""
 
 
-def label_new_points(
-    hands: Sequence[HandTrack], frame: FrameState, queried: Mapping[int, Float[np.ndarray, "P M"]]
-) -> Float[np.ndarray, "P"]:
+def label_new_points(hands: Sequence[HandTrack], frame: FrameState) -> Float[np.ndarray, "P"]:
     """Label points without a label, and reassign labels that are not settled.
 
     Args:
         hands: The hands that have a pose.
         frame: The frame; its `labels` are overwritten.
-        queried: Log-odds of labels from the labeler's answers, for some hands.
 
     Returns:
         Confidence in each label that has changed; NaN for the others.
@@ -58,7 +55,7 @@ def label_new_points(
     if not hands:
         return confidence
     for hand in hands:
-        _label_palm(hand, frame, queried, confidence)
+        _label_palm(hand, frame, confidence)
     table = _marker_table(hands, frame)
     association = hands[0].state.config.association
     candidates = find_candidates(frame.points, frame.evidence, table, len(hands) * len(DIGITS), association)
@@ -71,7 +68,7 @@ def label_new_points(
         digits = slice(row * len(DIGITS), (row + 1) * len(DIGITS))
         own = DigitCandidates(*(values[digits] for values in candidates))
         rows = DigitHypotheses(*(values[digits] for values in hypotheses))
-        _evaluate_hand(hand, frame, own, markers[digits] - first, queried, rows)
+        _evaluate_hand(hand, frame, own, markers[digits] - first, rows)
         first += hand.state.num_markers
     before, margins = table.assigned.copy(), np.full(len(frame.points), np.nan)
     assign_jointly(candidates, hypotheses, markers, table.assigned, margins)
@@ -84,7 +81,6 @@ def label_new_points(
 def _label_palm(
     hand: HandTrack,
     frame: FrameState,
-    queried: Mapping[int, NDArray[np.float64]],
     confidence: NDArray[np.float64],
 ) -> None:
     """Match unlabeled points with the missing markers of a palm; labels and confidence are overwritten."""
@@ -103,8 +99,6 @@ def _label_palm(
         hand.state.config.association.stray_density,
     )
     log_odds += hand.state.presence_log_odds(frame.first_seen[free])[:, palm]
-    if hand.index in queried:
-        log_odds += queried[hand.index][free[:, None], palm]
     matched, match_confidence = match_points(log_odds)
     chosen = free[matched >= 0]
     labels[chosen], confidence[chosen] = palm[matched[matched >= 0]], match_confidence[matched >= 0]
@@ -136,7 +130,6 @@ def _evaluate_hand(
     frame: FrameState,
     candidates: DigitCandidates,
     markers: NDArray[np.int64],
-    queried: Mapping[int, NDArray[np.float64]],
     hypotheses: DigitHypotheses,
 ) -> None:
     """Evaluate the hypotheses of one hand's digits, which are filled."""
@@ -145,8 +138,6 @@ def _evaluate_hand(
     state, labels = hand.state, frame.labels[hand.index]
     log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(labels >= 0)
     log_odds[labeled, labels[labeled]] = frame.evidence[labeled]
-    if hand.index in queried:
-        log_odds += queried[hand.index]
     confirmed, unconfirmed = state.digit_models(hand.prediction, hand.estimate)
     for digit in np.flatnonzero(candidates.counts):
         evaluate_digit(

@@ -12,7 +12,7 @@ from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
 from poses.motion.motions import sample_motion
 from track.association.hand_state import HandState, Prediction
-from track.association.label_consistency import fit_labels, gate_labels, targets_of
+from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, targets_of
 from track.config import GatingConfig
 
 RATE = 120.0
@@ -97,6 +97,44 @@ def test_few_labels_may_be_dropped_at_once(hand, motion, markers):
         points[:many] += [0.0, 0.0, 0.06]
         gate_labels(state, points, labels, prediction, GATING)
         assert (labels < 0).sum() == gone
+
+
+def test_the_gate_is_as_wide_as_the_whole_hand_is_off(hand, motion, markers):
+    """A hand that speeds up is no reason to drop labels."""
+    state, prediction = followed(hand, motion, markers, 20)
+    points = markers[20] + [0.012, 0.0, 0.0]
+    points[[4, 5, 6]] += [0.02, 0.0, 0.0]  # and a finger with it
+    labels = np.arange(19)
+    gate_labels(state, points, labels, prediction, GATING)
+    np.testing.assert_array_equal(labels, np.arange(19))
+    points[6] += [0.15, 0.0, 0.0]
+    gate_labels(state, points, labels, prediction, GATING)
+    assert np.flatnonzero(labels < 0).tolist() == [6]
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.02])
+@pytest.mark.parametrize("pair", [(3, 6), (6, 9), (9, 12), (5, 8), (0, 1)])
+def test_exchanged_labels_are_exchanged_back_also_while_the_hand_speeds_up(
+    hand, motion, markers, pair, moved
+):
+    _, prediction = followed(hand, motion, markers, 20)
+    points = markers[20] + [0.0, moved, 0.0]
+    assigned = np.arange(19)
+    assert exchange_labels(points, assigned, prediction.positions, GATING).size == 0
+    near = np.linalg.norm(points[pair[0]] - points[pair[1]]) < GATING.exchange_distance
+    assigned[list(pair)] = pair[::-1]
+    changed = exchange_labels(points, assigned, prediction.positions, GATING)
+    assert sorted(changed) == (list(pair) if near else [])
+    if near:
+        np.testing.assert_array_equal(assigned, np.arange(19))
+
+
+def test_exchanges_need_two_labels(hand, motion, markers):
+    _, prediction = followed(hand, motion, markers, 20)
+    for assigned in (np.full(19, -1), np.where(np.arange(19) == 3, 3, -1)):
+        before = assigned.copy()
+        assert exchange_labels(markers[20], assigned, prediction.positions, GATING).size == 0
+        np.testing.assert_array_equal(assigned, before)
 
 
 def planted(points: np.ndarray, wrong: int, off: float, seed: int) -> np.ndarray:

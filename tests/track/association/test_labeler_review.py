@@ -1,0 +1,125 @@
+"""Reviews of a hand's labels by the labeler."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from handsim.hand.model import join_qpos
+from poses.shapes.validity import resting_angles
+from track.association.frame_state import FrameState
+from track.association.hand_state import HandState
+from track.association.label_new_points import HandTrack
+from track.association.labeler_review import LabelerReview
+from track.config import TrackerConfig
+from train.labelers.protocol import Labeling
+from train.labelers.storage import load_labeler
+
+TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
+RATE = 120.0
+
+
+class CountingLabeler:
+    """The shipped labeler, which counts the times it is asked."""
+
+    def __init__(self):
+        self._labeler = load_labeler("dense19")
+        self.marker_names = self._labeler.marker_names
+        self.times = 0
+
+    def label_frames(self, frames) -> list[Labeling]:
+        self.times += 1
+        return self._labeler.label_frames(frames)
+
+
+@pytest.fixture
+def state() -> HandState:
+    """A hand that was followed for half a second at rest, its markers 1 mm off at random."""
+    user = nominal_fit(load_layout("dense19"), "M", "right")
+    state, rng = HandState(user), np.random.default_rng(0)
+    qpos = join_qpos(resting_angles(user.model)[None])[0]
+    target = state.solver.marker_positions(qpos)
+    state.initialize(qpos, target, 0.0)
+    for frame in range(1, 60):
+        prediction = state.predict(frame / RATE)
+        seen = target + 0.001 * rng.standard_normal(target.shape)
+        state.update(state.fit(seen, prediction.qpos, prediction), np.ones(19, dtype=bool), frame / RATE)
+    return state
+
+
+def frame_of(points, labels, time, *, ids=None, first_seen=0.0) -> FrameState:
+    count = len(points)
+    numbers = np.arange(count) if ids is None else ids
+    seen = np.full(count, first_seen)
+    return FrameState(points, numbers, labels[None].copy(), np.zeros(count), np.ones(count), seen, time)
+
+
+def reviewed(review: LabelerReview, state: HandState, frame: FrameState):
+    """The result of a review, and the estimate it started from."""
+    prediction = state.predict(frame.time)
+    targets = np.full((19, 3), np.nan)
+    labels = frame.labels[0]
+    targets[labels[labels >= 0]] = frame.points[labels >= 0]
+    estimate = state.fit(targets, prediction.qpos, prediction)
+    return review.review(HandTrack(0, state, prediction, estimate), estimate, frame)
+
+
+def test_exchanged_labels_are_found_and_right_ones_stay(state):
+    points = state.solver.marker_positions(state.qpos)
+    labeler = CountingLabeler()
+    review = LabelerReview(labeler, 1, TrackerConfig())
+    assert reviewed(review, state, frame_of(points, np.arange(19), 0.5)) is None
+    assert labeler.times == 1
+    wrong = np.arange(19)
+    wrong[[TIP, OTHER_TIP]] = OTHER_TIP, TIP
+    found = reviewed(review, state, frame_of(points, wrong, 1.0))
+    np.testing.assert_array_equal(found.labels, np.arange(19))
+    np.testing.assert_allclose(found.estimate.positions, points, atol=0.002)
+    assert found.confidence.min() > 0.5
+
+
+def test_a_marker_that_waits_gets_its_label_and_a_ghost_does_not(state):
+    points = state.solver.marker_positions(state.qpos)
+    labels = np.arange(19)
+    labels[TIP] = -1
+    found = reviewed(
+        LabelerReview(CountingLabeler(), 1, TrackerConfig()), state, frame_of(points, labels, 0.5)
+    )
+    np.testing.assert_array_equal(found.labels, np.arange(19))
+    ghost = points.copy()
+    ghost[TIP] += [0.0, 0.0, 0.03]
+    again = LabelerReview(CountingLabeler(), 1, TrackerConfig())
+    assert reviewed(again, state, frame_of(ghost, labels, 0.5, first_seen=0.5)) is None
+
+
+def test_reviews_become_rarer_until_a_new_point_comes(state):
+    points = state.solver.marker_positions(state.qpos)
+    labeler = CountingLabeler()
+    review = LabelerReview(labeler, 1, TrackerConfig())
+    for frame in range(240):
+        reviewed(review, state, frame_of(points, np.arange(19), 0.5 + frame / RATE))
+    assert 8 <= labeler.times <= 20
+    labels = np.arange(19)
+    labels[TIP] = -1
+    ghost, before = points.copy(), labeler.times
+    ghost[TIP] += [0.0, 0.0, 0.03]
+    for number, new in ((100, True), (100, False), (101, True)):
+        ids = np.where(labels < 0, number, np.arange(19))
+        reviewed(review, state, frame_of(ghost, labels, 2.5, ids=ids))
+        assert (labeler.times > before) == new
+        before = labeler.times
+
+
+def test_a_hand_that_was_initialized_is_reviewed_in_the_next_frame(state):
+    points, labeler = state.solver.marker_positions(state.qpos), CountingLabeler()
+    review = LabelerReview(labeler, 1, TrackerConfig())
+    for frame in range(120):
+        reviewed(review, state, frame_of(points, np.arange(19), 0.5 + frame / RATE))
+    before = labeler.times
+    review.restart(0, 1.5)
+    reviewed(review, state, frame_of(points, np.arange(19), 1.5))
+    assert labeler.times == before
+    reviewed(review, state, frame_of(points, np.arange(19), 1.5 + 2 / RATE))
+    assert labeler.times == before + 1
