@@ -175,6 +175,22 @@ class PresenceConfig(_Settings):
 
 
 @dataclass(frozen=True)
+class LinkingConfig(_Settings):
+    """Numbers of points where the stream's own IDs do not last (`track.association.point_linking`)."""
+
+    lasting_share: float = _share(0.5)
+    """Share of the last frame's IDs that must be there again for the stream's IDs to be used."""
+    first_distance: float = 0.04
+    """Distance of a point from its predicted position before hands are aligned [m]."""
+    next_distance: float = 0.025
+    """The same after that [m]."""
+    last_distance: float = 0.015
+    """The same after hands were aligned twice [m]."""
+    fewest_aligned: int = 5
+    """Points with which a hand is aligned."""
+
+
+@dataclass(frozen=True)
 class GatingConfig(_Settings):
     """Tests of labels that go along with IDs (`track.association.label_consistency`)."""
 
@@ -329,6 +345,8 @@ class TrackerConfig(_Settings):
     """Measurement model: spread and bias of markers."""
     presence: PresenceConfig = PresenceConfig()
     """When markers come back, and how long strays live."""
+    linking: LinkingConfig = LinkingConfig()
+    """Numbers of points in streams without lasting IDs."""
     gating: GatingConfig = GatingConfig()
     """Tests of labels that go along with IDs."""
     association: AssociationConfig = AssociationConfig()

@@ -21,6 +21,7 @@ from track.association.initialization import HandInitializer, InitializedHand
 from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, targets_of
 from track.association.label_new_points import HandTrack, label_new_points
 from track.association.labeler_review import LabelerReview
+from track.association.point_linking import PointLinker
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
 from track.intake import IncomingFrame, Intake
@@ -56,6 +57,7 @@ class Tracker:
         self._bodies = [BodyTracker(body) for body in bodies]
         self._states = [HandState(hand, config) for hand in hands]
         self._initializer = HandInitializer(self._states, labeler, config)
+        self._linker = PointLinker(config.linking)
         self._review = LabelerReview(labeler, len(hands), config)
         sizes = [state.num_markers for state in self._states]
         self._first = np.cumsum([0, *sizes, *(len(body.marker_names) for body in bodies)])
@@ -98,7 +100,8 @@ class Tracker:
         return tuple(bodies), labels
 
     def _frame_state(self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float) -> FrameState:
-        """The frame with the labels and the evidence that its IDs carry over."""
+        """The frame with the labels and the evidence that its points carry over."""
+        ids = self._linker.number(points, ids, self._labels, lambda: self._predict_points(time))
         known = [self._labels.get(point, (-1, 0.0)) for point in ids.tolist()]
         carried = np.array([label for label, _ in known], dtype=np.int64)
         first = self._first[: len(self._states) + 1, None]
@@ -109,6 +112,16 @@ class Tracker:
         first_seen = np.array([self._first_seen.get(point, time) for point in ids.tolist()])
         confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
         return FrameState(points, ids, labels, evidence, confidence, first_seen, time)
+
+    def _predict_points(self, time: float) -> dict[int, tuple[int, NDArray[np.float64]]]:
+        """Hand and predicted position of the points that had a label in the last frame."""
+        positions = [None if state.qpos is None else state.predict(time).positions for state in self._states]
+        predicted = {}
+        for number, (label, _) in self._labels.items():
+            hand = int(np.searchsorted(self._first, label, side="right")) - 1
+            if hand < len(positions) and (own := positions[hand]) is not None:
+                predicted[number] = hand, own[label - self._first[hand]]
+        return predicted
 
     def _track_hands(self, frame: FrameState) -> tuple[tuple[TrackedHand, ...], NDArray[np.int64]]:
         """Every hand, and the labels (P,) of points, counted through the hands."""

@@ -21,8 +21,9 @@ from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.calibration.user_calibration import Calibration, CalibrationError, calibrate_hands
-from track.capture_tracking import track_capture
-from track.commands.user_options import BOTH, Size, uncalibrated_users
+from track.capture_tracking import capture_frames, track_capture
+from track.commands.user_options import BOTH, Size, measured_users, users_of
+from track.hand_size import sample_frames
 from track.tracker import Tracker
 from track.user import save_user
 from train.labelers.protocol import Labeler
@@ -41,7 +42,7 @@ def calibrate(
     *,
     out: Path,
     glove: str = "dense19",
-    size: Size = "M",
+    size: Size = "auto",
     hands: tuple[Side, ...] = BOTH,
     labeler: str | None = None,
 ) -> None:
@@ -54,21 +55,23 @@ def calibrate(
         capture: A .trc, .c3d or Motive .csv file of half a minute or more; its names are not used.
         out: The user's file, .json, for handsim track --shape.
         glove: Marker layout: a shipped name or the path of a .toml file.
-        size: The size nearest to the hands.
+        size: The size nearest to the hands; auto measures it in the capture.
         hands: Which hands are in the capture.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
     """
     if out.suffix.lower() != ".json":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .json")
     check_outputs((capture, glove, labeler), [out])
-    start = uncalibrated_users(glove, size, hands)
-    source = read_capture(capture)
+    start = users_of(glove, size, None, hands)
+    source, words = read_capture(capture), f"size {size}"
     network = labeler_for_glove(glove, labeler)
+    if size == "auto":
+        start, words = measured_users(glove, hands, sample_frames(list(capture_frames(source))), network)
     take, done = _round(source, start, start, network)
     if _leaves_markers(take, done):
         known = [calibration.hand for calibration in done]
         take, done = _round(source, known, start, network)
-    save_user(out, [one.hand for one in done], f"calibrated from {capture.name}, size {size} to begin with")
+    save_user(out, [one.hand for one in done], f"calibrated from {capture.name}, {words} to begin with")
     print_line(f"{out}: {len(done)} hands in glove {glove}, from {take.num_frames} frames")
     for hand in start:
         report = [line for one in done if one.hand.side == hand.side for line in _report(one)]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
+from itertools import chain
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
 
 from gloves.takes.tracked_take import TrackedTake
 from handsim.app.interrupts import interrupt_flag
@@ -16,6 +19,9 @@ from track.live_recording import LiveRecorder
 from track.streams.point_stream import PointStream, StreamedFrame, open_stream
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
+
+_MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
+_LONGEST_WAIT: Final = 10.0  # [s] for them
 
 
 class TrackedSource(NamedTuple):
@@ -34,17 +40,35 @@ class TrackedSource(NamedTuple):
         return self.take.num_frames == self.num_frames
 
 
+class Start(Protocol):
+    """Makes a tracker."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What makes the take, as JSON; complete once the tracker is made."""
+        ...
+
+    def __call__(self, frames: Sequence[StreamedFrame]) -> Tracker:
+        """The tracker; its hands are measured in some frames, if there are any."""
+        ...
+
+
 def track_live(
-    url: str, seconds: float | None, tracker: Tracker, out: Path, settings: dict[str, Any]
+    url: str,
+    seconds: float | None,
+    start: Start,
+    out: Path,
+    *,
+    fewest_points: float | None,
 ) -> TrackedSource:
     """Track and record a stream until time is up or a signal ends it.
 
     Args:
         url: The address of a NatNet server.
         seconds: How long to record [s]; None for as long as it comes.
-        tracker: A tracker that has not seen a frame.
+        start: Makes the tracker, from the first frames if there is something to be measured in them.
         out: The take's file; until its end the recording is beside it.
-        settings: What makes the take, as JSON.
+        fewest_points: Points of a frame in which something can be measured; None where nothing is.
 
     Raises:
         CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
@@ -52,12 +76,15 @@ def track_live(
     with (
         interrupt_flag() as interrupted,  # the frames so far are kept
         closing(open_stream(url, ended=interrupted)) as stream,
-        LiveRecorder(tracker, out, settings) as recorder,
         LiveStatus() as status,
+        ExitStack() as stack,
     ):
+        first = [] if fewest_points is None else _first_frames(stream, fewest_points, seconds, status)
+        tracker = start([frame for frame in first if len(frame.points) >= (fewest_points or 0)])
+        recorder = stack.enter_context(LiveRecorder(tracker, out, start.settings))
         status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
         try:
-            _record(track_stream(stream, tracker), seconds, recorder, stream, status)
+            _record(track_stream(chain(first, stream), tracker), seconds, recorder, stream, status)
             status.show(f"writing {out}", now=True)
             take, step = recorder.finish(
                 stream_counts(stream),
@@ -67,6 +94,27 @@ def track_live(
             status.say(f"the recording is kept in {recorder.part}")
             raise
         return TrackedSource(take, recorder.num_frames, _notes(stream, step))
+
+
+def _first_frames(
+    stream: PointStream, fewest_points: float, seconds: float | None, status: LiveStatus
+) -> list[StreamedFrame]:
+    """The first frames of a stream, until there were enough points for a second, or ten seconds are over."""
+    frames: list[StreamedFrame] = []
+    began = shown = np.inf
+    status.show("waiting for hands, to measure their size")
+    for frame in stream:
+        now = perf_counter()
+        if frame.silent and frames:
+            break
+        if not frame.silent:
+            frames.append(frame)
+            began = min(began, now)
+        if len(frame.points) >= fewest_points:
+            shown = min(shown, now)
+        if now >= min(began + min(_LONGEST_WAIT, seconds or np.inf), shown + _MEASURED):
+            break
+    return frames
 
 
 def _record(

@@ -27,10 +27,12 @@ from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import track_capture, warm_up
+from track.capture_tracking import capture_frames, track_capture, warm_up
 from track.commands.live import TrackedSource, track_live
-from track.commands.user_options import BOTH, Size, calibrated_users, uncalibrated_users
+from track.commands.user_options import Size, measured_users, users_of
 from track.evaluation.take_summary import summarize, suspicions
+from track.hand_size import sample_frames
+from track.streams.point_stream import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
@@ -39,6 +41,7 @@ from train.labelers.storage import labeler_for_glove
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
+_SHOWN: Final = 0.8  # share of one hand's markers in a frame in which its size can be measured
 _TIMED: Final = 100_000  # frames whose computing time is kept
 
 
@@ -65,7 +68,8 @@ def track(
             or the end of the terminal ends it. Frames are written as they come, to OUT.part until then.
         seconds: How long to record a live stream [s].
         glove: Marker layout: a shipped name or the path of a .toml file; its labeler is used.
-        size: Size of the hands; M when neither this nor --shape is given.
+        size: Size of the hands; auto, which is the default, measures it in the capture or in the first second
+            of a stream.
         shape: The user's file from handsim calibrate: hands and gloves.
         hands: Which hands to track; both, or those of --shape, when not given.
         body: A rigid body to track beside the hands, once per body: a .toml file, see handsim body, or one of
@@ -76,26 +80,24 @@ def track(
     """
     _check_options(capture, live, seconds, out, labeled)
     check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
-    if shape is None:
-        user = uncalibrated_users(glove, size or "M", BOTH if hands is None else hands)
-    else:
-        user = calibrated_users(shape, glove, size, hands)
+    user = users_of(glove, size, shape, hands)
     bodies = load_bodies(body)
     source = None if capture is None else read_capture(capture)
-    network = labeler_for_glove(glove, labeler)
+    start = _Start(user, labeler_for_glove(glove, labeler), bodies, glove)
+    start.settings.update(
+        capture=live if capture is None else capture.name,
+        glove=glove,
+        user=size or "auto" if shape is None else shape.name,
+        labeler=labeler or glove,
+    )
     with Console(stderr=True).status("getting ready"):
-        warm_up(user, network)
-        timed = TimedTracker(user, network, bodies)
-    settings = {
-        "capture": live if capture is None else capture.name,
-        "glove": glove,
-        "user": size or "M" if shape is None else shape.name,
-        "labeler": labeler or glove,
-    }
+        warm_up(user, start.labeler)
+    measures = shape is None and size in (None, "auto")
     if source is None:
-        tracked = track_live(str(live), seconds, timed, out, settings)
+        fewest = _SHOWN * user[0].layout.num_markers if measures else None
+        tracked = track_live(str(live), seconds, start, out, fewest_points=fewest)
     else:
-        tracked = _track_file(source, timed, out, settings)
+        tracked = _track_file(source, start, out, measures=measures)
     if labeled is not None:
         write_capture(labeled, labeled_points(tracked.take if tracked.whole else load_tracked_take(out)))
     rate, frames = tracked.take.rate, tracked.num_frames
@@ -103,11 +105,40 @@ def track(
     for line in (
         *tracked.notes,
         *summarize(tracked.take),
-        f"{1e3 * np.median(timed.seconds):.2f} ms per frame",
+        f"{1e3 * np.median(start.seconds):.2f} ms per frame",
     ):
         print_line(line)
     for suspicion in suspicions(tracked.take):
         warnings.warn(suspicion, HandSimWarning, stacklevel=2)
+
+
+class _Start:
+    """Makes the tracker of a command, which measures its computing time.
+
+    Args:
+        user: The user's hands, as far as they are known.
+        labeler: Labeler of their glove.
+        bodies: Rigid bodies beside the hands.
+        glove: Marker layout of hands that are measured.
+    """
+
+    def __init__(
+        self, user: Sequence[GloveFit], labeler: Labeler, bodies: Sequence[RigidTemplate], glove: str
+    ) -> None:
+        self._user, self.labeler, self._bodies, self._glove = user, labeler, bodies, glove
+        self.settings: dict[str, Any] = {}
+        """What makes the take, as JSON."""
+        self.seconds: deque[float] = deque(maxlen=_TIMED)
+        """Computing time of each of the last frames [s]."""
+
+    def __call__(self, frames: Sequence[StreamedFrame]) -> Tracker:
+        """The tracker; its hands are measured in some frames, if there are any."""
+        if frames:
+            sides = [hand.side for hand in self._user]
+            self._user, words = measured_users(self._glove, sides, frames, self.labeler)
+            self.settings["user"] = f"auto, {words}"
+            print_line(f"size of the hands: {words}")
+        return TimedTracker(self._user, self.labeler, self._bodies, self.seconds)
 
 
 class TimedTracker(Tracker):
@@ -117,20 +148,24 @@ class TimedTracker(Tracker):
         hands: The user's hands, each side at most once.
         labeler: Labeler of the hands' glove.
         bodies: Rigid bodies beside the hands.
+        seconds: Takes the computing time of each frame [s].
     """
 
     def __init__(
-        self, hands: Sequence[GloveFit], labeler: Labeler, bodies: Sequence[RigidTemplate] = ()
+        self,
+        hands: Sequence[GloveFit],
+        labeler: Labeler,
+        bodies: Sequence[RigidTemplate],
+        seconds: deque[float],
     ) -> None:
         super().__init__(hands, labeler, bodies)
-        self.seconds: deque[float] = deque(maxlen=_TIMED)
-        """Computing time of each of the last frames [s]."""
+        self._seconds = seconds
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
         """Track the next frame, see `Tracker.step`."""
         start = perf_counter()
         frame = super().step(points, ids, time)
-        self.seconds.append(perf_counter() - start)
+        self._seconds.append(perf_counter() - start)
         return frame
 
 
@@ -160,14 +195,16 @@ def _check_options(
         check_suffix(labeled, WRITABLE)
 
 
-def _track_file(source: Capture, timed: TimedTracker, out: Path, settings: dict[str, Any]) -> TrackedSource:
+def _track_file(source: Capture, start: _Start, out: Path, *, measures: bool) -> TrackedSource:
     """Track a capture and write the take."""
+    with Console(stderr=True).status("measuring the hands"):
+        tracker = start(sample_frames(list(capture_frames(source))) if measures else ())
     with progress_bar("frames") as (bar, task):
         take = track_capture(
             source,
-            timed,
+            tracker,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    take = dataclasses.replace(take, settings={**take.settings, **settings})
+    take = dataclasses.replace(take, settings={**take.settings, **start.settings})
     take.save(out)
     return TrackedSource(take, take.num_frames)

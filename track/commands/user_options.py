@@ -2,26 +2,85 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.hand.topology import Side
+from track.hand_size import fit_size
+from track.streams.point_stream import StreamedFrame
 from track.user import load_user
+from train.labelers.protocol import Labeler
 
-Size = Literal["XS", "S", "M", "L", "XL"]
+Size = Literal["auto", "XS", "S", "M", "L", "XL"]
+USUAL_SIZE: Final = "M"
+"""The size of hands that could not be measured."""
 BOTH: Final[tuple[Side, ...]] = ("right", "left")
 
 
-def uncalibrated_users(glove: str, size: Size, hands: Sequence[Side]) -> tuple[GloveFit, ...]:
+def users_of(
+    glove: str, size: Size | None, shape: Path | None, hands: tuple[Side, ...] | None
+) -> tuple[GloveFit, ...]:
+    """Hands as a command's options name them; of the usual size where it is to be measured.
+
+    Args:
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        size: The option --size.
+        shape: The option --shape, a user's file.
+        hands: Sides; both, or all of the file, when None.
+
+    Raises:
+        UserError: The file cannot be read.
+        LayoutError: The glove is unknown or does not fit.
+        ArgumentError: Size and file are both given, or the file has no such hand or another glove.
+    """
+    if shape is not None:
+        return calibrated_users(shape, glove, size, hands)
+    named = USUAL_SIZE if size is None or size == "auto" else size
+    return uncalibrated_users(glove, named, BOTH if hands is None else hands)
+
+
+def measured_users(
+    glove: str, hands: Sequence[Side], frames: Sequence[StreamedFrame], labeler: Labeler
+) -> tuple[tuple[GloveFit, ...], str]:
+    """Hands of the size that fits some frames, in a glove as designed.
+
+    Args:
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        hands: Their sides.
+        frames: Frames of unlabeled points.
+        labeler: Labeler of the glove.
+
+    Returns:
+        The hands, and their size in words. Hands that are not found get the usual size, with a warning.
+
+    Raises:
+        LayoutError: The glove is unknown or does not fit.
+        ArgumentError: A hand is given twice, or none is.
+    """
+    _check_hands(hands)
+    layout = load_layout(glove)
+    size = fit_size(frames, layout, hands, labeler)
+    if size is None:
+        warnings.warn(
+            f"no hand was found to measure its size; size {USUAL_SIZE} is used (--size names another)",
+            HandSimWarning,
+            stacklevel=3,
+        )
+        return uncalibrated_users(glove, USUAL_SIZE, hands), USUAL_SIZE
+    return size.hands(layout, hands), str(size)
+
+
+def uncalibrated_users(glove: str, size: str, hands: Sequence[Side]) -> tuple[GloveFit, ...]:
     """Hands of one size in a glove as designed.
 
     Args:
         glove: Marker layout: a shipped name or the path of a .toml file.
-        size: Size of the hands.
+        size: Size of the hands: XS, S, M, L or XL.
         hands: Their sides.
 
     Raises:

@@ -114,12 +114,34 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     assert f"{unlabeled} of " in lines[3]
 
 
+def test_the_size_of_the_hands_is_measured(capture, tmp_path, capsys):
+    out = tmp_path / "tracked.npz"
+    assert main(["track", str(capture), "--out", str(out)]) == 0
+    said = capsys.readouterr().out.splitlines()[0]
+    length, breadth = (int(word) for word in said.removeprefix("size of the hands: ")[:-3].split(" x "))
+    truth, take = load_take(capture.with_suffix(".truth.npz")), load_tracked_take(out)
+    assert length == pytest.approx(1e3 * truth.hands[0].fit.shape.length, abs=12)
+    assert 0.4 < breadth / length < 0.5
+    assert take.settings["user"] == f"auto, {length} x {breadth} mm"
+    assert np.nanmedian(take.rms) < 0.005
+
+
+def test_hands_that_are_not_there_get_the_usual_size(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    path, out = tmp_path / "clutter.trc", tmp_path / "out.npz"
+    write_capture(path, Capture(tuple(f"U{n}" for n in range(30)), rng.uniform(-1, 1, (60, 30, 3)), 120.0))
+    main(["track", str(path), "--out", str(out)])
+    assert "no hand was found to measure its size; size M is used" in capsys.readouterr().err
+
+
 def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
     truth = load_take(capture.with_suffix(".truth.npz"))
     wand, out, labeled = tmp_path / "wand.toml", tmp_path / "take.npz", tmp_path / "labeled.c3d"
     assert main(["body", str(capture.with_suffix(".truth.npz")), "--out", str(wand)]) == 0
     assert capsys.readouterr().out == f"{wand}: controller, 6 markers, at most 99.9 mm apart\n"
     asked = [
+        "--size",
+        "L",
         "--hands",
         "right",
         "--body",
@@ -194,8 +216,10 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys):
     assert (take.status[-1] != LOST).all()
     told = capsys.readouterr()
     assert "right hand: tracked" in told.out and "missing" not in told.out
+    assert told.out.startswith("size of the hands: ") and take.settings["user"].startswith("auto, ")
+    assert told.err.splitlines()[0] == "waiting for hands, to measure their size"
     assert (
-        told.err.splitlines()[0] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
+        told.err.splitlines()[1] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
     )
 
 
@@ -223,7 +247,7 @@ def test_a_kill_leaves_all_but_the_last_second(capture, tmp_path):
     points, ids = np.tile(take.points, (40, 1, 1)), np.tile(take.ids, (40, 1))
     with ReplayServer(points, ids, 120.0) as server:
         run = "import sys; from handsim.app.cli import main; main(sys.argv[1:])"
-        live = ["track", "--live", server.url, "--out", str(out)]
+        live = ["track", "--live", server.url, "--size", "M", "--out", str(out)]
         process = subprocess.Popen([sys.executable, "-c", run, *live], stderr=subprocess.DEVNULL)
         part = tmp_path / "live.npz.part"
         while process.poll() is None and not (part.exists() and GrownArchive(part).num_frames > 60):

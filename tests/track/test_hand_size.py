@@ -1,0 +1,77 @@
+"""The size of hands, measured in frames of unlabeled points."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.fit import attach
+from gloves.layout import load_layout
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
+from poses.motion.motions import sample_motion
+from track.hand_size import fit_size, sample_frames, usual_breadth
+from track.streams.point_stream import StreamedFrame
+from train.labelers.storage import load_labeler
+
+RATE = 120.0
+
+
+def frames_of(shapes, *, seed: int, noise: float = 0.0015, seconds: float = 1.0) -> list[StreamedFrame]:
+    """Unlabeled points of moving hands, as noisy as those of real gloves, in an order of their own."""
+    rng, layout = np.random.default_rng(seed), load_layout("dense19")
+    clouds = []
+    for number, shape in enumerate(shapes):
+        model = HandModel(shape)
+        motion = sample_motion(model, seconds, rng=rng).qpos
+        place = np.tile([0.4 * number, 0.0, 1.0], (len(motion), 1))
+        qpos = join_qpos(motion[:, 7:], position=place)
+        fit = attach(layout, model)
+        clouds.append(fit.attachment.centers(model, model.forward_kinematics(qpos)))
+    points = np.concatenate(clouds, axis=1)
+    points += noise * rng.standard_normal(points.shape)
+    order = rng.permutation(points.shape[1])
+    return [StreamedFrame(t, t / RATE, cloud[order], order) for t, cloud in enumerate(points)]
+
+
+@pytest.mark.parametrize("length", [0.135, 0.15, 0.175, 0.2, 0.215])
+def test_lengths_from_children_to_the_longest_are_found(length):
+    shape = shape_from_measures(length, usual_breadth(length))
+    found = fit_size(frames_of([shape], seed=1), load_layout("dense19"), ["right"], load_labeler("dense19"))
+    assert found.length == pytest.approx(length, abs=0.004)
+    assert found.breadth == pytest.approx(usual_breadth(length), abs=0.005)
+    assert found.rms < 0.003
+    (hand,) = found.hands(load_layout("dense19"), ["right"])
+    assert hand.shape.length == pytest.approx(found.length) and hand.side == "right"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_hands_of_other_proportions_have_one_size(seed):
+    shape = sample_shape(ADULTS, rng=np.random.default_rng(seed))
+    frames = frames_of([shape, shape.with_side("left")], seed=seed)
+    found = fit_size(frames, load_layout("dense19"), ["right", "left"], load_labeler("dense19"))
+    assert found.length == pytest.approx(shape.length, abs=0.012)
+    assert str(found) == f"{1e3 * found.length:.0f} x {1e3 * found.breadth:.0f} mm"
+
+
+def test_frames_without_a_hand_have_no_size():
+    rng = np.random.default_rng(0)
+    clutter = [StreamedFrame(t, t / RATE, rng.uniform(-1.0, 1.0, (30, 3)), np.arange(30)) for t in range(60)]
+    layout, labeler = load_layout("dense19"), load_labeler("dense19")
+    assert fit_size(clutter, layout, ["right", "left"], labeler) is None
+    assert fit_size([], layout, ["right"], labeler) is None
+
+
+def test_the_usual_breadth_is_that_of_the_five_sizes_and_goes_on():
+    for length, breadth in SIZES.values():
+        assert usual_breadth(1e-3 * length) == pytest.approx(1e-3 * breadth)
+    assert usual_breadth(0.13) / 0.13 == pytest.approx(72.0 / 165.0)
+    assert usual_breadth(0.22) > usual_breadth(0.21)
+
+
+def test_parts_of_a_long_capture_are_consecutive_and_reach_its_end():
+    frames = [StreamedFrame(t, t / RATE, np.zeros((0, 3)), np.arange(0)) for t in range(1000)]
+    numbers = np.array([frame.number for frame in sample_frames(frames)])
+    assert numbers[0] == 0 and numbers[-1] == 999 and len(numbers) == 240
+    assert (np.diff(numbers) != 1).sum() == 3
+    assert sample_frames(frames[:50]) == frames[:50]

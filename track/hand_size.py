@@ -1,0 +1,156 @@
+"""The size of a user's hands from a few labeled frames: the length and breadth that the markers fit best.
+
+Hands of mean proportions are tried; what else is different about a user, `track.calibration` finds out from a
+longer capture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from gloves.fit import GloveFit, attach
+from gloves.layout import MarkerLayout
+from handsim.hand.model import HandModel
+from handsim.hand.shape import SIZES, shape_from_measures
+from handsim.hand.topology import Side
+from track.kinematics.pose_solver import PoseSolver
+from track.streams.point_stream import StreamedFrame
+from track.tracked_frame import Status
+from track.tracker import Tracker
+from train.labelers.protocol import Labeler
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] hands to find the labels with, the likeliest first
+_SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longest in ANSUR II
+_BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
+_FAR: Final = 0.012  # [m] from the length that the labels were found with
+_PRECISION: Final = 0.001  # [m] of length
+_FRAMES: Final = 8  # of each hand that are fitted
+_FEWEST: Final = 3  # frames with which a size is trusted
+_MISSING: Final = 0.2  # share of the markers at most in such a frame
+_FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
+_PATIENCE: Final = 20  # frames without a hand after which another size is tried
+_WINDOWS: Final = 4  # parts of a capture that are looked at
+_WINDOW: Final = 60  # frames of each
+
+
+class SizeFit(NamedTuple):
+    """The size of a user's hands."""
+
+    length: float
+    """Hand length [m]."""
+    breadth: float
+    """Hand breadth [m]."""
+    rms: float
+    """Median RMS distance of the markers from hands of this size [m]."""
+
+    def __str__(self) -> str:
+        return f"{1e3 * self.length:.0f} x {1e3 * self.breadth:.0f} mm"
+
+    def hands(self, layout: MarkerLayout, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
+        """Hands of this size in a glove as designed."""
+        return tuple(_hand(self.length, self.breadth, layout, side) for side in sides)
+
+
+def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
+    """Parts of a capture for `fit_size`, of consecutive frames each: beginning, end and two between."""
+    if len(frames) <= _WINDOWS * _WINDOW:
+        return list(frames)
+    starts = np.linspace(0, len(frames) - _WINDOW, _WINDOWS).astype(int)
+    return [frame for start in starts for frame in frames[start : start + _WINDOW]]
+
+
+def fit_size(
+    frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
+) -> SizeFit | None:
+    """The size of the hands in some frames.
+
+    Args:
+        frames: Frames of unlabeled points, as `sample_frames` gives, or the beginning of a stream.
+        layout: The glove that the hands wear.
+        sides: Which hands.
+        labeler: Labeler of the glove.
+
+    Returns:
+        The size, the same for both hands; None if no hand is found that shows most of its markers.
+    """
+    for length in _LENGTHS:
+        size = _fit_from(length, frames, layout, sides, labeler)
+        if size is not None and abs(size.length - length) > _FAR:  # the labels are better with its own size
+            size = _fit_from(size.length, frames, layout, sides, labeler) or size
+        if size is not None:
+            return size
+    return None
+
+
+def _fit_from(
+    length: float,
+    frames: Sequence[StreamedFrame],
+    layout: MarkerLayout,
+    sides: Sequence[Side],
+    labeler: Labeler,
+) -> SizeFit | None:
+    """The size of hands that are labeled as hands of a length [m]."""
+    users = [_hand(length, usual_breadth(length), layout, side) for side in sides]
+    markers = {side: some for side, some in _label(frames, users, labeler) if len(some) >= _FEWEST}
+    return _search(markers, layout) if markers else None
+
+
+def usual_breadth(length: float) -> float:
+    """The breadth of hands of a length [m]: that of the five sizes, and in proportion beyond them."""
+    lengths, breadths = 1e-3 * np.array(sorted(SIZES.values())).T
+    inside = float(np.clip(length, lengths[0], lengths[-1]))
+    return float(np.interp(inside, lengths, breadths)) * length / inside
+
+
+def _hand(length: float, breadth: float, layout: MarkerLayout, side: Side) -> GloveFit:
+    """A hand of mean proportions in a glove as designed; length and breadth in [m]."""
+    return attach(layout, HandModel(shape_from_measures(length, breadth, side=side)))
+
+
+def _label(
+    frames: Sequence[StreamedFrame], users: Sequence[GloveFit], labeler: Labeler
+) -> Iterator[tuple[Side, Float[np.ndarray, "F M 3"]]]:
+    """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them."""
+    tracker, count = Tracker(users, labeler), users[0].layout.num_markers
+    found: list[list[NDArray[np.float64]]] = [[] for _ in users]
+    for number, frame in enumerate(frames):
+        if number == _PATIENCE and not any(found):
+            break
+        for hand, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
+            if hand.status in _FITTED and len(hand.filled) <= _MISSING * count:
+                markers = hand.markers.copy()
+                markers[hand.filled] = np.nan
+                some.append(markers)
+    for user, some in zip(users, found, strict=True):
+        chosen = np.linspace(0, len(some) - 1, min(_FRAMES, len(some))).astype(int)
+        yield user.side, np.array([some[row] for row in chosen]).reshape(-1, count, 3)
+
+
+def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> SizeFit:
+    """The length and breadth with the least RMS distance: length, then breadth, then length again."""
+
+    def rms(length: float, breadth: float) -> float:
+        fits = [
+            PoseSolver(_hand(length, breadth, layout, side)).solve(some).rms for side, some in markers.items()
+        ]
+        return float(np.median(np.concatenate(fits)))
+
+    length = _least(lambda tried: rms(tried, usual_breadth(tried)), _SHORTEST, _LONGEST)
+    usual = usual_breadth(length)
+    breadth = _least(lambda tried: rms(length, tried), _BREADTHS[0] * usual, _BREADTHS[1] * usual)
+    length = _least(lambda tried: rms(tried, breadth), 0.95 * length, 1.05 * length)
+    return SizeFit(length, breadth, rms(length, breadth))
+
+
+def _least(function: Callable[[float], float], low: float, high: float) -> float:
+    """The argument between two bounds [m] with the least value of a function."""
+    result = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": _PRECISION})
+    return float(result.x)
