@@ -41,7 +41,7 @@ class SetLabelerConfig:
             _check_count(name, getattr(self, name), low, high)
         if self.width % self.gates:
             raise ArgumentError(f"gates is {self.gates}, expected a divisor of width, {self.width}")
-        check_number("reach", self.reach, 0.0, 10.0, above=True)
+        check_number("reach", self.reach, 0.001, 10.0)
 
 
 _SIZES: Final = {  # least and greatest; a network beyond these would not fit into memory

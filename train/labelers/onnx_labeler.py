@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import warnings
 from dataclasses import asdict, fields
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from torch import nn
 
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
+_DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros
 _CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
 _IMAGES: Final = "images"  # its input
 _INPUTS: Final = "points", "present"
@@ -56,9 +58,10 @@ class OnnxLabeler:
         options.log_severity_level = 4
         options.add_session_config_entry("session.set_denormal_as_zero", "1")  # distance bumps underflow
         try:
-            self._session = onnxruntime.InferenceSession(
-                path.read_bytes(), options, providers=["CPUExecutionProvider"]
-            )
+            content = path.read_bytes()
+            if sign_model(content) != content:  # onnxruntime crashes on some damaged files
+                raise ValueError("the SHA-256 is another one")
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
             metadata = self._session.get_modelmeta().custom_metadata_map
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
@@ -105,6 +108,30 @@ class OnnxLabeler:
         return CNNLabeler(positions, hand, config, self.marker_names).label_batch
 
 
+def _place_of_digest(content: bytes) -> slice:
+    """Where the digest stands in a file: a text of 64 bytes after its key.
+
+    Raises:
+        ValueError: It is not there once.
+    """
+    key = _DIGEST.encode() + b"\x12\x40"  # protobuf's tag of the value, and its length
+    if content.count(key) != 1:
+        raise ValueError("the file has no SHA-256")
+    first = content.index(key) + len(key)
+    return slice(first, first + 64)
+
+
+def sign_model(content: bytes) -> bytes:
+    """The bytes of an ONNX model with the SHA-256 of what they are now; of one that was signed before.
+
+    Raises:
+        ValueError: It has no place for it.
+    """
+    place = _place_of_digest(content)
+    blank = content[: place.start] + b"0" * 64 + content[place.stop :]
+    return content[: place.start] + hashlib.sha256(blank).hexdigest().encode() + content[place.stop :]
+
+
 def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> None:
     """Write a trained labeler as an ONNX file for any number of clouds of any size.
 
@@ -119,7 +146,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         import onnx
     except ImportError as error:
         raise HandSimError(f"exporting needs onnx; {_HINT}") from error
-    properties = {_NAMES: json.dumps(list(marker_names))}
+    properties = {_NAMES: json.dumps(list(marker_names)), _DIGEST: "0" * 64}
     example: tuple[torch.Tensor, ...]
     if isinstance(network, DeepLabelCNN):
         example, inputs, outputs = (torch.zeros(2, 1, 52, 52),), [_IMAGES], ["positions"]
@@ -147,4 +174,4 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         model = onnx.load(str(temporary))
         onnx.helper.set_model_props(model, properties)
         onnx.checker.check_model(model, full_check=True)
-        onnx.save(model, str(temporary))
+        temporary.write_bytes(sign_model(model.SerializeToString()))

@@ -16,7 +16,7 @@ from handsim.app.cli import main
 from handsim.errors import HandSimError, WeightsError
 from train.config import CNNConfig, SetLabelerConfig
 from train.labelers.kinds import labeler_of, new_network
-from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
+from train.labelers.onnx_labeler import OnnxLabeler, export_onnx, sign_model
 from train.labelers.storage import load_labeler
 from train.labelers.views import MeanHand
 
@@ -74,6 +74,17 @@ def test_damaged_files_are_told(exported, tmp_path):
         OnnxLabeler(tmp_path / "none.onnx")
 
 
+def test_a_changed_byte_is_told_before_onnxruntime_reads_it(exported, tmp_path, rng):
+    content, path = exported.read_bytes(), tmp_path / "changed.onnx"
+    assert sign_model(content) == content
+    for place in rng.integers(len(content), size=200):
+        changed = bytearray(content)
+        changed[place] ^= 1 + int(rng.integers(255))
+        path.write_bytes(changed)
+        with pytest.raises(WeightsError, match=r"changed\.onnx is damaged or not a labeler's"):
+            OnnxLabeler(path)
+
+
 def test_the_papers_network_labels_alike_in_both_runtimes(tmp_path, rng):
     torch.manual_seed(0)
     network = new_network(CNNConfig(num_labels=4, reject=0.03))
@@ -117,6 +128,6 @@ def test_a_file_whose_network_is_of_no_use_is_told(exported, tmp_path, damage):
         names = json.loads(entry.value)
         entry.value = json.dumps(names[:-1] if damage == "names" else [*names[:-1], names[0]])
     path = tmp_path / "damaged.onnx"
-    onnx.save(model, str(path))
+    path.write_bytes(sign_model(model.SerializeToString()))
     with pytest.raises(WeightsError, match=r"damaged.onnx is damaged or not a labeler's"):
         OnnxLabeler(path)
