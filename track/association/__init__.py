@@ -5,7 +5,7 @@ In the order of a frame's way through it:
 - `point_linking`: numbers of points that last, also where the stream's own IDs do not.
 - `frame_state`: the points of a frame and what is known of each, the state that the steps share.
 - `hand_state`: filter state of one hand: prediction, fit, update, and the learned bias of each marker.
-- `label_consistency`: labels that go along with IDs: exchanged ones, gated by the predicted pose, then by the fit.
+- `label_consistency`: labels that go along with IDs: exchanged, gated by the predicted pose, then by the fit.
 - `label_new_points`: labels for new points; the steps below serve it.
 - `point_matching`: one-to-one matching of points with markers by log-odds; for the palm.
 - `candidates`: candidate points of each digit.

@@ -7,6 +7,7 @@ the pose and its bias, which is nearly as accurate for an uncalibrated hand as f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba
@@ -24,7 +25,7 @@ from track.kinematics.marker_prediction import MarkerPrediction
 from track.kinematics.pose_solver import PoseSolver
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
+    from jaxtyping import Bool, Float, Int
     from numpy.typing import NDArray
 
 
@@ -225,6 +226,30 @@ class HandState:
             self._variance[:] = np.clip(spread, noise.first_spread_least, noise.first_spread_most) ** 2
         self._store(estimate, time)
         return estimate
+
+    def forget(self, markers: Int[np.ndarray, "K"]) -> Callable[[], None]:
+        """Forget the biases of some markers: they are where the glove has them again, give or take.
+
+        Args:
+            markers: The markers.
+
+        Returns:
+            A function that recalls the biases, unless others were learned in the meantime.
+        """
+        arrays = self._bias, self._bias_frames, self._variance, self.variance
+        before = [array.copy() for array in arrays]
+        for array in arrays[:2]:
+            array[markers] = 0.0
+        for array in arrays[2:]:
+            array[markers] = self.config.noise.first_spread_most**2
+        self._shift_markers()
+
+        def recall() -> None:
+            for array, values in zip(arrays, before, strict=True):
+                array[:] = values
+            self._shift_markers()
+
+        return recall
 
     def rms_without_bias(self, estimate: Estimate) -> float:
         """RMS distance of the markers from their positions on the hand as it was given [m]."""

@@ -73,14 +73,45 @@ class LabelerReview:
         labels, confidence = np.full(len(near), -1), np.full(len(near), np.nan)
         labeling = self._labeler.label_frames([frame.points[cloud]])[0]
         labels[cloud], confidence[cloud] = labeling.labels, labeling.confidence
-        if (labels == frame.labels[hand.index]).all():
-            return None
-        fitted = fit_labels(hand.state, frame.points, labels, hand.prediction, self._config.gating)
-        proposal = Proposal(labels, confidence, fitted)
-        if np.isnan(fitted.rms) or self._gain(hand, estimate, frame, proposal) < self._config.review.margin:
-            return None
-        self._wait[hand.index] = self._config.review.first_wait
+        proposal = self._compare(hand, estimate, frame, labels, confidence)
+        if proposal is None:
+            doubted = self._doubted_biases(hand, frame, labels)
+            if len(doubted):
+                recall = hand.state.forget(doubted)
+                proposal = self._compare(hand, estimate, frame, labels, confidence)
+                if proposal is None:
+                    recall()
+        if proposal is not None:
+            self._wait[hand.index] = self._config.review.first_wait
         return proposal
+
+    def _compare(
+        self,
+        hand: HandTrack,
+        estimate: Estimate,
+        frame: FrameState,
+        named: NDArray[np.int64],
+        confidence: NDArray[np.float64],
+    ) -> Proposal | None:
+        """Fit the labeler's labels; None if those of the frame are likelier or the same."""
+        labels = named.copy()
+        fitted = fit_labels(hand.state, frame.points, labels, hand.prediction, self._config.gating)
+        if (labels == frame.labels[hand.index]).all() or np.isnan(fitted.rms):
+            return None
+        proposal = Proposal(labels, confidence, fitted)
+        gain = self._gain(hand, estimate, frame, proposal)
+        return proposal if gain >= self._config.review.margin else None
+
+    def _doubted_biases(
+        self, hand: HandTrack, frame: FrameState, named: NDArray[np.int64]
+    ) -> Int[np.ndarray, "K"]:
+        """Markers that the hand lacks although the labeler sees them in points that have lasted.
+
+        Their biases may have been learned from other points.
+        """
+        old = frame.time - frame.first_seen >= self._config.presence.stray_lifetime
+        doubted = np.unique(named[old & frame.unlabeled & (named >= 0)])
+        return np.setdiff1d(doubted, frame.labels[hand.index])
 
     def _near(self, hand: HandTrack, estimate: Estimate, frame: FrameState) -> Bool[np.ndarray, "P"]:
         """Which points without a label may be markers that the hand lacks."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"
 CONFIG: Final = "config.json"
+_LONGEST_NAME: Final = 100  # bytes; file systems take 255
 
 
 def row_dtype(num_markers: int) -> np.dtype[np.void]:
@@ -147,7 +148,7 @@ _MANIFEST_FIELDS: Final[dict[str, tuple[str, Callable[[Any], bool]]]] = {
     "min_cameras": ("a whole number of at least 1", lambda value: type(value) is int and value >= 1),
     "files": (
         "a table of names of files in this folder and their SHA-256",
-        lambda value: _is_table_of(value, str) and all(Path(name).name == name for name in value),
+        lambda value: _is_table_of(value, str) and all(_is_file_name(name) for name in value),
     ),
     "redrawn": ("a table of counts", lambda value: value is None or _is_table_of(value, int)),
     "units": ("text", lambda value: isinstance(value, str)),
@@ -158,6 +159,10 @@ _MAY_LACK: Final = {"redrawn", "units"}
 
 def _are_names(value: object) -> bool:
     return isinstance(value, list) and all(isinstance(name, str) for name in value)
+
+
+def _is_file_name(name: str) -> bool:
+    return Path(name).name == name and len(name.encode(errors="replace")) <= _LONGEST_NAME
 
 
 def _is_table_of(value: object, kind: type) -> bool:

@@ -18,6 +18,7 @@ from train.labelers.protocol import Labeling
 from train.labelers.storage import load_labeler
 
 TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
+KNUCKLE = 4  # of the index finger
 RATE = 120.0
 
 
@@ -36,11 +37,16 @@ class CountingLabeler:
 
 @pytest.fixture
 def state() -> HandState:
-    """A hand that was followed for half a second at rest, its markers 1 mm off at random."""
+    return followed()
+
+
+def followed(off: np.ndarray | float = 0.0) -> HandState:
+    """A hand that was followed for half a second at rest, its markers 1 mm off at random, its knuckle off."""
     user = nominal_fit(load_layout("dense19"), "M", "right")
     state, rng = HandState(user), np.random.default_rng(0)
     qpos = join_qpos(resting_angles(user.model)[None])[0]
     target = state.solver.marker_positions(qpos)
+    target[KNUCKLE] += off
     state.initialize(qpos, target, 0.0)
     for frame in range(1, 60):
         prediction = state.predict(frame / RATE)
@@ -123,3 +129,33 @@ def test_a_hand_that_was_initialized_is_reviewed_in_the_next_frame(state):
     assert labeler.times == before
     reviewed(review, state, frame_of(points, np.arange(19), 1.5 + 2 / RATE))
     assert labeler.times == before + 1
+
+
+@pytest.mark.parametrize("age", [0.0, 0.4])
+def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age):
+    """The true marker was hidden, and a ghost beside it had its label."""
+    state = followed(np.array([0.0, 0.01, 0.01]))
+    user = nominal_fit(load_layout("dense19"), "M", "right")
+    points = HandState(user).solver.marker_positions(join_qpos(resting_angles(user.model)[None])[0])
+    labels = np.arange(19)
+    labels[KNUCKLE] = -1
+    frame = frame_of(points, labels, 1.0, first_seen=1.0 - age)
+    found = reviewed(LabelerReview(CountingLabeler(), 1, TrackerConfig()), state, frame)
+    if age == 0.0:
+        assert found is None
+    else:
+        np.testing.assert_array_equal(found.labels, np.arange(19))
+
+
+def test_biases_are_forgotten_and_recalled():
+    state, designed = followed(np.array([0.0, 0.01, 0.01])), HandState(followed().hand).adapted.positions
+    biased, variance = state.adapted.positions.copy(), state.variance.copy()
+    recall = state.forget(np.array([KNUCKLE]))
+    np.testing.assert_array_equal(state.adapted.positions[KNUCKLE], designed[KNUCKLE])
+    others = np.delete(np.arange(19), KNUCKLE)
+    np.testing.assert_array_equal(state.adapted.positions[others], biased[others])
+    assert state.variance[KNUCKLE] > variance[KNUCKLE]
+    recall()
+    np.testing.assert_array_equal(state.adapted.positions, biased)
+    np.testing.assert_array_equal(state.variance, variance)
+    assert np.linalg.norm(biased[KNUCKLE, 0] - designed[KNUCKLE, 0]) > 0.003
