@@ -10,7 +10,7 @@ DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format fuzz figures chaos docs clean drawing
+.PHONY: help demo test lint format fuzz figures chaos truth docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -43,6 +43,10 @@ figures: $(INSTALLED)  ## write docs/figures.toml into the pages; ONLY=table5 ru
 
 chaos: $(INSTALLED)  ## kill every long command at random moments and run it again; KILLS=20
 	$(BIN)/python benchmarks/chaos.py --kills $(or $(KILLS),20)
+
+truth: $(INSTALLED)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data
+	@test -d "$(DATA)" || { echo "make truth needs DATA, the path of a folder of Mocap_SIG18_Data"; exit 1; }
+	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/real_motion.py $(DATA)
 
 clean:  ## remove .venv, caches and what the demo wrote
 	rm -rf $(VENV) demo docs/_build docs/api build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

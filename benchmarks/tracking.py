@@ -4,8 +4,8 @@
         [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
-    calibrate` begins with the nearest of the five sizes, has the tracker label the capture, and writes their
-    hands. With these the twin is tracked, beside the true hands and the nearest size as it is.
+    calibrate` measures their size, has the tracker label the capture, and writes their hands. With these the
+    twin is tracked, beside the true hands and hands of the size measured in the twin.
 drums: the twins with twenty ghosts a frame near the hands (`drum_takes`), from the beginning and from second
     one, and without.
 starts: a tracker begins at a random frame, or has a second of darkness behind it; how many frames pass until
@@ -43,7 +43,7 @@ from track.evaluation.hand_errors import hand_errors
 from track.evaluation.take_evaluation import (
     TrackingReport,
     evaluate_tracker,
-    nearest_size,
+    measured_users,
     nominal_users,
     seen_frame,
     true_users,
@@ -62,7 +62,10 @@ TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 WARM_UP = 30  # frames
 FINDINGS = 25  # frames in which hands are looked for
 EVERY = 36000  # frames between two looks at the memory: five minutes
-HANDS = {"true": true_users, "uncalibrated": nominal_users}
+HANDS = {
+    "true": true_users,
+    "uncalibrated": lambda take: measured_users(take, labeler()),
+}
 
 
 @cache
@@ -106,7 +109,7 @@ def calibrated_users(take: Take, seed: int, free: float) -> list[GloveFit]:
         capture, user = Path(folder) / "calibration.c3d", Path(folder) / "user.json"
         names = tuple(f"point{number}" for number in range(made.points.shape[1]))
         write_capture(capture, Capture(names, made.points, made.rate))
-        calibrate(capture, out=user, size=nearest_size(take.hands[0].shape.length))
+        calibrate(capture, out=user)
         found = {hand.side: hand for hand in load_user(user)}
     return [found[hand.side] for hand in take.hands]
 

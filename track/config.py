@@ -75,7 +75,7 @@ class IntakeConfig(_Settings):
     longest_interval: float = 2.0
     """Longest interval that counts in the usual one, as a multiple of it."""
     silence: float = 0.25
-    """Time without a frame that is noted [s]."""
+    """Time without a frame that is noted, and that labels do not outlive [s]."""
 
 
 @dataclass(frozen=True)

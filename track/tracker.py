@@ -63,6 +63,7 @@ class Tracker:
         self._first = np.cumsum([0, *sizes, *(len(body.marker_names) for body in bodies)])
         self._labels: dict[int, tuple[int, float]] = {}  # label and evidence of each ID
         self._first_seen: dict[int, float] = {}  # [s] of each ID
+        self._last_time = -np.inf  # [s] of the last frame
         self._last_sound = np.zeros(len(hands))  # [s] when each track was last beyond doubt
 
     def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
@@ -77,6 +78,9 @@ class Tracker:
             ArgumentError: `points` and `ids` do not fit together.
         """
         incoming = self._intake.take(points, ids, time)
+        if incoming.time - self._last_time > self.config.intake.silence:
+            self._labels = {}  # IDs may be those of other points by now
+        self._last_time = incoming.time
         bodies, labels = self._track_bodies(incoming)
         confidence, free = np.ones(len(labels)), labels < 0
         frame = self._frame_state(incoming.points[free], incoming.ids[free], incoming.time)

@@ -19,7 +19,7 @@ from track.evaluation.take_evaluation import (
     FrameTracker,
     TrackingReport,
     evaluate_tracker,
-    nominal_users,
+    measured_users,
     seen_frame,
     true_users,
 )
@@ -36,9 +36,9 @@ OURS: Final = "handsim"
 PAPERS_LOOP: Final = "paper's loop"
 NEED_FIRST_LABELS: Final = ("nearest point", "Hungarian")
 """Methods that get the labels of the first frame and cannot initialize a hand."""
-USERS: Final[dict[str, Callable[[Take], list[GloveFit]]]] = {
-    "calibrated": true_users,
-    "uncalibrated": nominal_users,
+USERS: Final[dict[str, Callable[[Take, Labeler], list[GloveFit]]]] = {
+    "calibrated": lambda take, _: true_users(take),
+    "uncalibrated": measured_users,
 }
 TRIALS: Final = 10
 _WARM_UP: Final = 30  # frames before time is measured, in which kernels are loaded
@@ -117,7 +117,7 @@ def compare_trackers(
         done: Called after each frame of a take; trials are not counted.
     """
     wearers = {
-        (users, capture): hands_of(take)
+        (users, capture): hands_of(take, labeler)
         for users, hands_of in USERS.items()
         for capture, take in takes.items()
     }
@@ -150,7 +150,9 @@ def measure_with_body(
     body = RigidTemplate.of(named_object(take.body.name))
     nothing, measured = np.zeros(0), []
     for users, hands_of in USERS.items():
-        report = _report(take, hands_of(take), lambda _, hands: Tracker(hands, labeler, (body,)), done)
+        report = _report(
+            take, hands_of(take, labeler), lambda _, hands: Tracker(hands, labeler, (body,)), done
+        )
         measured.append(Measurement(f"{OURS}, {body.name} too", users, capture, report, nothing, nothing))
     return measured
 

@@ -16,7 +16,10 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES
 from handsim.hand.topology import NUM_QPOS
 from track.baselines.plain_hand import MOST_RMS
+from track.hand_size import fit_size, sample_frames
+from track.streams.point_stream import StreamedFrame
 from track.tracked_frame import TrackedFrame
+from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
@@ -114,6 +117,28 @@ def nominal_users(take: Take) -> list[GloveFit]:
     """
     layout = load_layout(str(take.settings["glove"]))
     return [nominal_fit(layout, nearest_size(hand.fit.shape.length), hand.side) for hand in take.hands]
+
+
+def measured_users(take: Take, labeler: Labeler) -> list[GloveFit]:
+    """The hands of a take without calibration: of the size that is measured in it, gloves as designed.
+
+    Hands whose size cannot be measured have the nearest of the five sizes.
+
+    Args:
+        take: The take.
+        labeler: Labeler of its glove.
+
+    Raises:
+        LayoutError: The take's glove is not found.
+    """
+    layout, sides = load_layout(str(take.settings["glove"])), [hand.side for hand in take.hands]
+    frames = [
+        StreamedFrame(number, number / take.rate, seen.points, seen.ids)
+        for number in range(take.num_frames)
+        for seen in [seen_frame(take, number)]
+    ]
+    size = fit_size(sample_frames(frames), layout, sides, labeler)
+    return nominal_users(take) if size is None else list(size.hands(layout, sides))
 
 
 def nearest_size(length: float) -> str:

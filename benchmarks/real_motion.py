@@ -1,0 +1,97 @@
+"""The tracker on real hands in motion: published poses, two hands, made into captures without names.
+
+python benchmarks/real_motion.py DATA [--conditions clean gaps close new-ids exchanged-ids] [--frames 0]
+
+DATA is a folder of Mocap_SIG18_Data (Han et al. 2018), with User1/capture1 and so on in it. The left and the
+right file of a sequence are one person's two hands at one time. Three captures move about three times as fast
+from frame to frame as 120 Hz would show; they are played at 40 Hz. There is about 1.5 mm of noise per axis in
+the data. Conditions:
+
+clean          every marker in every frame
+gaps           each marker missing for 4 frames at a time (median), 4 % of the time, and short-lived ghosts
+close          gaps, the hands' centers 8 to 12 cm apart
+new-ids        gaps, every point of every frame with a new ID
+exchanged-ids  gaps, and in one of 40 frames two points within 22 mm exchange their IDs for good
+
+A frame is right if every marker of both hands has its own point, or rightly none, and no ghost is a marker.
+The size of the hands is measured (`handsim track --size auto`).
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import torch
+from machine import describe
+from real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
+
+from gloves.layout import load_layout
+from track.hand_size import fit_size, sample_frames
+from track.streams.point_stream import StreamedFrame
+from track.tracker import Tracker
+from train.labelers.storage import load_labeler
+
+SIDES = ("right", "left")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=CONDITIONS)
+    parser.add_argument("--frames", type=int, default=0, help="of each capture at most; all when 0")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    print(describe("torch", "numba"))
+    print(
+        "frames right [%] | " + " | ".join(options.conditions) + " | median, p99 of the time of a frame [ms]"
+    )
+    table = []
+    for folder in sorted(options.data.glob("User*/capture*")):
+        name, row, times = "/".join(folder.parts[-2:]), [], []
+        for condition in options.conditions:
+            scene = make_scene(folder, condition, seed=options.seed, frames=options.frames)
+            right, seconds = track(scene)
+            row.append(100.0 * right.mean())
+            times.append(1e3 * seconds)
+        table.append(row)
+        p50, p99 = np.percentile(np.concatenate(times), [50, 99])
+        print_row(f"{name}, {'40' if name in FAST else '120'} Hz", row, f" | {p50:.2f}, {p99:.1f}")
+    print_row("mean", np.mean(table, axis=0))
+    print_row("worst", np.min(table, axis=0))
+
+
+def print_row(name: str, values: object, rest: str = "") -> None:
+    """A row of the table."""
+    print(f"{name} | " + " | ".join(f"{value:.2f}" for value in values) + rest, flush=True)  # type: ignore[attr-defined]
+
+
+def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Which counted frames are right, and the computing time of each frame [s]."""
+    seen = np.isfinite(scene.points[..., 0])
+    frames = [
+        StreamedFrame(t, t / scene.rate, scene.points[t, seen[t]], scene.ids[t, seen[t]])
+        for t in range(len(seen))
+    ]
+    layout, labeler = load_layout("dense19"), load_labeler("dense19")
+    size = fit_size(sample_frames(frames), layout, SIDES, labeler)
+    assert size is not None
+    tracker = Tracker(size.hands(layout, SIDES), labeler)
+    columns = np.arange(scene.points.shape[1])
+    truth = np.where(columns < 2 * len(NAMES), columns, -1)
+    right, seconds = np.zeros(len(frames), dtype=bool), np.zeros(len(frames))
+    for t, frame in enumerate(frames):
+        start = perf_counter()
+        labels = tracker.step(frame.points, frame.ids, frame.time).labels
+        seconds[t] = perf_counter() - start
+        right[t] = (labels == truth[seen[t]]).all()
+    return right[scene.counted], seconds
+
+
+if __name__ == "__main__":
+    main()
