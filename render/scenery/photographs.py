@@ -67,12 +67,17 @@ def _read(file: Path) -> NDArray[np.uint8] | None:
 
 
 def _num_pixels(file: Path) -> int:
-    """Pixels that a file states; OpenCV would allocate them all before it finds that they are not there."""
+    """Pixels that a file states; OpenCV would allocate them all before it finds that they are not there.
+
+    The same holds for the parts of a PNG, which are checked.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of decompression bombs
             with Image.open(file) as picture:
-                return int(picture.width * picture.height)
+                pixels = int(picture.width * picture.height)
+                picture.verify()
+                return pixels
     except Exception as error:  # headers are damaged in many ways
         raise HandSimError(f"{file}: not a readable photograph") from error
 
