@@ -188,6 +188,8 @@ class LinkingConfig(_Settings):
     """The same after hands were aligned twice [m]."""
     fewest_aligned: int = 5
     """Points with which a hand is aligned."""
+    beside_distance: float = 0.06
+    """Distance from a hand's points within which a point without a label moves with the hand [m]."""
 
 
 @dataclass(frozen=True)
@@ -320,6 +322,12 @@ class ReviewConfig(_Settings):
     """Log probability that a point is a marker that the track saw elsewhere while this one was visible."""
     margin: float = 8.0
     """Log-odds by which the labeler's labels must be likelier than those of the track."""
+    much_nearer: float = _share(0.85)
+    """Largest share of a point's distance from a marker that is left without its bias, to doubt the bias."""
+    moved_label: float = 4.0
+    """Log-odds that a point keeps the label that it has."""
+    persistence: float = 1.0
+    """Log-odds that each earlier review with the same labels adds, which were likelier by less."""
     most_answer_log_odds: float = 7.0
     """Largest log-odds that the labeler's confidence in a label contributes."""
 

@@ -227,6 +227,10 @@ class HandState:
         self._store(estimate, time)
         return estimate
 
+    def unbiased_positions(self, estimate: Estimate) -> Float[np.ndarray, "M 3"]:
+        """Where a pose's markers would be in the world if the glove had no bias [m]."""
+        return estimate.positions + np.einsum("mij,mj->mi", estimate.predicted.rotations, self._bias)
+
     def forget(self, markers: Int[np.ndarray, "K"]) -> Callable[[], None]:
         """Forget the biases of some markers: they are where the glove has them again, give or take.
 

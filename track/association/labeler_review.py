@@ -49,6 +49,8 @@ class LabelerReview:
         self._config = config
         self._wait = np.full(num_hands, config.review.first_wait)  # [s] from a hand's last review to its next
         self._last = np.full(num_hands, -np.inf)  # [s] of each hand's last review
+        self._earlier: list[dict[tuple[int, int], int]] = [{} for _ in range(num_hands)]
+        # How many reviews in turn found other labels of points likelier, but not by enough.
         self._open: list[frozenset[int]] = [frozenset()] * num_hands  # IDs that it was about
 
     def restart(self, index: int, time: float) -> None:
@@ -75,7 +77,7 @@ class LabelerReview:
         labels[cloud], confidence[cloud] = labeling.labels, labeling.confidence
         proposal = self._compare(hand, estimate, frame, labels, confidence)
         if proposal is None:
-            doubted = self._doubted_biases(hand, frame, labels)
+            doubted = self._doubted_biases(hand, estimate, frame, labels)
             if len(doubted):
                 recall = hand.state.forget(doubted)
                 proposal = self._compare(hand, estimate, frame, labels, confidence)
@@ -100,17 +102,31 @@ class LabelerReview:
             return None
         proposal = Proposal(labels, confidence, fitted)
         gain = self._gain(hand, estimate, frame, proposal)
-        return proposal if gain >= self._config.review.margin else None
+        changes = {
+            (int(frame.ids[row]), int(labels[row]))
+            for row in np.flatnonzero((labels != frame.labels[hand.index]) & (labels >= 0))
+        }
+        earlier = self._earlier[hand.index]
+        times = min((earlier.get(change, 0) for change in changes), default=0)
+        if gain + self._config.review.persistence * times >= self._config.review.margin:
+            return proposal
+        if gain > 0.0:
+            self._earlier[hand.index] = {change: earlier.get(change, 0) + 1 for change in changes}
+        return None
 
     def _doubted_biases(
-        self, hand: HandTrack, frame: FrameState, named: NDArray[np.int64]
+        self, hand: HandTrack, estimate: Estimate, frame: FrameState, named: NDArray[np.int64]
     ) -> Int[np.ndarray, "K"]:
-        """Markers that the hand lacks although the labeler sees them in points that have lasted.
+        """Markers that the hand lacks, and for which the labeler names points that have lasted.
 
-        Their biases may have been learned from other points.
+        Their biases may have been learned from other points if the markers would be much nearer without them.
         """
         old = frame.time - frame.first_seen >= self._config.presence.stray_lifetime
-        doubted = np.unique(named[old & frame.unlabeled & (named >= 0)])
+        rows = np.flatnonzero(old & frame.unlabeled & (named >= 0))
+        points, markers = frame.points[rows], named[rows]
+        without = np.linalg.norm(points - hand.state.unbiased_positions(estimate)[markers], axis=1)
+        with_bias = np.linalg.norm(points - estimate.positions[markers], axis=1)
+        doubted = markers[without < self._config.review.much_nearer * with_bias]
         return np.setdiff1d(doubted, frame.labels[hand.index])
 
     def _near(self, hand: HandTrack, estimate: Estimate, frame: FrameState) -> Bool[np.ndarray, "P"]:
@@ -142,6 +158,7 @@ class LabelerReview:
         sure = np.clip(confidence[named], 0.5, 1.0 - 1e-6)
         gain += np.minimum(np.log(sure / (1.0 - sure)), self._config.review.most_answer_log_odds).sum()
         fresh = named[labels[named] < 0]
+        gain -= self._config.review.moved_label * (len(named) - len(fresh))
         presence = hand.state.presence_log_odds(frame.first_seen[fresh])[
             np.arange(len(fresh)), proposed[fresh]
         ]

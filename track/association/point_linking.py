@@ -75,6 +75,7 @@ class PointLinker:
         for row, number in enumerate(self._last.tolist()):
             if number in predicted:
                 hands[row], expected[row] = predicted[number]
+        beside = self._beside(hands)
         moved, found = expected.copy(), np.full(len(points), -1)
         for distance in (self._config.first_distance, self._config.next_distance, self._config.last_distance):
             rows, columns = _assign(points, moved, distance)
@@ -83,8 +84,19 @@ class PointLinker:
                 if own.sum() >= self._config.fewest_aligned:
                     rotation, shift = rigid_fit(expected[columns[own]], points[rows[own]])
                     moved[hands == hand] = expected[hands == hand] @ rotation.T + shift
+                    rotation, shift = rigid_fit(self._points[columns[own]], points[rows[own]])
+                    moved[beside == hand] = self._points[beside == hand] @ rotation.T + shift
         found[rows] = self._last[columns]
         return found
+
+    def _beside(self, hands: NDArray[np.int64]) -> Int[np.ndarray, "Q"]:
+        """The hand that each point of the last frame without one is beside, and moves with; -1 for none."""
+        beside, loose, held = np.full(len(hands), -1), np.flatnonzero(hands < 0), np.flatnonzero(hands >= 0)
+        if len(loose) and len(held):
+            distances = np.linalg.norm(self._points[loose, None] - self._points[held], axis=-1)
+            near = distances.min(axis=1) < self._config.beside_distance
+            beside[loose[near]] = hands[held[distances.argmin(axis=1)[near]]]
+        return beside
 
 
 def _assign(

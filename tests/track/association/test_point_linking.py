@@ -78,3 +78,13 @@ def test_a_hand_that_moves_otherwise_than_predicted_is_aligned(seed):
     without = PointLinker()
     first = without.number(both, np.full(38, -1), (), dict)
     assert (without.number(moved, np.full(38, -1), (), dict) == first)[:19].mean() < 0.7
+
+
+def test_a_point_without_a_label_moves_with_the_hand_beside_it():
+    points, linker = cloud(20, 3), PointLinker()
+    first = linker.number(points, np.full(20, -1), (), dict)
+    loose = int(np.linalg.norm(points - points.mean(0), axis=1).argmin())
+    predicted = {n: (0, points[row]) for row, n in enumerate(first.tolist()) if row != loose}
+    moved = points + [0.03, 0.0, 0.01]
+    second = linker.number(moved, np.full(20, -1), predicted, lambda: predicted)
+    assert second[loose] == first[loose] and (second == first).mean() > 0.9
