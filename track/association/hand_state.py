@@ -229,7 +229,8 @@ class HandState:
 
     def unbiased_positions(self, estimate: Estimate) -> Float[np.ndarray, "M 3"]:
         """Where a pose's markers would be in the world if the glove had no bias [m]."""
-        return estimate.positions + np.einsum("mij,mj->mi", estimate.predicted.rotations, self._bias)
+        offsets: NDArray[np.float64] = np.einsum("mij,mj->mi", estimate.predicted.rotations, self._bias)
+        return estimate.positions + offsets
 
     def forget(self, markers: Int[np.ndarray, "K"]) -> Callable[[], None]:
         """Forget the biases of some markers: they are where the glove has them again, give or take.
