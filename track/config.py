@@ -324,7 +324,7 @@ class ReviewConfig(_Settings):
     """Log-odds by which the labeler's labels must be likelier than those of the track."""
     much_nearer: float = _share(0.85)
     """Largest share of a point's distance from a marker that is left without its bias, to doubt the bias."""
-    moved_label: float = 4.0
+    moved_label: float = 2.0
     """Log-odds that a point keeps the label that it has."""
     persistence: float = 1.0
     """Log-odds that each earlier review with the same labels adds, which were likelier by less."""

@@ -63,7 +63,7 @@ def calibrate(
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .json")
     check_outputs((capture, glove, labeler), [out])
     start = users_of(glove, size, None, hands)
-    source, words = read_capture(capture), f"size {size}"
+    source, words = read_capture(capture), None
     network = labeler_for_glove(glove, labeler)
     if size == "auto":
         start, words = measured_users(glove, hands, sample_frames(list(capture_frames(source))), network)
@@ -71,7 +71,9 @@ def calibrate(
     if _leaves_markers(take, done):
         known = [calibration.hand for calibration in done]
         take, done = _round(source, known, start, network)
-    save_user(out, [one.hand for one in done], f"calibrated from {capture.name}, {words} to begin with")
+    save_user(
+        out, [one.hand for one in done], f"calibrated from {capture.name}, {words or size} to begin with"
+    )
     print_line(f"{out}: {len(done)} hands in glove {glove}, from {take.num_frames} frames")
     for hand in start:
         report = [line for one in done if one.hand.side == hand.side for line in _report(one)]

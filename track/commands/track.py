@@ -29,7 +29,7 @@ from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.capture_tracking import capture_frames, track_capture, warm_up
 from track.commands.live import TrackedSource, track_live
-from track.commands.user_options import Size, measured_users, users_of
+from track.commands.user_options import USUAL_SIZE, Size, measured_users, users_of
 from track.evaluation.take_summary import summarize, suspicions
 from track.hand_size import sample_frames
 from track.streams.point_stream import StreamedFrame
@@ -136,8 +136,15 @@ class _Start:
         if frames:
             sides = [hand.side for hand in self._user]
             self._user, words = measured_users(self._glove, sides, frames, self.labeler)
-            self.settings["user"] = f"auto, {words}"
-            print_line(f"size of the hands: {words}")
+            self.settings["user"] = f"auto, {words or USUAL_SIZE}"
+            if words is None:
+                warnings.warn(
+                    f"no hand was found to measure its size; size {USUAL_SIZE} is used, or name a --size",
+                    HandSimWarning,
+                    stacklevel=2,
+                )
+            else:
+                print_line(f"size of the hands: {words}")
         return TimedTracker(self._user, self.labeler, self._bodies, self.seconds)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
-from handsim.errors import ArgumentError, HandSimWarning, choices
+from handsim.errors import ArgumentError, choices
 from handsim.hand.topology import Side
 from track.hand_size import fit_size
 from track.streams.point_stream import StreamedFrame
@@ -46,7 +45,7 @@ def users_of(
 
 def measured_users(
     glove: str, hands: Sequence[Side], frames: Sequence[StreamedFrame], labeler: Labeler
-) -> tuple[tuple[GloveFit, ...], str]:
+) -> tuple[tuple[GloveFit, ...], str | None]:
     """Hands of the size that fits some frames, in a glove as designed.
 
     Args:
@@ -56,7 +55,7 @@ def measured_users(
         labeler: Labeler of the glove.
 
     Returns:
-        The hands, and their size in words. Hands that are not found get the usual size, with a warning.
+        The hands, and their size in words. Hands that are not found have the usual size, and no words.
 
     Raises:
         LayoutError: The glove is unknown or does not fit.
@@ -66,12 +65,7 @@ def measured_users(
     layout = load_layout(glove)
     size = fit_size(frames, layout, hands, labeler)
     if size is None:
-        warnings.warn(
-            f"no hand was found to measure its size; size {USUAL_SIZE} is used (--size names another)",
-            HandSimWarning,
-            stacklevel=3,
-        )
-        return uncalibrated_users(glove, USUAL_SIZE, hands), USUAL_SIZE
+        return uncalibrated_users(glove, USUAL_SIZE, hands), None
     return size.hands(layout, hands), str(size)
 
 
