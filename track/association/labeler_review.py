@@ -72,6 +72,8 @@ class LabelerReview:
         if not self._is_due(hand.index, frame, near):
             return None
         cloud = np.flatnonzero((frame.labels[hand.index] >= 0) | near)
+        if len(cloud) > self._config.initialization.most_points:
+            return None
         labels, confidence = np.full(len(near), -1), np.full(len(near), np.nan)
         labeling = self._labeler.label_frames([frame.points[cloud]])[0]
         labels[cloud], confidence[cloud] = labeling.labels, labeling.confidence

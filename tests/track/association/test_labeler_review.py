@@ -118,6 +118,17 @@ def test_reviews_become_rarer_until_a_new_point_comes(state):
         before = labeler.times
 
 
+def test_a_hand_in_a_crowd_of_strays_is_not_reviewed(state):
+    """No labeler takes so many points."""
+    points, rng = state.solver.marker_positions(state.qpos), np.random.default_rng(1)
+    labels = np.concatenate([np.arange(19), np.full(700, -1)])
+    labels[TIP] = -1
+    crowd = np.concatenate([points, points[TIP] + rng.uniform(-0.03, 0.03, (700, 3))])
+    labeler = CountingLabeler()
+    assert reviewed(LabelerReview(labeler, 1, TrackerConfig()), state, frame_of(crowd, labels, 0.5)) is None
+    assert labeler.times == 0
+
+
 def test_a_hand_that_was_initialized_is_reviewed_in_the_next_frame(state):
     points, labeler = state.solver.marker_positions(state.qpos), CountingLabeler()
     review = LabelerReview(labeler, 1, TrackerConfig())
