@@ -29,7 +29,7 @@ from machine import describe
 from real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 
 from gloves.layout import load_layout
-from track.hand_size import fit_size, sample_frames
+from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.point_stream import StreamedFrame
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
@@ -81,7 +81,7 @@ def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     layout, labeler = load_layout("dense19"), load_labeler("dense19")
     size = fit_size(sample_frames(frames), layout, SIDES, labeler)
     assert size is not None
-    tracker = Tracker(size.hands(layout, SIDES), labeler)
+    tracker = Tracker(size.hands(SIDES), labeler)
     columns = np.arange(scene.points.shape[1])
     truth = np.where(columns < 2 * len(NAMES), columns, -1)
     right, seconds = np.zeros(len(frames), dtype=bool), np.zeros(len(frames))

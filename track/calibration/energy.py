@@ -58,7 +58,7 @@ ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
 POSITION_SPREAD: Final = 0.006
 """Standard deviation of a marker's slip along the skin [m]; (noise / spread)^2 is the paper's lambda_1."""
-HEIGHT_SPREAD: Final = 0.0004
+HEIGHT_SPREAD: Final = 0.002
 """Standard deviation of a marker center's height around one radius above the skin [m]."""
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""

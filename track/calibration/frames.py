@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Int
     from numpy.typing import NDArray
 
-NUM_FRAMES: Final = 160
+NUM_FRAMES: Final = 240
 """Frames that a calibration is solved on."""
 FEWEST_FRAMES: Final = 100
 """Usable frames without which a capture is refused."""
@@ -39,6 +39,8 @@ class PoseTrack(NamedTuple):
     qpos: Float[np.ndarray, "K 27"]
     rms: Float[np.ndarray, "K"]
     """3D RMS distance of the markers from the model's [m]."""
+    residuals: Float[np.ndarray, "K M 3"]
+    """Model minus marker [m], NaN where a marker is missing."""
 
 
 def check_markers(markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float) -> NDArray[np.float64]:
@@ -89,7 +91,7 @@ def solve_frames(
         initial: Poses to start from (K, 27).
     """
     solved = PoseSolver(hand).solve(markers[frames], initial)
-    return PoseTrack(frames, solved.qpos, solved.rms)
+    return PoseTrack(frames, solved.qpos, solved.rms, solved.residuals)
 
 
 def initial_poses(

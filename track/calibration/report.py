@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS
+from handsim.space.transforms import quaternion_matrix
 from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.energy import Estimate, Fit, Problem
 from track.calibration.hand_parameters import BONE_LENGTHS, LENGTH, NUM_PARAMETERS, shape_jacobian
@@ -22,9 +24,8 @@ if TYPE_CHECKING:
 ENOUGH_RANGE: Final = 0.3
 """Share of a joint's range that the user has to cover."""
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
-_OPTICAL_NOISE: Final = 0.00015  # [m] of a coordinate, from the optical system alone
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
-_INDEPENDENT_POSES: Final = 4.0  # frames whose deformation of the flesh is independent
+_INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
 def marker_noise(problem: Problem, fit: Fit) -> float:
@@ -35,17 +36,35 @@ def marker_noise(problem: Problem, fit: Fit) -> float:
     return float(np.clip(np.sqrt(np.median(squares) / (_CHI2_MEDIAN * remaining)), _LEAST_NOISE, _MOST_NOISE))
 
 
-def effective_noise(noise: float, num_frames: int) -> float:
+def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray, "T M 3"]) -> float:
+    """Share of the residuals' variance that repeats in a similar pose: flesh that moves with the joints.
+
+    It is the correlation of each frame's residuals, in the wrist's frame, with those of the frame whose joint
+    angles are nearest. Noise that is independent from frame to frame gives zero.
+
+    Args:
+        qpos: Poses of a fitted hand, two or more.
+        residuals: Model minus marker [m], NaN where a marker is missing.
+    """
+    local = np.einsum("tji,tmj->tmi", quaternion_matrix(qpos[:, 3:7]), residuals)
+    nearest = cKDTree(qpos[:, 7:]).query(qpos[:, 7:], k=2)[1][:, 1]
+    products, squares = local * local[nearest], 0.5 * (local**2 + local[nearest] ** 2)
+    both = np.isfinite(products)
+    return float(np.clip(products[both].sum() / max(squares[both].sum(), 1e-18), 0.0, 1.0))
+
+
+def effective_noise(noise: float, repeated: float, num_frames: int) -> float:
     """Noise [m] for the weights of the residuals, so that correlated frames do not count as independent ones.
 
-    Optical noise is independent from frame to frame. The rest of a residual is flesh that moves with the
-    pose: it repeats in every similar pose, so that many frames carry the information of a few.
+    What repeats in every similar pose is flesh that moves with the pose: many frames carry the information of
+    a few about it.
 
     Args:
         noise: Standard deviation of a marker's coordinates [m].
+        repeated: Share of its square that repeats, see `repeated_share`.
         num_frames: Frames that are weighted.
     """
-    flesh = max(noise**2 - _OPTICAL_NOISE**2, 0.0)
+    flesh = repeated * noise**2
     return float(np.sqrt(noise**2 + flesh * max(num_frames / _INDEPENDENT_POSES - 1.0, 0.0)))
 
 

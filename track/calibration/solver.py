@@ -12,8 +12,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from gloves.fit import GloveFit
+from handsim.hand.model import HandModel
 from track.calibration.contacts import contact_weights, slide_contacts
 from track.calibration.energy import Estimate, Fit, NormalEquations, Problem
+from track.calibration.hand_parameters import shape_at
+from track.calibration.skin_coordinates import attachment_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -65,6 +69,18 @@ def contact_gap(estimate: Estimate, fit: Fit) -> float:
         return float("nan")
     weights = contact_weights(fit.geometry, estimate.contacts.fingers)
     return float(np.sqrt((weights * fit.geometry.gaps**2).sum() / max(weights.sum(), 1e-12)))
+
+
+def user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
+    """The right hand of an estimate in its glove.
+
+    Args:
+        right: A right hand in the same glove.
+        problem: The data.
+        estimate: Shape and markers.
+    """
+    shape = shape_at(problem.shape, estimate.parameters)
+    return GloveFit(HandModel(shape), attachment_at(right.attachment.layout, estimate.coordinates, shape))
 
 
 def eliminate_poses(

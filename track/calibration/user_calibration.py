@@ -41,11 +41,12 @@ from track.calibration.report import (
     contact_gaps,
     effective_noise,
     marker_noise,
+    repeated_share,
     standard_errors,
     still_joints,
 )
-from track.calibration.skin_coordinates import SkinPatch, attachment_at, nearest_coordinates, skin_points
-from track.calibration.solver import Progress, levenberg_marquardt
+from track.calibration.skin_coordinates import SkinPatch, nearest_coordinates, skin_points
+from track.calibration.solver import Progress, levenberg_marquardt, user_hand
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -158,12 +159,12 @@ def calibrate(
     check_motion(track, complete, start)
     problem, estimate = _initial_problem(markers, right, track)
     estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
-    rough = _user_hand(right, problem, estimate)
+    rough = user_hand(right, problem, estimate)
     rough_track = solve_frames(markers, rough, usable)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
     estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _MOST_STEPS, progress)
-    done = _user_hand(right, problem, estimate)
+    done = user_hand(right, problem, estimate)
     before = _gaps_before(right, markers, touches, usable)
     final = solve_frames(markers, done, usable, rough_track.qpos)
     position_errors, length_errors = standard_errors(problem, estimate, fit)
@@ -265,7 +266,7 @@ def _with_touches(
         problem.design,
         problem.radius,
         markers[track.frames[frames]],
-        noise=effective_noise(noise, len(frames)),
+        noise=effective_noise(noise, repeated_share(track.qpos, track.residuals), len(frames)),
         robust_scale=_SCALE_IN_NOISES * noise,
     )
     estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])
@@ -275,12 +276,6 @@ def _with_touches(
     contacts = initialize_contacts(model, touches, model.forward_kinematics(track.qpos[touching]))
     contacts = contacts._replace(frames=len(chosen) + np.arange(len(touches)))
     return larger, dataclasses.replace(estimate, contacts=contacts)
-
-
-def _user_hand(right: GloveFit, problem: Problem, estimate: Estimate) -> GloveFit:
-    """The right hand of an estimate in its glove."""
-    shape = shape_at(problem.shape, estimate.parameters)
-    return GloveFit(HandModel(shape), attachment_at(right.attachment.layout, estimate.coordinates, shape))
 
 
 def _touches(

@@ -13,17 +13,17 @@ from scipy.spatial.distance import cdist
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach
 from gloves.takes.tracked_take import INITIALIZED, TRACKED, TrackedTake
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
+from track.calibration.hand_size import sample_frames
 from track.calibration.user_calibration import Calibration, CalibrationError, calibrate_hands
 from track.capture_tracking import capture_frames, track_capture
 from track.commands.user_options import BOTH, Size, measured_users, users_of
-from track.hand_size import sample_frames
 from track.tracker import Tracker
 from track.user import save_user
 from train.labelers.protocol import Labeler
@@ -62,12 +62,13 @@ def calibrate(
     if out.suffix.lower() != ".json":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .json")
     check_outputs((capture, glove, labeler), [out])
-    start = users_of(glove, size, None, hands)
+    tracked = start = users_of(glove, size, None, hands)
     source, words = read_capture(capture), None
     network = labeler_for_glove(glove, labeler)
     if size == "auto":
-        start, words = measured_users(glove, hands, sample_frames(list(capture_frames(source))), network)
-    take, done = _round(source, start, start, network)
+        tracked, words = measured_users(glove, hands, sample_frames(list(capture_frames(source))), network)
+        start = tuple(attach(hand.layout, hand.model) for hand in tracked)
+    take, done = _round(source, tracked, start, network)
     if _leaves_markers(take, done):
         known = [calibration.hand for calibration in done]
         take, done = _round(source, known, start, network)

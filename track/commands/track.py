@@ -27,11 +27,11 @@ from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
 from track.bodies.rigid_body import RigidTemplate
+from track.calibration.hand_size import sample_frames
 from track.capture_tracking import capture_frames, track_capture, warm_up
 from track.commands.live import TrackedSource, track_live
 from track.commands.user_options import USUAL_SIZE, Size, measured_users, users_of
 from track.evaluation.take_summary import summarize, suspicions
-from track.hand_size import sample_frames
 from track.streams.point_stream import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker

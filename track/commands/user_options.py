@@ -10,7 +10,7 @@ from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, choices
 from handsim.hand.topology import Side
-from track.hand_size import fit_size
+from track.calibration.hand_size import fit_size
 from track.streams.point_stream import StreamedFrame
 from track.user import load_user
 from train.labelers.protocol import Labeler
@@ -46,7 +46,7 @@ def users_of(
 def measured_users(
     glove: str, hands: Sequence[Side], frames: Sequence[StreamedFrame], labeler: Labeler
 ) -> tuple[tuple[GloveFit, ...], str | None]:
-    """Hands of the size that fits some frames, in a glove as designed.
+    """Hands as measured in some frames.
 
     Args:
         glove: Marker layout: a shipped name or the path of a .toml file.
@@ -66,7 +66,7 @@ def measured_users(
     size = fit_size(frames, layout, hands, labeler)
     if size is None:
         return uncalibrated_users(glove, USUAL_SIZE, hands), None
-    return size.hands(layout, hands), str(size)
+    return size.hands(hands), str(size)
 
 
 def uncalibrated_users(glove: str, size: str, hands: Sequence[Side]) -> tuple[GloveFit, ...]:

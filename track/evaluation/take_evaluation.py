@@ -16,7 +16,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES
 from handsim.hand.topology import NUM_QPOS
 from track.baselines.plain_hand import MOST_RMS
-from track.hand_size import fit_size, sample_frames
+from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.point_stream import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from train.labelers.protocol import Labeler
@@ -138,7 +138,7 @@ def measured_users(take: Take, labeler: Labeler) -> list[GloveFit]:
         for seen in [seen_frame(take, number)]
     ]
     size = fit_size(sample_frames(frames), layout, sides, labeler)
-    return nominal_users(take) if size is None else list(size.hands(layout, sides))
+    return nominal_users(take) if size is None else list(size.hands(sides))
 
 
 def nearest_size(length: float) -> str:

@@ -1,7 +1,7 @@
-"""The size of a user's hands from a few labeled frames: the length and breadth that the markers fit best.
+"""The size and proportions of a user's hands from a few labeled frames.
 
-Hands of mean proportions are tried; what else is different about a user, `track.calibration` finds out from a
-longer capture.
+Length and breadth of hands of mean proportions are searched first; then the proportions and the positions of
+the markers follow as far as the frames tell. `user_calibration` finds the rest from a longer capture.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES, shape_from_measures
 from handsim.hand.topology import Side
+from track.calibration.hand_proportions import fit_proportions
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.point_stream import StreamedFrame
 from track.tracked_frame import Status
@@ -41,22 +42,30 @@ _WINDOWS: Final = 4  # parts of a capture that are looked at
 _WINDOW: Final = 60  # frames of each
 
 
-class SizeFit(NamedTuple):
-    """The size of a user's hands."""
+class _Measured(NamedTuple):
+    """Labeled markers, and the hands of mean proportions that fit them best."""
 
-    length: float
-    """Hand length [m]."""
-    breadth: float
-    """Hand breadth [m]."""
+    markers: dict[Side, NDArray[np.float64]]
+    """Of each hand (F, M, 3) [m]; NaN where missing."""
+    measures: tuple[float, float]
+    """Length and breadth [m]."""
+
+
+class SizeFit(NamedTuple):
+    """Hands as measured."""
+
+    hand: GloveFit
+    """The right one; a left hand is its mirror image."""
     rms: float
-    """Median RMS distance of the markers from hands of this size [m]."""
+    """Median RMS distance of the markers from this hand [m]."""
 
     def __str__(self) -> str:
-        return f"{1e3 * self.length:.0f} x {1e3 * self.breadth:.0f} mm"
+        shape = self.hand.shape
+        return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm"
 
-    def hands(self, layout: MarkerLayout, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
-        """Hands of this size in a glove as designed."""
-        return tuple(_hand(self.length, self.breadth, layout, side) for side in sides)
+    def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
+        """The measured hands of these sides."""
+        return tuple(self.hand.with_side(side) for side in sides)
 
 
 def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
@@ -70,7 +79,7 @@ def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
 def fit_size(
     frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
 ) -> SizeFit | None:
-    """The size of the hands in some frames.
+    """The size and proportions of the hands in some frames.
 
     Args:
         frames: Frames of unlabeled points, as `sample_frames` gives, or the beginning of a stream.
@@ -79,28 +88,30 @@ def fit_size(
         labeler: Labeler of the glove.
 
     Returns:
-        The size, the same for both hands; None if no hand is found that shows most of its markers.
+        The hands, both of one shape; None if no hand is found that shows most of its markers.
     """
     for length in _LENGTHS:
-        size = _fit_from(length, frames, layout, sides, labeler)
-        if size is not None and abs(size.length - length) > _FAR:  # the labels are better with its own size
-            size = _fit_from(size.length, frames, layout, sides, labeler) or size
-        if size is not None:
-            return size
+        found = _measure_from(length, frames, layout, sides, labeler)
+        if (
+            found is not None and abs(found.measures[0] - length) > _FAR
+        ):  # the labels are better with its own size
+            found = _measure_from(found.measures[0], frames, layout, sides, labeler) or found
+        if found is not None:
+            return SizeFit(*fit_proportions(found.markers, _hand(*found.measures, layout, "right")))
     return None
 
 
-def _fit_from(
+def _measure_from(
     length: float,
     frames: Sequence[StreamedFrame],
     layout: MarkerLayout,
     sides: Sequence[Side],
     labeler: Labeler,
-) -> SizeFit | None:
-    """The size of hands that are labeled as hands of a length [m]."""
+) -> _Measured | None:
+    """What is measured on hands that are labeled as hands of a length [m]."""
     users = [_hand(length, usual_breadth(length), layout, side) for side in sides]
     markers = {side: some for side, some in _label(frames, users, labeler) if len(some) >= _FEWEST}
-    return _search(markers, layout) if markers else None
+    return _Measured(markers, _search(markers, layout)) if markers else None
 
 
 def usual_breadth(length: float) -> float:
@@ -134,8 +145,8 @@ def _label(
         yield user.side, np.array([some[row] for row in chosen]).reshape(-1, count, 3)
 
 
-def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> SizeFit:
-    """The length and breadth with the least RMS distance: length, then breadth, then length again."""
+def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> tuple[float, float]:
+    """The length and breadth [m] with the least RMS distance: length, then breadth, then length again."""
 
     def rms(length: float, breadth: float) -> float:
         fits = [
@@ -147,7 +158,7 @@ def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> S
     usual = usual_breadth(length)
     breadth = _least(lambda tried: rms(length, tried), _BREADTHS[0] * usual, _BREADTHS[1] * usual)
     length = _least(lambda tried: rms(tried, breadth), 0.95 * length, 1.05 * length)
-    return SizeFit(length, breadth, rms(length, breadth))
+    return length, breadth
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:

@@ -10,7 +10,7 @@ from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
 from poses.motion.motions import sample_motion
-from track.hand_size import fit_size, sample_frames, usual_breadth
+from track.calibration.hand_size import fit_size, sample_frames, usual_breadth
 from track.streams.point_stream import StreamedFrame
 from train.labelers.storage import load_labeler
 
@@ -38,11 +38,11 @@ def frames_of(shapes, *, seed: int, noise: float = 0.0015, seconds: float = 1.0)
 def test_lengths_from_children_to_the_longest_are_found(length):
     shape = shape_from_measures(length, usual_breadth(length))
     found = fit_size(frames_of([shape], seed=1), load_layout("dense19"), ["right"], load_labeler("dense19"))
-    assert found.length == pytest.approx(length, abs=0.004)
-    assert found.breadth == pytest.approx(usual_breadth(length), abs=0.005)
+    assert found.hand.shape.length == pytest.approx(length, abs=0.004)
+    assert found.hand.shape.breadth == pytest.approx(usual_breadth(length), abs=0.005)
     assert found.rms < 0.003
-    (hand,) = found.hands(load_layout("dense19"), ["right"])
-    assert hand.shape.length == pytest.approx(found.length) and hand.side == "right"
+    (hand,) = found.hands(["left"])
+    assert hand.shape.length == found.hand.shape.length and hand.side == "left"
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -50,8 +50,8 @@ def test_two_hands_of_other_proportions_have_one_size(seed):
     shape = sample_shape(ADULTS, rng=np.random.default_rng(seed))
     frames = frames_of([shape, shape.with_side("left")], seed=seed)
     found = fit_size(frames, load_layout("dense19"), ["right", "left"], load_labeler("dense19"))
-    assert found.length == pytest.approx(shape.length, abs=0.012)
-    assert str(found) == f"{1e3 * found.length:.0f} x {1e3 * found.breadth:.0f} mm"
+    assert found.hand.shape.length == pytest.approx(shape.length, abs=0.012)
+    assert str(found) == f"{1e3 * found.hand.shape.length:.0f} x {1e3 * found.hand.shape.breadth:.0f} mm"
 
 
 def test_frames_without_a_hand_have_no_size():
