@@ -92,6 +92,8 @@ class SolverConfig(_Settings):
     """RMS distance, limits and prior included, below which no further start is tried [m]."""
     most_steps: int = 30
     """Steps at most from each start."""
+    frame_accuracy: float = 0.00003
+    """In real time a fit ends when a step brings all markers together nearer by no more than this [m]."""
     easing_steps: int = 8
     """Steps at most at each widened scale of a robust loss."""
 

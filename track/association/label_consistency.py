@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+import numba
 import numpy as np
 
 from track.association.hand_state import Estimate, HandState, Prediction
@@ -14,7 +15,7 @@ from track.config import GatingConfig
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
-
+    from numpy.typing import NDArray
 
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
 
@@ -53,15 +54,51 @@ def gate_labels(
         prediction: The hand's predicted pose.
         config: The gate.
     """
+    _gate(
+        points,
+        labels,
+        prediction.positions,
+        state.variance,
+        config.prediction_spread,
+        config.prediction_factor,
+        config.gate,
+        config.most_gated,
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _gate(
+    points: NDArray[np.float64],
+    labels: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    spread: float,
+    factor: float,
+    gate: float,
+    most_gated: float,
+) -> None:
+    """Kernel of `gate_labels`.
+
+    Args:
+        points: The frame's points (P, 3) [m].
+        labels: Their labels (P,), overwritten.
+        positions: Predicted markers (M, 3) [m].
+        variance: Their variance (M,) [m^2].
+        spread: Least standard deviation beside it [m].
+        factor: The same as a multiple of what the hand's markers show.
+        gate: Squared Mahalanobis distance of the gate.
+        most_gated: Largest share of the labels to drop.
+    """
     labeled = np.flatnonzero(labels >= 0)
     if len(labeled) == 0:
         return
-    squares = ((points[labeled] - prediction.positions[labels[labeled]]) ** 2).sum(axis=1)
-    shown = config.prediction_factor**2 * np.median(squares) / _MEDIAN_SQUARE
-    variance = state.variance[labels[labeled]] + max(config.prediction_spread**2, shown)
-    gated = labeled[squares > config.gate * variance]
-    if len(gated) <= config.most_gated * len(labeled):
-        labels[gated] = -1
+    squares = np.empty(len(labeled))
+    for row, point in enumerate(labeled):
+        squares[row] = ((points[point] - positions[labels[point]]) ** 2).sum()
+    shown = max(spread**2, factor**2 * np.median(squares) / _MEDIAN_SQUARE)
+    outside = squares > gate * (variance[labels[labeled]] + shown)
+    if outside.sum() <= most_gated * len(labeled):
+        labels[labeled[outside]] = -1
 
 
 def exchange_labels(
@@ -83,28 +120,73 @@ def exchange_labels(
     Returns:
         The points whose label has changed.
     """
-    changed: list[int] = []
+    return _exchange(  # type: ignore[no-any-return]
+        points,
+        assigned,
+        positions,
+        config.exchange_spread,
+        config.prediction_factor,
+        config.exchange_distance,
+        config.exchange_margin,
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _exchange(
+    points: NDArray[np.float64],
+    assigned: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    spread: float,
+    factor: float,
+    distance: float,
+    margin: float,
+) -> NDArray[np.int64]:
+    """Kernel of `exchange_labels`.
+
+    What an exchange of i and j gains, (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2), is
+    -(p_i-p_j).(m_i-m_j) / s^2. The pair that gains most comes first; a point is exchanged once.
+
+    Args:
+        points: The frame's points (P, 3) [m].
+        assigned: Marker of each point (P,), -1 for none; overwritten.
+        positions: Predicted markers (K, 3) [m].
+        spread: Least standard deviation of the offset of two markers [m].
+        factor: The same as a multiple of what the markers show.
+        distance: Largest distance of two points that are exchanged [m].
+        margin: Least gain (log-odds).
+
+    Returns:
+        The points whose label has changed (E,).
+    """
     labeled = np.flatnonzero(assigned >= 0)
+    changed = np.empty(len(labeled), dtype=np.int64)
+    count = 0
     if len(labeled) < 2:
-        return np.array(changed, dtype=np.int64)
+        return changed[:0]
     seen, markers = points[labeled], positions[assigned[labeled]]
     offsets = seen - markers
-    offsets -= np.median(offsets, axis=0)
-    shown = config.prediction_factor**2 * np.median((offsets**2).sum(axis=1)) / _MEDIAN_SQUARE
-    variance = max(config.exchange_spread**2, shown)
-    # What an exchange of i and j gains: (|p_i-m_i|^2 + |p_j-m_j|^2 - |p_i-m_j|^2 - |p_j-m_i|^2) / (2 s^2).
-    cross = seen @ markers.T
-    own = np.diag(cross)
-    gains = (cross + cross.T - own[:, None] - own) / variance
-    apart = ((seen[:, None] - seen) ** 2).sum(axis=-1) > config.exchange_distance**2
-    gains[apart] = 0.0
-    while gains.max() > config.exchange_margin:
-        one, other = np.unravel_index(gains.argmax(), gains.shape)
-        pair = labeled[[one, other]]
-        assigned[pair] = assigned[pair[::-1]]
-        changed += pair.tolist()
-        gains[[one, other]], gains[:, [one, other]] = 0.0, 0.0
-    return np.array(changed, dtype=np.int64)
+    middle = np.array([np.median(offsets[:, 0]), np.median(offsets[:, 1]), np.median(offsets[:, 2])])
+    squares = ((offsets - middle) ** 2).sum(axis=1)
+    variance = max(spread**2, factor**2 * np.median(squares) / _MEDIAN_SQUARE)
+    free = np.ones(len(labeled), dtype=np.bool_)
+    while True:
+        most, one, other = margin, -1, -1
+        for i in range(len(labeled)):
+            for j in range(i):
+                gain, square = 0.0, 0.0
+                for k in range(3):
+                    apart = seen[i, k] - seen[j, k]
+                    gain -= apart * (markers[i, k] - markers[j, k]) / variance
+                    square += apart * apart
+                if gain > most and square <= distance**2 and free[i] and free[j]:
+                    most, one, other = gain, i, j
+        if one < 0:
+            return changed[:count]
+        free[one] = free[other] = False
+        first, second = labeled[one], labeled[other]
+        assigned[first], assigned[second] = assigned[second], assigned[first]
+        changed[count], changed[count + 1] = first, second
+        count += 2
 
 
 def fit_labels(

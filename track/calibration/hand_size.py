@@ -33,13 +33,14 @@ _SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longe
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
 _FAR: Final = 0.012  # [m] from the length that the labels were found with
 _PRECISION: Final = 0.001  # [m] of length
-_FRAMES: Final = 8  # of each hand that are fitted
+_FRAMES: Final = 8  # of each hand with which length and breadth are searched
+_PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted to
 _FEWEST: Final = 3  # frames with which a size is trusted
 _MISSING: Final = 0.2  # share of the markers at most in such a frame
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
-_PATIENCE: Final = 20  # frames without a hand after which another size is tried
-_WINDOWS: Final = 4  # parts of a capture that are looked at
-_WINDOW: Final = 60  # frames of each
+_PATIENCE: Final = 20  # frames with enough points for a hand, but none, after which another size is tried
+_WINDOWS: Final = 8  # parts of a capture that are looked at
+_WINDOW: Final = 30  # frames of each
 
 
 class _Measured(NamedTuple):
@@ -69,7 +70,7 @@ class SizeFit(NamedTuple):
 
 
 def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
-    """Parts of a capture for `fit_size`, of consecutive frames each: beginning, end and two between."""
+    """Parts of a capture for `fit_size`, of consecutive frames each: beginning, end and six between."""
     if len(frames) <= _WINDOWS * _WINDOW:
         return list(frames)
     starts = np.linspace(0, len(frames) - _WINDOW, _WINDOWS).astype(int)
@@ -132,25 +133,33 @@ def _label(
     """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them."""
     tracker, count = Tracker(users, labeler), users[0].layout.num_markers
     found: list[list[NDArray[np.float64]]] = [[] for _ in users]
-    for number, frame in enumerate(frames):
-        if number == _PATIENCE and not any(found):
+    in_vain = 0
+    for frame in frames:
+        if in_vain == _PATIENCE and not any(found):
             break
+        in_vain += len(frame.points) >= (1.0 - _MISSING) * count
         for hand, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
             if hand.status in _FITTED and len(hand.filled) <= _MISSING * count:
                 markers = hand.markers.copy()
                 markers[hand.filled] = np.nan
                 some.append(markers)
     for user, some in zip(users, found, strict=True):
-        chosen = np.linspace(0, len(some) - 1, min(_FRAMES, len(some))).astype(int)
-        yield user.side, np.array([some[row] for row in chosen]).reshape(-1, count, 3)
+        yield user.side, _spread_out(np.array(some).reshape(-1, count, 3), _PROPORTION_FRAMES)
+
+
+def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
+    """So many frames of markers (F, M, 3) at most, evenly spaced."""
+    return markers[np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)]
 
 
 def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> tuple[float, float]:
     """The length and breadth [m] with the least RMS distance: length, then breadth, then length again."""
 
+    few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
+
     def rms(length: float, breadth: float) -> float:
         fits = [
-            PoseSolver(_hand(length, breadth, layout, side)).solve(some).rms for side, some in markers.items()
+            PoseSolver(_hand(length, breadth, layout, side)).solve(some).rms for side, some in few.items()
         ]
         return float(np.median(np.concatenate(fits)))
 

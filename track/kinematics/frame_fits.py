@@ -48,6 +48,7 @@ def fit_frames(
     weights: SolverWeights,
     robust_scale: float,
     iterations: int,
+    small_gain: float,
 ) -> tuple[
     int,
     Float[np.ndarray, "T 27"],
@@ -69,6 +70,7 @@ def fit_frames(
         weights: Weights and limits.
         robust_scale: See `levenberg_marquardt`.
         iterations: Steps at most from each start.
+        small_gain: See `levenberg_marquardt`.
 
     Returns:
         Index of the first frame that cannot be solved (or -1), and the arrays of a `PoseFit`.
@@ -114,7 +116,7 @@ def fit_frames(
                     continue
                 most = iterations if part == 1.0 else min(iterations, weights.easing_steps)
                 cost, tried = levenberg_marquardt(
-                    hand, target, pose, prior_mean, precision, part * robust_scale, most, work
+                    hand, target, pose, prior_mean, precision, part * robust_scale, most, small_gain, work
                 )
                 steps[frame] += tried
             if cost < least:

@@ -32,7 +32,6 @@ _LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2  # [1/rad^2] of a hinge beyond i
 _FIRST_DAMPING: Final = 1e-4  # share of the diagonal; small, because most starts are near the minimum
 _LEAST_DAMPING: Final = 1e-10  # share of the diagonal; keeps the factor positive
 _MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from there on
-_SMALL_GAIN = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron; converged
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -44,6 +43,7 @@ def levenberg_marquardt(
     precision: Float[np.ndarray, "26"],
     robust_scale: float,
     most_steps: int,
+    small_gain: float,
     work: Workspace,
 ) -> tuple[float, int]:
     """Bring a pose to a minimum of its cost.
@@ -58,6 +58,7 @@ def levenberg_marquardt(
         robust_scale: Inverse square of the distance at which the robust loss levels off [1/m^2]; zero for
             plain least squares.
         most_steps: Steps at most.
+        small_gain: Expected decrease of the cost from which on a step is the last one.
         work: Buffers, overwritten.
 
     Returns:
@@ -82,7 +83,7 @@ def levenberg_marquardt(
         if better:
             qpos[:] = trial
             cost = trial_cost
-        if gain < _SMALL_GAIN:
+        if gain < small_gain:
             break
         if better:
             _linearize(hand, qpos, prior_mean, precision, robust_scale, weights, work)

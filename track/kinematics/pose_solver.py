@@ -19,6 +19,7 @@ from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_QPOS
 from track.config import SolverConfig
 from track.kinematics.frame_fits import FEWEST_MARKERS, SolverWeights, fit_frames
 from track.kinematics.joint_prior import JointPrior
+from track.kinematics.levenberg_marquardt import MARKER_NOISE
 from track.kinematics.marker_kinematics import HandArrays, hand_arrays
 from track.kinematics.marker_prediction import (
     MarkerPrediction,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import ArrayLike, NDArray
 
+_CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
 _NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # a pose, with precision zero
 
 
@@ -86,6 +88,7 @@ class PoseSolver:
         self._shapes: StartingShapes = starting_shapes(fit)
         self._robust_scale = 0.0 if outlier_distance is None else outlier_distance**-2
         self._most_steps = config.most_steps
+        self._small_gain = (config.frame_accuracy / MARKER_NOISE) ** 2
         self._weights = SolverWeights(
             config.rest_spread**-2,
             config.complete_digit_factor,
@@ -132,7 +135,7 @@ class PoseSolver:
                 )
         angles, precision = _rows(prior, len(targets))
         steps = self._most_steps if iterations is None else iterations
-        wrong, fit = self._run(targets, starts, angles, precision, _NO_WRIST, steps)
+        wrong, fit = self._run(targets, starts, angles, precision, _NO_WRIST, steps, _CONVERGED)
         if wrong >= 0:
             present = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
             if present < FEWEST_MARKERS:
@@ -165,8 +168,8 @@ class PoseSolver:
             wrist_spread: Standard deviations of that position [m] and orientation [rad].
         """
         wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
-        precision = spread[None] ** -2.0
-        return self._run(target[None], start[None], angles[None], precision, wrist_prior, self._most_steps)[1]
+        precision, one = spread[None] ** -2.0, (target[None], start[None], angles[None])
+        return self._run(*one, precision, wrist_prior, self._most_steps, self._small_gain)[1]
 
     def _run(
         self,
@@ -176,6 +179,7 @@ class PoseSolver:
         precision: NDArray[np.float64],
         wrist: NDArray[np.float64],
         iterations: int,
+        small_gain: float,
     ) -> tuple[int, PoseFit]:
         """Index of the first frame that cannot be solved (or -1), and the fits; see `fit_frames`."""
         wrong, *arrays = fit_frames(
@@ -190,6 +194,7 @@ class PoseSolver:
             self._weights,
             self._robust_scale,
             iterations,
+            small_gain,
         )
         return wrong, PoseFit(*arrays)
 
