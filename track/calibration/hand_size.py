@@ -149,12 +149,14 @@ def _label(
 
 def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     """So many frames of markers (F, M, 3) at most, evenly spaced."""
-    return markers[np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)]
+    chosen: NDArray[np.float64] = markers[
+        np.linspace(0, len(markers) - 1, min(most, len(markers))).astype(int)
+    ]
+    return chosen
 
 
 def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> tuple[float, float]:
     """The length and breadth [m] with the least RMS distance: length, then breadth, then length again."""
-
     few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
 
     def rms(length: float, breadth: float) -> float:

@@ -67,8 +67,10 @@ def test_a_hand_that_comes_late_is_measured():
     shown = frames_of([shape], seed=2)
     strays = np.random.default_rng(0).uniform(-1.0, 1.0, (len(shown), 3, 3))
     frames = [StreamedFrame(t, t / RATE, points, np.arange(3)) for t, points in enumerate(strays)]
+    late = len(shown)
     frames += [
-        StreamedFrame(t, t / RATE, *shown[t - len(shown)][2:]) for t in range(len(shown), 2 * len(shown))
+        StreamedFrame(late + frame.number, (late + frame.number) / RATE, frame.points, frame.ids + 3)
+        for frame in shown
     ]
     found = fit_size(frames, load_layout("dense19"), ["right"], load_labeler("dense19"))
     assert found.hand.shape.length == pytest.approx(0.19, abs=0.005)
