@@ -74,17 +74,14 @@ def label_hands(
             settled.append(complete or len(hands) >= 2)
         told(sum(settled[first:]))
     starts = np.concatenate([[0], np.cumsum([len(points) for points in frames])]).astype(np.int64)
-    previous = previous_points(
-        np.concatenate([np.zeros((0, 3)), *frames]),
-        starts,
-        min(_FARTHEST, _SPEED / rate + _NOISE),
-        min(_FARTHEST, 0.5 * _ACCELERATION / rate**2 + _NOISE),
-    )
+    points = np.concatenate([np.zeros((0, 3)), *frames])
+    previous = _linked(points, starts, np.full(len(points), -1), rate)
     sides = sides_of(found, starts, previous)
     by_side = [dict(zip(side, hands, strict=True)) for side, hands in zip(sides, found, strict=True)]
     follower = Follower(frames, by_side, finder, previous, rate)
     follower.follow(settled, told)
     labels, confidence = _in_a_row(starts, by_side, finder.num_markers)
+    previous = _linked(points, starts, labels, rate)
     labels, confidence = vote(
         labels,
         confidence,
@@ -98,6 +95,16 @@ def label_hands(
         _frame_labels(labels[first:last][back], confidence[first:last][back], finder.num_markers)
         for (first, last), back in zip(pairwise(starts), map(np.argsort, orders), strict=True)
     ]
+
+
+def _linked(
+    points: NDArray[np.float64], starts: NDArray[np.int64], labels: NDArray[np.int64], rate: float
+) -> NDArray[np.int64]:
+    """Which point of the frame before each point was, see `previous_points`."""
+    first, next_one = _SPEED / rate + _NOISE, 0.5 * _ACCELERATION / rate**2 + _NOISE
+    return previous_points(  # type: ignore[no-any-return]
+        points, starts, labels, min(_FARTHEST, first), min(_FARTHEST, next_one)
+    )
 
 
 def _two_best(hands: list[FoundHand]) -> list[FoundHand]:

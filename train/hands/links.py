@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numba
 import numpy as np
@@ -10,6 +10,10 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
+
+
+AMBIGUOUS: Final = 0.4
+"""Share of the second distance above which the nearest point may be another one, so that labels decide."""
 
 
 def clusters(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[np.int64]]:
@@ -47,16 +51,83 @@ def _single_linkage(points: NDArray[np.float64], distance: float) -> NDArray[np.
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _next_point(
+    expected: NDArray[np.float64],
+    reach: float,
+    label: int,
+    points: NDArray[np.float64],
+    labels: NDArray[np.int64],
+    miss: float,
+) -> tuple[int, float]:
+    """Which point of a frame a point is, -1 for none, and its squared distance.
+
+    Args:
+        expected: Where the point is expected (3,) [m].
+        reach: Longest distance from there [m].
+        label: Its label, -1 for none.
+        points: Points of the frame (N, 3) [m].
+        labels: Their labels (N,).
+        miss: Squared distance of points from where they are expected, by their labels [m^2].
+    """
+    nearest, at, second = np.inf, -1, np.inf  # squared distances
+    best, least = -1, np.inf  # without points of other labels
+    for new in range(len(points)):
+        squared = _squared(expected, points[new])
+        if squared < nearest:
+            nearest, at, second = squared, new, nearest
+        else:
+            second = min(second, squared)
+        if squared < least and (label < 0 or labels[new] < 0 or labels[new] == label):
+            best, least = new, squared
+    if max(nearest, miss) <= AMBIGUOUS**2 * second:
+        best, least = at, nearest
+    return (best, least) if least < reach**2 else (-1, np.inf)
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _usual_miss(
+    expected: NDArray[np.float64],
+    before: NDArray[np.int64],
+    points: NDArray[np.float64],
+    labels: NDArray[np.int64],
+) -> float:
+    """Median of the squared distances of labeled points from where they are expected [m^2], 0 without any.
+
+    Args:
+        expected: Where the points of the frame before are expected (O, 3) [m].
+        before: Their labels (O,), -1 for none.
+        points: Points of a frame (N, 3) [m].
+        labels: Their labels (N,).
+    """
+    squares = np.empty(len(points))
+    count = 0
+    for new in range(len(points)):
+        for old in range(len(before)):
+            if labels[new] >= 0 and before[old] == labels[new]:
+                squares[count] = _squared(expected[old], points[new])
+                count += 1
+                break
+    return float(np.median(squares[:count])) if count else 0.0
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def previous_points(
-    points: Float[np.ndarray, "P 3"], starts: Int[np.ndarray, "T+1"], reach: float, expected_reach: float
+    points: Float[np.ndarray, "P 3"],
+    starts: Int[np.ndarray, "T+1"],
+    labels: Int[np.ndarray, "P"],
+    reach: float,
+    expected_reach: float,
 ) -> Int[np.ndarray, "P"]:
     """Which point of the frame before each point was, -1 where none is: the nearest both ways.
 
-    A point that was followed once is expected where its last step leads it.
+    A point that was followed once is expected where its last step leads it. Where another point is about as
+    near, or the hand has moved nearly as far as its markers are apart, points of different labels are
+    different points.
 
     Args:
         points: Points of all frames in a row [m].
         starts: Where each frame starts among them, and where the last one ends.
+        labels: Label of each point, -1 for none.
         reach: Longest first step [m].
         expected_reach: Longest distance from where a point is expected [m].
     """
@@ -66,13 +137,13 @@ def previous_points(
     for frame in range(1, len(starts) - 1):
         before, now, end = starts[frame - 1], starts[frame], starts[frame + 1]
         back = np.full(end - now, -1)
-        nearest = np.full(end - now, reach**2)
+        nearest = np.full(end - now, np.inf)
+        miss = _usual_miss(expected[before:now], labels[before:now], points[now:end], labels[now:end])
         for old in range(before, now):
-            best, least = -1, reaches[old] ** 2
-            for new in range(now, end):
-                squared = _squared(expected[old], points[new])
-                if squared < least:
-                    best, least = new, squared
+            best, least = _next_point(
+                expected[old], reaches[old], labels[old], points[now:end], labels[now:end], miss
+            )
+            best += now if best >= 0 else 0
             if best >= 0 and least < nearest[best - now]:
                 back[best - now], nearest[best - now] = old, least
         for new in range(now, end):

@@ -22,7 +22,7 @@ _MARGIN: Final = 5  # of these times, beyond which no vote counts
 _FRAMES: Final = 1024  # that are counted at once
 _NO_LABEL: Final = 0.5  # weight of a frame in which a point has no label
 _SHARE: Final = 0.35  # of the votes that a label needs
-_AGREEING: Final = 0.7  # share of the paths between two frames that must lead from a marker to the same one
+_AGREEING: Final = 0.9  # share of the expected agreement of the labels along the paths between two frames
 
 
 def vote(
@@ -48,7 +48,7 @@ def vote(
         rate: Frames per second [Hz].
     """
     margin = int(np.ceil(_MARGIN * _FADING * rate))
-    previous = _agreeing(labels % num_markers, labels >= 0, starts, previous)
+    previous = _agreeing(labels % num_markers, np.where(labels >= 0, confidence, 0.0), starts, previous)
     elected, shares = np.full(len(labels), -1), np.zeros(len(labels))
     for first in range(0, len(starts) - 1, _FRAMES):
         last = min(first + _FRAMES, len(starts) - 1)
@@ -72,17 +72,27 @@ def vote(
 
 def _agreeing(
     names: NDArray[np.int64],
-    named: NDArray[np.bool_],
+    confidence: NDArray[np.float64],
     starts: NDArray[np.int64],
     previous: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """The links (P,) without those to a frame whose labels say otherwise; -1 for none."""
+    """The links (P,) without those to a frame in which labels change more often than they are wrong.
+
+    Args:
+        names: Label of each point (P,).
+        confidence: Probability (P,) that it is right; 0 where a point has none.
+        starts: Where each frame starts among the points, and where the last one ends.
+        previous: Which point of the frame before each point was (P,), -1 for none.
+    """
     frame = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    linked = np.flatnonzero((previous >= 0) & named)
-    linked = linked[named[previous[linked]]]
-    same = linked[names[linked] == names[previous[linked]]]
-    links, agreeing = (np.bincount(frame[some], minlength=len(starts) - 1) for some in (linked, same))
-    return np.where((agreeing < _AGREEING * links)[frame], -1, previous)
+    linked = np.flatnonzero((previous >= 0) & (confidence > 0.0))
+    linked = linked[confidence[previous[linked]] > 0.0]
+    before = previous[linked]
+    agreeing, expected = (
+        np.bincount(frame[linked], weights, minlength=len(starts) - 1)
+        for weights in (names[linked] == names[before], confidence[linked] * confidence[before])
+    )
+    return np.where((agreeing < _AGREEING * expected)[frame], -1, previous)
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
