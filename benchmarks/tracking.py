@@ -54,7 +54,7 @@ from track.user import load_user
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
-from train.simulation.room_settings import KINDS, Kind
+from train.simulation.room_settings import KINDS, SIMULATED_KINDS, SimulatedKind
 from train.simulation.takes import TakeConfig, simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
@@ -69,7 +69,7 @@ HANDS = {
 
 
 @cache
-def twin(kind: Kind, frames: int | None, seed: int) -> Take:
+def twin(kind: SimulatedKind, frames: int | None, seed: int) -> Take:
     return without_body(simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)))
 
 
@@ -227,7 +227,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("sections", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}")
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=SIMULATED_KINDS)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--frames", type=int, help="of every twin; the paper's number when not given")
     parser.add_argument("--free", type=float, default=40.0, help="free motion in a calibration capture [s]")

@@ -7,6 +7,7 @@ Settings:
 Takes, continuous and with IDs:
 - people: random hands, and the gloves as they are worn; training frames use it too.
 - motion: what hands and an object do, for each kind of capture.
+- real_like: takes whose people, speed and skin are like those of published captures.
 - sight: which cameras have a free view of which marker.
 - light_sources: markers, mirror images and stray reflections with their views.
 - room: light sources through the optical system into a `Take`.

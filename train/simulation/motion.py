@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from poses.grasps.object_motion import sample_object_motion
 from poses.motion.scripts import scripted_motion
 from poses.motion.wrist_paths import WristConfig, wrist_path
 from train.simulation.room_settings import Kind
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 RATE: Final = 120.0
 """Frames per second of simulated takes [Hz]."""
@@ -45,6 +48,8 @@ class SceneMotion:
     moving_object: MovingObject | None = None
     rate: float = RATE
     """Frames per second [Hz]."""
+    skin: tuple[Float[np.ndarray, "T M 3"], ...] = ()
+    """Displacement of each hand's markers by its skin, in the world [m]; none when empty."""
 
     @property
     def num_frames(self) -> int:

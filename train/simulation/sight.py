@@ -41,6 +41,8 @@ class SceneSight:
             hand.fit.attachment.markers(hand.fit.model, bones)
             for hand, bones in zip(self.scene.hands, self.T_world_bone, strict=True)
         ]
+        for part, moved in zip(parts, self.scene.skin, strict=False):
+            part[0][:] += moved
         if self.scene.moving_object is not None:
             rigid_object, pose = (
                 self.scene.moving_object.rigid_object,

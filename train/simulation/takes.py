@@ -17,8 +17,16 @@ from handsim.errors import ArgumentError, PoseError, choices
 from handsim.space.cameras import ROOM_CENTER, check_outside_volume, load_rig
 from train.simulation.motion import SceneMotion, sample_scene_motion
 from train.simulation.people import sample_adult_hands, wear_gloves
+from train.simulation.real_like import NUM_FRAMES, sample_real_like_scene
 from train.simulation.room import record_take
-from train.simulation.room_settings import TWINS, Kind, OpticsOptions
+from train.simulation.room_settings import (
+    SIMULATED_KINDS,
+    TWINS,
+    Kind,
+    OpticsOptions,
+    RoomConfig,
+    SimulatedKind,
+)
 
 WRIST_VOLUME: Final = 0.5
 """Half side of the cube that wrists stay in [m]; no camera may stand there."""
@@ -30,9 +38,9 @@ _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)
 class TakeConfig:
     """Everything that decides the bytes of a simulated take; takes have 120 frames per second [Hz]."""
 
-    kind: Kind = "single-hand"
+    kind: SimulatedKind = "single-hand"
     num_frames: int | None = None
-    """Frames; the paper's number for this kind when not given."""
+    """Frames; the paper's number for this kind when not given, 3000 for real-like."""
     glove: str = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
     rig: str = "figure5"
@@ -42,13 +50,18 @@ class TakeConfig:
     """The optical system, where it differs from the one fitted to this kind of capture."""
 
     def __post_init__(self) -> None:
-        if self.kind not in TWINS:
-            raise ArgumentError(choices(self.kind, TWINS, noun="kind of capture"))
+        if self.kind not in SIMULATED_KINDS:
+            raise ArgumentError(choices(self.kind, SIMULATED_KINDS, noun="kind of capture"))
         if self.num_frames is not None and self.num_frames < 1:
             raise ArgumentError(f"num_frames is {self.num_frames}, expected at least 1")
         if self.seed < 0:
             raise ArgumentError(f"seed is {self.seed}, expected 0 or more")
-        self.optics.applied(TWINS[self.kind].room.optics)  # raises what is out of range
+        self.optics.applied(self.room.optics)  # raises what is out of range
+
+    @property
+    def room(self) -> RoomConfig:
+        """The room of the paper's capture; of the one with two hands for real-like."""
+        return TWINS["hand-hand" if self.kind == "real-like" else self.kind].room
 
 
 def simulate_take(config: TakeConfig) -> Take:
@@ -65,14 +78,17 @@ def simulate_take(config: TakeConfig) -> Take:
         ArgumentError: The rig is unknown, damaged or stands in the hands' way.
         PoseError: None of the people drawn can do what this kind of capture asks for.
     """
-    twin = TWINS[config.kind]
-    key = list(TWINS).index(config.kind), twin.draw
+    kind = config.kind
+    key = SIMULATED_KINDS.index(kind), 0 if kind == "real-like" else TWINS[kind].draw
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=key))
     rig, layout = load_rig(config.rig), load_layout(config.glove)
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
-    scene = sample_scene(config.kind, layout, config.num_frames or twin.paper.frames, rng=rng)
-    optics = config.optics.applied(twin.room.optics).worn(layout.radius)
-    room = dataclasses.replace(twin.room, optics=optics)
+    if kind == "real-like":
+        scene = sample_real_like_scene(layout, config.num_frames or NUM_FRAMES, rng=rng)
+    else:
+        scene = sample_scene(kind, layout, config.num_frames or TWINS[kind].paper.frames, rng=rng)
+    optics = config.optics.applied(config.room.optics).worn(layout.radius)
+    room = dataclasses.replace(config.room, optics=optics)
     settings = dataclasses.asdict(config) | {"room": dataclasses.asdict(room)}
     del settings["optics"]  # the room has all of them
     return record_take(scene, rig, room, settings, rng=rng)
