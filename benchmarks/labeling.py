@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,8 +24,6 @@ from train.data.augmentation import Corruption, corrupt
 from train.labelers.depth_image import depth_images
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
-from train.labelers.set_labeler import TrainedSetLabeler
-from train.labelers.set_network import LabelScores
 from train.labelers.storage import load_labeler, load_network
 from train.labelers.views import principal_axes
 from train.simulation.held_out import held_out_markers
@@ -54,13 +51,11 @@ def main() -> None:
         export_onnx(cnn, names, Path(folder) / "cnn.onnx")
         paper_onnx = OnnxLabeler(Path(folder) / "cnn.onnx")
         images = convolutions(cnn, Path(folder) / "cnn.onnx")
-    traced = TrainedSetLabeler(TracedNetwork(network), names)
     labeler, paper = load_labeler("dense19"), labeler_of(cnn, names)
     few = frames[: max(1, count // 20)]
     runs: dict[str, tuple[Callable[[np.ndarray], object], list[np.ndarray]]] = {
         "set labeler, onnxruntime": (lambda frame: onnx.label_frames([frame]), frames),
-        "set labeler, torch traced": (lambda frame: traced.label_frames([frame]), frames),
-        "set labeler, torch": (lambda frame: labeler.label_frames([frame]), frames),
+        "set labeler, numpy": (lambda frame: labeler.label_frames([frame]), frames),
         "paper's network, torch": (lambda frame: paper.label_frames([frame]), few),
         "paper's network, onnxruntime": (lambda frame: paper_onnx.label_frames([frame]), few),
         "- one image, torch": (lambda _: images["torch"](), few),
@@ -76,22 +71,6 @@ def main() -> None:
         start = time.perf_counter()
         batched.label_frames(frames)
         print(f"set labeler, {name}, in batches: {1e3 * (time.perf_counter() - start) / count:.2f} ms a hand")
-
-
-class TracedNetwork(torch.nn.Module):
-    """The set labeler without Python between its operations."""
-
-    def __init__(self, network: torch.nn.Module) -> None:
-        super().__init__()
-        example = torch.randn(1, 20, 3), torch.ones(1, 20, dtype=torch.bool)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            traced = torch.jit.trace(network.eval(), example, strict=False, check_trace=False)
-            self.traced = torch.jit.freeze(traced)
-
-    def forward(self, points: torch.Tensor, present: torch.Tensor) -> LabelScores:
-        """What the network gives."""
-        return LabelScores(*self.traced(points, present))
 
 
 def convolutions(cnn: torch.nn.Module, path: Path) -> dict[str, Callable[[], object]]:

@@ -9,6 +9,7 @@ import torch
 
 from train.data.batches import Batch
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+from train.labelers.set_inference import CloudScorer
 from train.labelers.set_network import SetLabeler, labeling_loss
 from train.threads import labeling_threads
 
@@ -30,6 +31,7 @@ class TrainedSetLabeler:
     def __init__(self, network: SetLabeler, marker_names: tuple[str, ...]) -> None:
         self.network = network.eval()
         self.marker_names = marker_names
+        self._scorer: CloudScorer | None = None  # made for the first cloud that comes alone
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
@@ -37,6 +39,11 @@ class TrainedSetLabeler:
 
     @torch.inference_mode()
     def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
+        if len(clouds) == 1:
+            if self._scorer is None:
+                self._scorer = CloudScorer(self.network)
+            by_point, by_label = self._scorer.score(clouds[0])
+            return label_by_scores(clouds, by_point[None], by_label[None])
         points, present = pad_clouds(clouds)
         with labeling_threads():
             scores = self.network(torch.from_numpy(points), torch.from_numpy(present))

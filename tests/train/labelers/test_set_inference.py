@@ -1,0 +1,55 @@
+"""The set labeler in numpy against the same network in torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from train.config import SetLabelerConfig
+from train.labelers.protocol import pad_clouds
+from train.labelers.set_inference import CloudScorer
+from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_network import SetLabeler
+from train.labelers.storage import load_labeler, load_network
+from train.simulation.held_out import held_out_markers
+
+
+def compare(network: SetLabeler, points: np.ndarray) -> None:
+    with torch.inference_mode():
+        expected = network(*(torch.from_numpy(part) for part in pad_clouds([points])))
+    for mine, theirs in zip(CloudScorer(network).score(points), expected, strict=True):
+        np.testing.assert_allclose(mine, theirs[0].numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 19, 60])
+def test_shipped_weights_give_the_same_scores_anywhere(count, rng):
+    network, _ = load_network("dense19")
+    compare(network.eval(), rng.uniform(-0.1, 0.1, (count, 3)) + [1.0, -2.0, 5.0])
+
+
+def test_a_network_of_any_size_gives_the_same_scores(rng):
+    torch.manual_seed(0)
+    config = SetLabelerConfig(num_labels=7, width=24, gates=3, depth=2, num_distances=9, reach=0.3)
+    compare(SetLabeler(config).eval(), rng.uniform(-0.1, 0.1, (11, 3)))
+
+
+def test_huge_scores_do_not_overflow(rng):
+    network = SetLabeler(SetLabelerConfig(num_labels=5, depth=1))
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.mul_(30.0)
+    with np.errstate(over="raise", invalid="raise"):
+        for scores in CloudScorer(network.eval()).score(rng.uniform(-0.1, 0.1, (9, 3))):
+            assert np.isfinite(scores).all()
+
+
+def test_a_hand_alone_is_labeled_like_a_hand_in_a_batch():
+    labeler = load_labeler("dense19")
+    assert isinstance(labeler, TrainedSetLabeler)
+    hands = list(held_out_markers("dense19", 20, seed=3))
+    for alone, together in zip(
+        [labeler.label_frames([hand])[0] for hand in hands], labeler.label_frames(hands), strict=True
+    ):
+        np.testing.assert_array_equal(alone.labels, together.labels)
+        np.testing.assert_allclose(alone.confidence, together.confidence, atol=1e-4)
