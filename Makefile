@@ -10,11 +10,11 @@ DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format fuzz figures chaos truth docs clean drawing
+.PHONY: help demo test lint format fuzz fuzz-coverage figures chaos truth docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
-	@sed -n 's/^\([a-z]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST)
+	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST)
 
 demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
@@ -34,6 +34,10 @@ format: $(INSTALLED)  ## put the code into its format
 
 fuzz: $(INSTALLED)  ## damaged files for every reader: CASES=20000 of each, TARGET=c3d for one
 	$(BIN)/python -m tests.fuzzing --cases $(or $(CASES),20000) $(if $(TARGET),--target $(TARGET))
+
+fuzz-coverage: $(INSTALLED)  ## the same by coverage: MOST=600 seconds of each, TARGET=c3d for one; installs atheris
+	$(BIN)/pip install --quiet --constraint constraints.txt atheris
+	$(BIN)/python -m tests.fuzzing.coverage --seconds $(or $(MOST),600) $(if $(TARGET),--target $(TARGET))
 
 docs: $(INSTALLED)  ## the guide and the API reference, into docs/_build
 	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs docs/_build
