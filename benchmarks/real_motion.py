@@ -1,6 +1,7 @@
 """The tracker on real hands in motion: published poses, two hands, made into captures without names.
 
-python benchmarks/real_motion.py DATA [--conditions clean gaps close new-ids exchanged-ids] [--frames 0]
+python benchmarks/real_motion.py DATA [--conditions clean gaps close new-ids exchanged-ids]
+    [--frames 0] [--label]
 
 DATA is a folder of Mocap_SIG18_Data (Han et al. 2018), with User1/capture1 and so on in it. The left and the
 right file of a sequence are one person's two hands at one time. Three captures move about three times as fast
@@ -14,7 +15,8 @@ new-ids        gaps, every point of every frame with a new ID
 exchanged-ids  gaps, and in one of 40 frames two points within 22 mm exchange their IDs for good
 
 A frame is right if every marker of both hands has its own point, or rightly none, and no ghost is a marker.
-The size of the hands is measured (`handsim track --size auto`).
+The size of the hands is measured (`handsim track --size auto`). With --label nothing is tracked: the labels
+are those of `handsim label`, which uses no IDs.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ from gloves.layout import load_layout
 from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.point_stream import StreamedFrame
 from track.tracker import Tracker
+from train.hands.frame_hands import HandFinder
+from train.hands.labeling import label_hands
 from train.labelers.storage import load_labeler
 
 SIDES = ("right", "left")
@@ -45,6 +49,7 @@ def main() -> None:
     parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=CONDITIONS)
     parser.add_argument("--frames", type=int, default=0, help="of each capture at most; all when 0")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--label", action="store_true", help="label instead of tracking")
     options = parser.parse_args()
     torch.set_num_threads(1)
     print(describe("torch", "numba"))
@@ -56,7 +61,7 @@ def main() -> None:
         name, row, times = "/".join(folder.parts[-2:]), [], []
         for condition in options.conditions:
             scene = make_scene(folder, condition, seed=options.seed, frames=options.frames)
-            right, seconds = track(scene)
+            right, seconds = (label if options.label else track)(scene)
             row.append(100.0 * right.mean())
             times.append(1e3 * seconds)
         table.append(row)
@@ -71,6 +76,28 @@ def print_row(name: str, values: object, rest: str = "") -> None:
     print(f"{name} | " + " | ".join(f"{value:.2f}" for value in values) + rest, flush=True)  # type: ignore[attr-defined]
 
 
+def label(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """The same for `handsim label`; the computing time is the mean one."""
+    seen = np.isfinite(scene.points[..., 0])
+    frames = [scene.points[t, seen[t]] for t in range(len(seen))]
+    finder = HandFinder(load_labeler("dense19"), load_layout("dense19"), rng=np.random.default_rng(0))
+    start = perf_counter()
+    found = label_hands(frames, finder, scene.rate)
+    seconds = np.full(len(frames), (perf_counter() - start) / len(frames))
+    truth = _truth(scene)
+    labels = [
+        np.where(one.labels >= 0, one.labels + np.where(one.sides < 0, len(NAMES), 0), -1) for one in found
+    ]
+    right = np.array([(mine == truth[here]).all() for mine, here in zip(labels, seen, strict=True)])
+    return right[scene.counted], seconds
+
+
+def _truth(scene: Scene) -> np.ndarray:
+    """Marker of each column, -1 for a ghost."""
+    columns = np.arange(scene.points.shape[1])
+    return np.where(columns < 2 * len(NAMES), columns, -1)
+
+
 def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Which counted frames are right, and the computing time of each frame [s]."""
     seen = np.isfinite(scene.points[..., 0])
@@ -82,8 +109,7 @@ def track(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     size = fit_size(sample_frames(frames), layout, SIDES, labeler)
     assert size is not None
     tracker = Tracker(size.hands(SIDES), labeler)
-    columns = np.arange(scene.points.shape[1])
-    truth = np.where(columns < 2 * len(NAMES), columns, -1)
+    truth = _truth(scene)
     right, seconds = np.zeros(len(frames), dtype=bool), np.zeros(len(frames))
     for t, frame in enumerate(frames):
         start = perf_counter()
