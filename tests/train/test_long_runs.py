@@ -231,7 +231,7 @@ def test_labelers_use_one_thread_unless_told(two_threads, rng):
     seen = []
     forward = labeler.network.forward
     labeler.network.forward = lambda *args: (seen.append(torch.get_num_threads()), forward(*args))[1]
-    frame = [rng.normal(scale=0.05, size=(19, 3))]
+    frame = [rng.normal(scale=0.05, size=(19, 3))] * 2  # one alone is labeled without torch
     labeler.label_frames(frame)
     label_on(2)
     try:
