@@ -132,7 +132,7 @@ def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 
     frame_bytes = words * np.dtype(dtype).itemsize
     present = max(0, len(data) - start) // frame_bytes
     stated = _stated_frames(parameters, int(header[4]) - int(header[3]) + 1)
-    if stated == 0:
+    if stated == 0 or (stated is None and present == 0):
         raise CaptureError("no frames: the file holds no frame")
     if stated is not None and present < stated:
         raise CaptureError(f"truncated: the file states {stated} frames and has room for {present}")
