@@ -7,6 +7,8 @@ their labels, units and rate; analog channels, events and force plates are passe
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -57,8 +59,8 @@ def write_c3d(path: Path, capture: Capture) -> None:
     programs that do not read it (ezc3d 1.7 is one) see the first 65,535 frames.
 
     Raises:
-        CaptureError: A label is too long, or the disk did not take the whole file.
-        OSError: The file cannot be opened.
+        CaptureError: A label is too long.
+        OSError: The file cannot be opened, or the disk did not take the whole file.
     """
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:
@@ -109,7 +111,7 @@ def _check_written(path: Path, capture: Capture) -> None:
         expected = (int(header[8]) - 1) * _BLOCK + 16 * capture.num_frames * len(capture.names)
         if path.stat().st_size >= expected:
             return
-    raise CaptureError("cannot be written: the disk did not take the whole file")
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
 def _read_points(data: bytes, parameters: Parameters) -> Float[np.ndarray, "T N 4"]:

@@ -153,7 +153,7 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
         text = data.decode("utf-8")
         deep = _DOTTED.search(text)
         if deep is not None:
-            raise ValueError(f"the key {deep[0][:20]}... has too many parts")
+            raise ValueError(f"the key {deep[0][:20]!r}... has too many parts")
         return tomllib.loads(text)
     except UnicodeDecodeError as cause:
         raise error(f"{path}: not a TOML file: it is not UTF-8 text") from cause

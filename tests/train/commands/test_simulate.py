@@ -183,3 +183,10 @@ def test_table_3_has_a_row_a_capture_with_the_papers_figures(capsys, monkeypatch
         assert share.endswith(f"({100 * ghosts:.2f} %)")
         assert by_marker.count("%") == 3
     assert any("real finger markers" in line for line in lines)
+
+
+def test_a_capture_that_no_memory_holds_is_refused_at_once(tmp_path, capsys):
+    assert main(["simulate", "--num-frames", "1000000000", "--out", str(tmp_path / "take.c3d")]) == 1
+    said = capsys.readouterr().err
+    assert "1000000000 frames need 20 TB of memory" in said and "shorter captures" in said
+    assert list(tmp_path.iterdir()) == []
