@@ -24,13 +24,15 @@ from handsim.errors import DatasetError, WeightsError
 from handsim.files.json_files import claim
 from train.config import Kind, TrainConfig
 from train.data.augmentation import Corruption
-from train.data.batches import Batch, draw_batch, paper_corruption
+from train.data.batches import Batch, draw_batch, paper_corruption, right_hands
 from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler, paper_report
 from train.evaluation.matching_costs import choose_costs
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import labeler_of
+from train.labelers.set_network import SetLabeler
 from train.labelers.storage import save_network
+from train.matching.prior_learning import learn_pose_prior
 from train.reports.run_page import write_run_page
 from train.threads import TrainingThreads, check_threads
 from train.training_state import TrainingState, passed
@@ -179,6 +181,9 @@ def _finish(run: _Run, dataset: Dataset, out: Path) -> dict[str, Any]:
     network = run.state.averaged()
     if isinstance(network, DeepLabelCNN):
         choose_costs(network, run.names, _few(held_out, _COST_FRAMES))
+    else:
+        assert isinstance(network, SetLabeler)
+        network.prior = learn_pose_prior(right_hands(run.rows), rng=np.random.default_rng(config.seed))
     card, report = _card(network, _few(held_out, _CARD_FRAMES[config.labeler]), config, dataset)
     if run.state.fabric.is_global_zero:
         card["curve"] = run.state.history.accuracies

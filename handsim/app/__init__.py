@@ -5,6 +5,7 @@
 - completion: a script that completes commands and options in a shell
 - presets: commands whose defaults come from a preset
 - demo: what the steps of `handsim demo` share
+- memory: refuses work that the machine has no memory for
 - messages: lines as they are, and warnings as lines
 - progress: the progress bar of all commands, and lines in its place in a log
 - live_status: one line of status, renewed in place

@@ -7,6 +7,7 @@ Each target runs in a process of its own, beginning with its valid files and tho
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import atheris
 import numpy as np
 
 _PACKAGES: Final = ["handsim", "gloves", "poses", "render", "track", "train"]
+_ENVIRONMENT: Final = os.environ | {"NUMBA_DISABLE_JIT": "1"}  # numba cannot compile what is instrumented
 _HERE: Final = "--here"  # in the process that fuzzes a target, whose imports are instrumented
 
 with atheris.instrument_imports(include=_PACKAGES) if _HERE in sys.argv else nullcontext():
@@ -43,7 +45,12 @@ def main() -> int:
         command = [sys.executable, "-m", "tests.fuzzing.coverage", _HERE, "--target", name]
         command += ["--seconds", str(options.seconds), "--keep", str(options.keep)]
         done = subprocess.run(
-            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+            command,
+            env=_ENVIRONMENT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
         )
         if done.returncode:
             failed.append(name)

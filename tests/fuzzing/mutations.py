@@ -37,8 +37,13 @@ def mutate_archive(data: bytes, rng: np.random.Generator) -> bytes:
     """Damage a zip archive: as a whole, or one of its members, whose checksum is then right."""
     if rng.random() < 0.2:
         return mutate(data, rng)
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {member.filename: archive.read(member) for member in archive.infolist()}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {member.filename: archive.read(member) for member in archive.infolist()}
+    except Exception:  # damaged before, in one of the many ways of zipfile
+        return mutate(data, rng)
+    if not members:
+        return mutate(data, rng)
     name = sorted(members)[int(rng.integers(len(members)))]
     if rng.random() < 0.05:
         del members[name]

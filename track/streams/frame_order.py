@@ -141,7 +141,7 @@ class FrameOrder:
                     first, second = sorted((one, new), key=lambda arrival: arrival.frame.time)
                     self.wild += len(self._doubtful) - 1
                     self._doubtful = []
-                    yield self._pass(first, restarted=self._last is not None)
+                    yield self._pass(first, restarted=not self._goes_on(first))
                     yield from self._add(second)
                     return
         self._doubtful.append(new)
@@ -184,6 +184,10 @@ class FrameOrder:
             return 0.0 < span <= waited + _FIRST_SLACK and 0 <= steps <= _FASTEST * span + 1.0
         longest = max(waited, max(steps, 1) * self._interval) + 0.5 * self._interval + _SLACK
         return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
+
+    def _goes_on(self, new: Arrival) -> bool:
+        """Whether a frame that another confirms goes on with the recording; the last header was wrong."""
+        return self._last is None or 0.0 < new.frame.time - self._last.frame.time <= _REORDERED
 
     def _missing(self, last: Arrival, new: Arrival) -> int:
         """The number of frames between two, as far as their times agree with their numbers."""

@@ -53,6 +53,12 @@ def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Ge
     return Batch(corrupt(markers, Corruption(occlude, config.ghosts, jitter), rng=rng), markers)
 
 
+def right_hands(rows: NDArray[np.void]) -> Float[np.ndarray, "B M 3"]:
+    """All markers of each row [m], of left hands mirrored."""
+    markers: NDArray[np.float64] = rows["markers"] @ _mirrors(rows["hand"])
+    return markers
+
+
 def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArray[np.float64]:
     """Symmetric matrices (B, 3, 3) that stretch along random orthogonal directions."""
     axes, _ = np.linalg.qr(rng.standard_normal((count, 3, 3)))

@@ -8,6 +8,5 @@
 - views, depth_image: from where the network of Han et al. 2018 sees a cloud, and what it sees.
 - cnn_network, sparse_convolution, cnn_labeler: that network, its first filters, the labeler around it.
 - onnx_labeler: a labeler as one ONNX file, run without torch.
-- matching: from scores or distances to a one-to-one labeling with a reject option.
 - side: left or right hand, from labeled points.
 """

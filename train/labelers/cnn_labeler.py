@@ -8,9 +8,9 @@ import numpy as np
 
 from train.config import CNNConfig
 from train.labelers.depth_image import depth_images
-from train.labelers.matching import match_distances
 from train.labelers.protocol import Labeling, check_output, label_in_batches, pad_clouds
 from train.labelers.views import MIRROR_IMAGE, MeanHand, spread_views
+from train.matching.assignment import match_distances
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
 import warnings
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from safetensors.numpy import load, save
 
 from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
@@ -17,6 +19,7 @@ from train.config import CNNConfig
 from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.protocol import Labeling, checked_names, label_by_scores, label_in_batches, pad_clouds
 from train.labelers.views import MeanHand
+from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
 _DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros
 _CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
+_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: safetensors in base64
 _IMAGES: Final = "images"  # its input
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
@@ -64,6 +68,7 @@ class OnnxLabeler:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
             metadata = self._session.get_modelmeta().custom_metadata_map
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
+            self._prior = _unpacked(metadata[_PRIOR]) if _PRIOR in metadata else None
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
             self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
         except Exception as error:  # onnxruntime's errors have no common class of their own
@@ -92,8 +97,9 @@ class OnnxLabeler:
 
     def _label_by_scores(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
         """The set labeler."""
-        scores = self._session.run(_OUTPUTS, dict(zip(_INPUTS, pad_clouds(clouds), strict=True)))
-        return label_by_scores(clouds, *scores)
+        given = dict(zip(_INPUTS, pad_clouds(clouds), strict=True))
+        by_point, by_label = self._session.run(_OUTPUTS, given)
+        return label_by_scores(clouds, by_point, by_label, self._prior)
 
     def _label_by_images(self, settings: str) -> Callable[[list[NDArray[np.float64]]], list[Labeling]]:
         """The paper's network, with what its metadata tells of its use."""
@@ -106,6 +112,11 @@ class OnnxLabeler:
             return predicted
 
         return CNNLabeler(positions, hand, config, self.marker_names).label_batch
+
+
+def _unpacked(text: str) -> PosePrior:
+    """The pose prior in a file's metadata."""
+    return PosePrior.of_tensors(load(base64.b64decode(text, validate=True)))
 
 
 def _place_of_digest(content: bytes) -> slice:
@@ -158,6 +169,9 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         inputs, outputs = list(_INPUTS), list(_OUTPUTS)
         axes = {name: {0: "frames", 1: "points"} for name in _INPUTS}
         axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
+        prior = getattr(network, "prior", None)
+        if isinstance(prior, PosePrior):
+            properties[_PRIOR] = base64.b64encode(save(prior.tensors())).decode()
     with atomic_write(path) as temporary, warnings.catch_warnings():
         # The newer exporter needs another package and fixes the sizes of expanded arrays.
         warnings.simplefilter("ignore")

@@ -10,7 +10,8 @@ import numpy as np
 
 from gloves.captures.plausibility import check_unit
 from handsim.errors import ArgumentError, WeightsError
-from train.labelers.matching import match_scores
+from train.matching.pose_prior import PosePrior
+from train.matching.verification import match_scores
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Int
@@ -129,15 +130,17 @@ def label_by_scores(
     clouds: Sequence[NDArray[np.float64]],
     point_scores: Float[np.ndarray, "B N M+1"],
     label_scores: Float[np.ndarray, "B M N+1"],
+    prior: PosePrior | None,
 ) -> list[Labeling]:
-    """Labelings from the log-probabilities of padded clouds, see `train.labelers.matching.match_scores`."""
+    """Labelings from the log-probabilities of padded clouds, see `train.matching.verification`."""
     longest = point_scores.shape[1]
     labelings = []
     for cloud, by_point, by_label in zip(clouds, point_scores, label_scores, strict=True):
         count = len(cloud)
         check_output(by_point[:count])
         check_output(by_label)
-        labelings.append(Labeling(*match_scores(by_point[:count], by_label[:, [*range(count), longest]])))
+        of_points = by_label[:, [*range(count), longest]]
+        labelings.append(Labeling(*match_scores(cloud, by_point[:count], of_points, prior)))
     return labelings
 
 

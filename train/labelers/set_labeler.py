@@ -43,11 +43,11 @@ class TrainedSetLabeler:
             if self._scorer is None:
                 self._scorer = CloudScorer(self.network)
             by_point, by_label = self._scorer.score(clouds[0])
-            return label_by_scores(clouds, by_point[None], by_label[None])
+            return label_by_scores(clouds, by_point[None], by_label[None], self.network.prior)
         points, present = pad_clouds(clouds)
         with labeling_threads():
             scores = self.network(torch.from_numpy(points), torch.from_numpy(present))
-        return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy())
+        return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy(), self.network.prior)
 
 
 def set_loss(network: torch.nn.Module, batch: Batch, device: torch.device) -> torch.Tensor:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from train.config import SetLabelerConfig
+from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -36,6 +37,8 @@ class SetLabeler(nn.Module):
     def __init__(self, config: SetLabelerConfig) -> None:
         super().__init__()
         self.config = config
+        self.prior: PosePrior | None = None
+        """What labelings are checked against; learned after training."""
         width, bumps = config.width, config.num_distances
         self.register_buffer("centers", torch.linspace(0.0, config.reach, bumps), persistent=False)
         self.embed = nn.Sequential(nn.Linear(bumps + 1, width), nn.SiLU(), nn.Linear(width, width))

@@ -14,12 +14,14 @@ from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 from train.labelers.protocol import Labeler, checked_names
+from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
-    from torch import nn
+    from torch import Tensor, nn
 
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
+_PRIOR: Final = "pose_prior."  # in the names of the prior's tensors
 _MOST_CARD: Final = 1 << 24  # bytes
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
@@ -86,7 +88,11 @@ def _read_network(weights: Path, card: Path) -> tuple[nn.Module, dict[str, Any]]
         if weights.stat().st_size < _bytes_of(config):  # before memory is asked for
             raise ValueError("it is too short for the network that its card describes")
         network = new_network(config)
-        network.load_state_dict(load_file(weights))
+        tensors = load_file(weights)
+        prior = {name: tensors.pop(name) for name in list(tensors) if name.startswith(_PRIOR)}
+        network.load_state_dict(tensors)
+        if prior:
+            network.prior = _read_prior(prior, config.num_labels)  # type: ignore[assignment]
     except WeightsError:
         raise
     except (HandSimError, SafetensorError, OSError, ValueError, LookupError, TypeError) as error:
@@ -97,6 +103,14 @@ def _read_network(weights: Path, card: Path) -> tuple[nn.Module, dict[str, Any]]
         if not tensor.isfinite().all():
             raise WeightsError(f"{weights} is damaged: {name} holds NaN or infinite values")
     return network, content
+
+
+def _read_prior(tensors: dict[str, Tensor], num_labels: int) -> PosePrior:
+    """The pose prior of a network with so many labels, from its tensors."""
+    prior = PosePrior.of_tensors({name.removeprefix(_PRIOR): one.numpy() for name, one in tensors.items()})
+    if prior.num_markers != num_labels:
+        raise WeightsError(f"the pose prior has {prior.num_markers} markers for {num_labels} labels")
+    return prior
 
 
 def _bytes_of(config: NetworkConfig) -> int:
@@ -116,10 +130,14 @@ def _damaged(weights: Path, error: Exception) -> WeightsError:
 
 
 def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None:
-    """Write weights and model card; `card` holds at least `marker_names`."""
+    """Write weights, with the pose prior if there is one, and model card with at least `marker_names`."""
+    import torch
     from safetensors.torch import save
 
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+    prior = getattr(network, "prior", None)
+    if isinstance(prior, PosePrior):
+        tensors |= {_PRIOR + name: torch.from_numpy(table) for name, table in prior.tensors().items()}
     with atomic_write(folder / WEIGHTS) as temporary:
         temporary.write_bytes(save(tensors))  # safetensors' own writing hides that a disk is full
     config: NetworkConfig = network.config  # type: ignore[assignment]

@@ -73,6 +73,16 @@ def test_a_server_that_starts_again_is_followed():
     assert (order.restarts, order.wild, order.late) == (2, 0, 0)
 
 
+@pytest.mark.parametrize(("number", "time"), [(10, 9.15), (12, 10.0)])
+def test_a_frame_with_a_damaged_header_does_not_look_like_a_restart(number, time):
+    """Time or number of the tenth frame are a little wrong: it passes, and the next ones do not fit it."""
+    order, packets = FrameOrder(), regular(range(30))
+    packets[10] = (number, time * INTERVAL, packets[10][2])
+    gone = passed(order, packets)
+    assert [told for _, told in gone[-19:]] == [told for _, told, _ in packets[11:]]
+    assert order.restarts == 0
+
+
 def test_a_pause_a_burst_and_another_rate_lose_nothing():
     order, packets = FrameOrder(), regular(range(20))
     packets += [(n, 5.0 + n * INTERVAL, 5.0 + n * INTERVAL) for n in range(20, 40)]  # the server paused

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from train.config import CNNConfig
 from train.labelers.cnn_network import DeepLabelCNN, position_loss
 from train.labelers.depth_image import depth_images
-from train.labelers.matching import GHOST, match_distances
 from train.labelers.views import random_views
+from train.matching.assignment import GHOST, match_distances
 
 
 @pytest.fixture(scope="module")

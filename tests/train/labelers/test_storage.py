@@ -64,3 +64,18 @@ def test_a_lost_tensor_is_told(tmp_path):
     write(tmp_path, SHIPPED, tensors)
     with pytest.raises(WeightsError, match="is damaged or not a labeler's"):
         load_labeler(tmp_path)
+
+
+def test_a_pose_prior_of_another_glove_is_told(tmp_path):
+    tensors = load_file(_SHIPPED / "dense19.safetensors")
+    others = load_file(_SHIPPED / "sparse13.safetensors")
+    priors = {name: table for name, table in others.items() if name.startswith("pose_prior.")}
+    write(tmp_path, SHIPPED, tensors | priors)
+    with pytest.raises(WeightsError, match="pose prior has 13 markers for 19 labels"):
+        load_labeler(tmp_path)
+
+
+def test_weights_without_a_pose_prior_are_read(tmp_path):
+    tensors = load_file(_SHIPPED / "dense19.safetensors")
+    write(tmp_path, SHIPPED, {name: one for name, one in tensors.items() if "pose_prior" not in name})
+    assert load_labeler(tmp_path).network.prior is None

@@ -8,7 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train.labelers.matching import GHOST, match_probabilities, match_scores, pair_probabilities
+from train.matching.assignment import GHOST, match_probabilities, pair_probabilities
+from train.matching.verification import match_scores
 
 
 def log_softmax(raw):
@@ -57,7 +58,7 @@ def test_every_point_and_every_label_is_spent_once(seed, count, num_labels):
     assert (probabilities >= 0).all()
     np.testing.assert_allclose(probabilities[:-1].sum(axis=1), 1.0)
     np.testing.assert_allclose(probabilities[:, :-1].sum(axis=0), 1.0, atol=0.2)  # nearly, after 20 rounds
-    labels, confidence = match_scores(by_point, by_label)
+    labels, confidence = match_scores(np.zeros((len(by_point), 3)), by_point, by_label, None)
     assert ((confidence >= 0) & (confidence <= 1)).all()
     assert labels.shape == confidence.shape == (count,)
 
@@ -76,13 +77,13 @@ def test_two_points_that_both_look_like_one_marker_share_it():
     """Alone each would be sure; together one of the two must be a ghost, and neither is sure any more."""
     by_point = np.log([[0.98, 0.02], [0.98, 0.02]])
     by_label = np.log([[0.49, 0.49, 0.02]])
-    labels, confidence = match_scores(by_point, by_label)
+    labels, confidence = match_scores(np.zeros((len(by_point), 3)), by_point, by_label, None)
     assert sorted(labels.tolist()) == [GHOST, 0]
     assert (confidence < 0.6).all()
 
 
 def test_scores_that_rule_something_out_altogether():
     by_point, by_label = np.array([[0.0, -1e4], [-1e4, 0.0]]), np.array([[0.0, -1e4, -1e4]])
-    labels, confidence = match_scores(by_point, by_label)
+    labels, confidence = match_scores(np.zeros((len(by_point), 3)), by_point, by_label, None)
     assert labels.tolist() == [0, GHOST]
     np.testing.assert_allclose(confidence, 1.0)

@@ -18,27 +18,8 @@ _WEIGHT: Final = 0.65
 """Weight of each of the two scores: 0.5 if they held the same information, 1 if they were independent."""
 _ROUNDS: Final = 20
 _NEVER: Final = 1e-30  # a probability whose logarithm is still a number
-_IMPOSSIBLE: Final = 1e6
-
-
-def match_scores(
-    point_scores: Float[np.ndarray, "N M+1"], label_scores: Float[np.ndarray, "M N+1"]
-) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """Most likely one-to-one labeling of one cloud.
-
-    A point may stay a ghost and a label occluded, each at its own cost, so nothing is forced (the paper's
-    equation 1 with a reject option).
-
-    Args:
-        point_scores: Log-probability of each label, and last of ghost, for each point.
-        label_scores: Log-probability of each point, and last of occluded, for each label.
-
-    Returns:
-        Label of each point (`GHOST` where none), and its probability, see `pair_probabilities`.
-    """
-    probabilities = pair_probabilities(point_scores, label_scores)
-    labels = match_probabilities(probabilities)
-    return labels, probabilities[np.arange(len(labels)), labels]  # GHOST, -1, is the last column
+IMPOSSIBLE: Final = 1e6
+"""Cost of a pair that cannot be."""
 
 
 def pair_probabilities(
@@ -64,15 +45,25 @@ def pair_probabilities(
 
 def match_probabilities(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Int[np.ndarray, "N"]:
     """The one-to-one labeling with the greatest product of probabilities; `GHOST` where a point has none."""
+    return solve_assignment(assignment_costs(probabilities))[1]
+
+
+def assignment_costs(probabilities: Float[np.ndarray, "N+1 M+1"]) -> Float[np.ndarray, "N M+N"]:
+    """What each pair of a point and a label costs, in logarithms; column M + i is point i as a ghost."""
     count, num_labels = len(probabilities) - 1, probabilities.shape[1] - 1
     costs = -np.log(np.maximum(probabilities, _NEVER))
     # A pair assigns a point and a label, which then is not occluded; each point has its own reject option.
-    table = np.full((count, num_labels + count), _IMPOSSIBLE)
+    table = np.full((count, num_labels + count), IMPOSSIBLE)
     table[:, :num_labels] = 2.0 * costs[:count, :num_labels] - costs[count, :num_labels]
     table.ravel()[num_labels :: num_labels + count + 1] = costs[:count, num_labels]
-    _, columns = linear_sum_assignment(table)
-    labels: NDArray[np.int64] = np.where(columns < num_labels, columns, GHOST)
-    return labels
+    return table
+
+
+def solve_assignment(table: Float[np.ndarray, "N M+N"]) -> tuple[float, Int[np.ndarray, "N"]]:
+    """The least cost of a labeling by such a table, and its labels, `GHOST` where none."""
+    rows, columns = linear_sum_assignment(table)
+    labels: NDArray[np.int64] = np.where(columns < table.shape[1] - len(table), columns, GHOST)
+    return float(table[rows, columns].sum()), labels
 
 
 def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[np.ndarray, "N"]:
