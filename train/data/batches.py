@@ -53,9 +53,12 @@ def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Ge
     return Batch(corrupt(markers, Corruption(occlude, config.ghosts, jitter), rng=rng), markers)
 
 
-def right_hands(rows: NDArray[np.void]) -> Float[np.ndarray, "B M 3"]:
-    """All markers of each row [m], of left hands mirrored."""
-    markers: NDArray[np.float64] = rows["markers"] @ _mirrors(rows["hand"])
+def right_hands(
+    rows: NDArray[np.void], anisotropy: float, *, rng: np.random.Generator
+) -> Float[np.ndarray, "B M 3"]:
+    """All markers of each row [m], of left hands mirrored; each hand is stretched around its center."""
+    centered = rows["markers"] - rows["markers"].mean(axis=1, keepdims=True)
+    markers: NDArray[np.float64] = centered @ _mirrors(rows["hand"]) @ _stretches(len(rows), anisotropy, rng)
     return markers
 
 
