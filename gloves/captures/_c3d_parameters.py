@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from gloves.captures._text import Tell
 from handsim.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -17,6 +18,8 @@ _INTEL, _DEC, _SGI = 84, 85, 86
 INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
 FLOAT_DTYPES: Final = {_INTEL: "<f4", _DEC: "<u4", _SGI: ">f4"}  # DEC floats are bits until `to_native`
 _CHARACTER, _BYTE, _INTEGER, _FLOAT = -1, 1, 2, 4
+_BLOCK: Final = 512
+_GROUPS: Final = {"POINT", "ANALOG", "TRIAL"}  # which say where points are; damage to others does not matter
 _MOST_BYTES: Final = 1 << 22  # of all values together; records that overlap could state far more
 _LONGEST_RECORD: Final = 1 << 17  # records are chained by 16-bit offsets; the last one has a little room more
 
@@ -40,45 +43,26 @@ class Parameters:
     values: dict[tuple[str, str], list[float] | list[str]]
 
     @staticmethod
-    def parse(data: bytes, start: int) -> Parameters:
-        """Walk the records from byte `start`; nothing outside the file is ever touched.
+    def parse(data: bytes, start: int, tell: Tell) -> Parameters:
+        """Read the records from byte `start`; nothing outside the file is ever touched.
+
+        Args:
+            data: The file, of at least one block.
+            start: Where the parameter section begins.
+            tell: Called where the last record points behind the section.
 
         Raises:
-            CaptureError: A record reaches beyond the file or makes no sense.
+            CaptureError: The section makes no sense, or a parameter of points is damaged.
         """
         if not 0 < start <= len(data) - 4 or data[start + 3] not in INTEGER_DTYPES:
             raise CaptureError("damaged: the parameter section is missing or in an unknown number format")
         processor = data[start + 3]
-        groups: dict[int, str] = {}
-        found: list[tuple[int, str, memoryview]] = []
-        at = start + 4
-        view = memoryview(data)
         try:
-            while at + 2 <= len(data):
-                name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
-                group = int.from_bytes(data[at + 1 : at + 2], "little", signed=True)
-                if name_length == 0:
-                    break
-                offset_at = at + 2 + name_length
-                name = data[at + 2 : offset_at].decode("ascii").upper().strip()
-                order: Literal["little", "big"] = "big" if processor == _SGI else "little"
-                offset = int.from_bytes(data[offset_at : offset_at + 2], order)
-                if group < 0:
-                    groups[-group] = name
-                else:
-                    record = view[offset_at + 2 : offset_at + 2 + _LONGEST_RECORD]
-                    found.append((group, name, record))
-                if offset == 0:
-                    break
-                if offset_at + offset > len(data):
-                    raise ValueError(name)
-                at = offset_at + offset
-            if sum(_num_bytes(raw) for _, _, raw in found) > _MOST_BYTES:
+            groups, found = _walk(data, start + 4, processor, tell)
+            read = [(groups[group], name, raw) for group, name, raw in found if groups.get(group) in _GROUPS]
+            if sum(_num_bytes(raw) for _, _, raw in read) > _MOST_BYTES:
                 raise CaptureError(f"damaged: the parameters hold more than {_MOST_BYTES} bytes")
-            values = {
-                (groups.get(group, ""), name): _read_values(bytes(raw), processor)
-                for group, name, raw in found
-            }
+            values = {(group, name): _read_values(bytes(raw), processor) for group, name, raw in read}
         except (ValueError, IndexError) as error:
             raise CaptureError("damaged: the parameter section cannot be read") from error
         return Parameters(processor, values)
@@ -107,6 +91,44 @@ class Parameters:
     def strings(self, group: str, name: str) -> list[str]:
         """A parameter of characters as strings without padding; empty if it is absent."""
         return [value for value in self.values.get((group, name), []) if isinstance(value, str)]
+
+
+def _walk(
+    data: bytes, at: int, processor: int, tell: Tell
+) -> tuple[dict[int, str], list[tuple[int, str, memoryview]]]:
+    """Names of groups by number; and of each parameter its group, its name and its record from the type on.
+
+    Args:
+        data: The file.
+        at: Where the first record begins.
+        processor: The number format.
+        tell: Called where the last record points behind the section.
+    """
+    order: Literal["little", "big"] = "big" if processor == _SGI else "little"
+    groups: dict[int, str] = {}
+    found: list[tuple[int, str, memoryview]] = []
+    view = memoryview(data)
+    points_at = (int.from_bytes(data[16:18], order) - 1) * _BLOCK
+    end = points_at if points_at > at else len(data)  # of the section
+    while at + 2 <= len(data):
+        name_length = abs(int.from_bytes(data[at : at + 1], "little", signed=True))
+        group = int.from_bytes(data[at + 1 : at + 2], "little", signed=True)
+        if name_length == 0:
+            break
+        offset_at = at + 2 + name_length
+        name = data[at + 2 : offset_at].decode("latin-1").upper().strip()
+        offset = int.from_bytes(data[offset_at : offset_at + 2], order)
+        if group < 0:
+            groups[-group] = name
+        else:
+            found.append((group, name, view[offset_at + 2 : offset_at + 2 + _LONGEST_RECORD]))
+        if offset == 0:
+            break
+        at = offset_at + offset
+        if at > end:
+            tell(f"the parameter section ends with {name[:40]!r}, which points behind it")
+            break
+    return groups, found
 
 
 def _num_bytes(raw: memoryview) -> int:
@@ -138,7 +160,7 @@ def _read_values(raw: bytes, processor: int) -> list[float] | list[str]:
 
 
 def _text(raw: bytes) -> str:
-    raw = raw.strip(b" \0")
+    raw = raw.partition(b"\0")[0].strip(b" ")  # what follows a zero byte is left over from another text
     try:
         return raw.decode("utf-8")
     except UnicodeDecodeError:

@@ -1,31 +1,48 @@
-"""Marker files by their suffix: TRC and C3D both ways, Motive CSV in."""
+"""Marker files by their suffix: TRC, C3D and Motive CSV both ways, Vicon CSV and Qualisys TSV in."""
 
 from __future__ import annotations
 
+import codecs
 import warnings
 from pathlib import Path
 from typing import Final
 
+from gloves.captures._text import Tell, split_lines
 from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import Capture
 from gloves.captures.markers import unlabeled_frames
-from gloves.captures.motive_csv import read_motive_csv
+from gloves.captures.motive_csv import MOTIVE_BEGIN, read_motive_csv, write_motive_csv
 from gloves.captures.plausibility import unit_fault, zeros_as_missing
+from gloves.captures.qtm_tsv import read_qtm_tsv
 from gloves.captures.trc import read_trc, write_trc
+from gloves.captures.vicon_csv import read_vicon_csv, vicon_sections
 from handsim.errors import CaptureError, HandSimWarning, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 
-_READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": read_motive_csv}
+def _read_csv(data: bytes, tell: Tell) -> Capture:
+    """A CSV by its content, since Motive's and Vicon's have the same suffix."""
+    if data.removeprefix(codecs.BOM_UTF8).startswith(MOTIVE_BEGIN):
+        return read_motive_csv(data, tell)
+    if vicon_sections(split_lines(data)[0]):
+        return read_vicon_csv(data, tell)
+    raise CaptureError(
+        "not a CSV of markers: expected Motive's, whose line 1 begins with 'Format Version', or Vicon's, where "
+        "a line reads 'Trajectories'"
+    )
+
+
+_READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": read_qtm_tsv}
+_TEXT_WRITERS: Final = {".trc": write_trc, ".csv": write_motive_csv}
 READABLE: Final = tuple(_READERS)
-WRITABLE: Final = (".trc", ".c3d")
+WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
 def read_capture(path: str | Path) -> Capture:
-    """Read a `.trc`, `.c3d` or Motive `.csv` file.
+    """Read a `.trc` or `.c3d` file, a `.csv` of Motive or Vicon, or a `.tsv` of Qualisys.
 
     Args:
-        path: The file; its suffix decides the format.
+        path: The file; its suffix decides the format, and its content decides between the two kinds of `.csv`.
 
     Returns:
         Positions (T, N, 3) in [m], whatever the file's unit, with one trajectory per column, and the rate
@@ -36,15 +53,20 @@ def read_capture(path: str | Path) -> Capture:
             cannot be that of its positions.
 
     Warns:
-        HandSimWarning: Points at exactly (0, 0, 0) were taken as missing.
+        HandSimWarning: Points at exactly (0, 0, 0) were taken as missing; the file states no unit or rate, or
+            contradicts itself, in a way that leaves one reading.
     """
     path = Path(path)
     check_suffix(path, READABLE)
     data = read_bytes(path, error=CaptureError)
     if not data:
         raise CaptureError(f"{path}: the file is empty")
+
+    def tell(text: str) -> None:
+        warnings.warn(f"{path}: {text}", HandSimWarning, stacklevel=3)
+
     try:
-        capture = _READERS[path.suffix.lower()](data)
+        capture = _READERS[path.suffix.lower()](data, tell)
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}") from error
     return _checked(path, capture)
@@ -70,9 +92,9 @@ def _checked(path: Path, capture: Capture) -> Capture:
 
 
 def write_capture(path: str | Path, capture: Capture) -> None:
-    """Write a `.trc` or `.c3d` file in millimeters, whole or not at all.
+    """Write a `.trc`, `.c3d` or Motive `.csv` file in millimeters, whole or not at all.
 
-    A TRC keeps positions to 5e-9 m; a C3D keeps single precision (6e-8 of the value).
+    A TRC keeps positions to 5e-9 m, a CSV to 5e-10 m; a C3D keeps single precision (6e-8 of the value).
 
     Args:
         path: The file; its suffix decides the format.
@@ -91,8 +113,8 @@ def write_capture(path: str | Path, capture: Capture) -> None:
             )
     try:
         with atomic_write(path) as temporary:
-            if path.suffix.lower() == ".trc":
-                write_trc(temporary, capture, title=path.name)
+            if path.suffix.lower() in _TEXT_WRITERS:
+                _TEXT_WRITERS[path.suffix.lower()](temporary, capture, title=path.name)
             else:
                 write_c3d(temporary, capture)
     except OSError as error:

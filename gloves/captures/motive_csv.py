@@ -1,44 +1,62 @@
-"""The CSV that OptiTrack Motive exports (format versions 1.2x and 1.3x).
+"""The CSV that OptiTrack Motive exports: format versions 1.2x and 1.3x are read, 1.23 is written.
 
 Line 1 is a list of keys and values; then rows led by a label (Type, Name, ID, in newer files Parent), a row
 of quantities, a row of axes that begins with 'Frame', and one row per frame. Labels and types decide,
-not positions: newer exports add rows and a TimeCode column.
+not positions: newer exports add rows and a TimeCode column. Exports of Motive 1.9 and before (1.20, 1.21)
+have the same rows without labels: types first, then names.
 """
 
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from gloves.captures._text import meters_per, parse_table, positive_rate, split_lines
+from gloves.captures._text import (
+    Tell,
+    csv_cells,
+    meters_per,
+    parse_table,
+    positive_rate,
+    split_lines,
+    warn,
+)
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
 
 _MOST_HEADER_LINES: Final = 20
+MOTIVE_BEGIN: Final = b"Format Version,"
 _AXES: Final = ["X", "Y", "Z"]
+_TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
 
 
-def read_motive_csv(data: bytes) -> Capture:
+def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
+
+    Args:
+        data: The file.
+        tell: Called with a sentence where the file states no unit of length.
 
     Raises:
         CaptureError: Not a Motive export, without marker columns, cut, or with a cell that is not a number.
     """
     lines, ended = split_lines(data)
-    if not lines[0].startswith(b"Format Version,"):
+    if not lines[0].startswith(MOTIVE_BEGIN):
         raise CaptureError("not a Motive CSV export: line 1 does not begin with 'Format Version'")
-    rows = [_cells(line) for line in lines[:_MOST_HEADER_LINES]]
+    rows = [csv_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
     stated = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
     rate = positive_rate(stated.get(rate_key, ""), name=rate_key)
+    if not stated.get("Length Units"):
+        tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
     scale = meters_per(stated.get("Length Units") or "Meters")
     end = next((index for index, row in enumerate(rows) if row and row[0] == "Frame"), None)
     if end is None or (end == len(lines) - 1 and not ended):
         raise CaptureError("the header is cut: no whole row begins with 'Frame'")
     axes = rows[end]
-    types, names = (_labeled_row(rows[1:end], label, len(axes)) for label in ("Type", "Name"))
+    types, names = _types_and_names(rows[1:end], len(axes))
     quantities = _quantities(rows[1:end], len(axes))
     columns = _marker_columns(types, quantities, axes)
 
@@ -56,19 +74,68 @@ def read_motive_csv(data: bytes) -> Capture:
     return Capture(labels, positions * scale, rate)
 
 
-def _cells(line: bytes) -> list[str]:
-    """Cells of a header line, where names may be quoted."""
-    try:
-        return [cell.strip() for cell in next(csv.reader([line.decode("utf-8", "replace")]), [])]
-    except csv.Error as error:
-        raise CaptureError(f"a header line cannot be read: {error}") from error
+def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:
+    """Write format version 1.23 in millimeters with six decimals; a missing marker gets three blank cells.
+
+    Args:
+        path: Where to write.
+        capture: What to write.
+        title: The file name whose stem is the take's name (`path` may be a temporary one).
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    num_frames, num_markers = capture.positions.shape[:2]
+    rate = f"{capture.rate:.6f}"
+    stated = {
+        "Format Version": "1.23",
+        "Take Name": Path(title).stem,
+        "Take Notes": "",
+        "Capture Frame Rate": rate,
+        "Export Frame Rate": rate,
+        "Capture Start Time": "",
+        "Total Frames in Take": str(num_frames),
+        "Total Exported Frames": str(num_frames),
+        "Rotation Type": "Quaternion",
+        "Length Units": "Millimeters",
+        "Coordinate Space": "Global",
+    }
+    ids = [f"{number:032X}" for number in range(1, num_markers + 1)]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([cell for pair in stated.items() for cell in pair])
+        writer.writerow([])
+        writer.writerow(["", "Type", *["Marker"] * (3 * num_markers)])
+        for label, values in (("Name", capture.names), ("ID", ids)):
+            writer.writerow(["", label, *(value for value in values for _ in _AXES)])
+        writer.writerow(["", "", *["Position"] * (3 * num_markers)])
+        writer.writerow(["Frame", "Time (Seconds)", *_AXES * num_markers])
+        row_format = "%d,%.6f" + ",%.6f" * (3 * num_markers)
+        for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):
+            text = row_format % (frame, frame / capture.rate, *row.tolist())
+            file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
 
 
-def _labeled_row(rows: list[list[str]], label: str, width: int) -> list[str]:
-    """The header row whose first cell with text is `label`, filled up to `width` cells."""
+def _types_and_names(rows: list[list[str]], width: int) -> tuple[list[str], list[str]]:
+    """Type and name of each column, from the header rows between line 1 and the axes.
+
+    Raises:
+        CaptureError: There are no such rows.
+    """
+    filled = [row for row in rows if any(row)]
+    # Without labels the first row says 'Marker' itself, behind two blank cells.
+    if len(filled) > 2 and not any(filled[0][:2]) and set(filled[0]) & _TYPES:
+        types, names = filled[:2]
+    else:
+        types, names = (_labeled_row(filled, label) for label in ("Type", "Name"))
+    return types + [""] * (width - len(types)), names + [""] * (width - len(names))
+
+
+def _labeled_row(rows: list[list[str]], label: str) -> list[str]:
+    """The header row whose first cell with text is `label`."""
     for row in rows:
-        if next((cell for cell in row if cell), "") == label:
-            return row + [""] * (width - len(row))
+        if next(cell for cell in row if cell) == label:
+            return row
     raise CaptureError(f"not a Motive CSV export: no header row is labeled '{label}'")
 
 

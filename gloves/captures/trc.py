@@ -2,22 +2,36 @@
 
 Five header lines (file type, keys, their values, marker names, axes), then one line per frame: number, time,
 and three cells per marker. Frame counts and frame numbers are often wrong in practice, so only names, units,
-rate and the rows themselves are used.
+rate and the rows themselves are used. Rows may hold more trajectories than line 4 names.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.captures._text import meters_per, parse_table, positive_rate, split_lines
+from gloves.captures._text import (
+    Tell,
+    check_width,
+    header_cells,
+    meters_per,
+    parse_table,
+    positive_rate,
+    split_lines,
+    warn,
+)
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 _HEADER_LINES: Final = 5
 _LEADING: Final = 2  # frame number and time
+_UNEVEN: Final = 0.1  # of the step between two frames, by which times may differ that were rounded
+_NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
 _KEYS: Final = (
     "DataRate",
     "CameraRate",
@@ -30,8 +44,12 @@ _KEYS: Final = (
 )
 
 
-def read_trc(data: bytes) -> Capture:
+def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a TRC file.
+
+    Args:
+        data: The file. Cells are separated by tabs, or by commas where the first line is.
+        tell: Called with a sentence for what is suspicious: a rate that only the column of times states.
 
     Raises:
         CaptureError: Not a TRC, header or last row cut, unknown units, or a cell that is not a number.
@@ -43,14 +61,16 @@ def read_trc(data: bytes) -> Capture:
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
         raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
-    keys, values, titles, axes = (_cells(line) for line in lines[1:_HEADER_LINES])
-    stated = {key.lower(): value for key, value in zip(keys, values, strict=False)}
-    for key in ("DataRate", "Units"):
-        if not stated.get(key.lower()):
-            raise CaptureError(f"the header (lines 2 and 3) states no {key}")
-    rate = positive_rate(stated["datarate"], name="DataRate")
+    delimiter = b"," if lines[0].lstrip().startswith(b"PathFileType,") else b"\t"
+    keys, values, titles, axes = (
+        header_cells(line, delimiter, number) for number, line in enumerate(lines[1:_HEADER_LINES], 2)
+    )
+    stated = _stated(keys, values)
+    if not stated.get("units"):
+        raise CaptureError("the header (lines 2 and 3) states no Units")
     scale = meters_per(stated["units"])
     names = _marker_names(titles, sum(bool(cell) for cell in axes))
+    names += _unnamed(lines[_HEADER_LINES:], len(names), delimiter)
 
     def column_name(column: int) -> str:
         if column < _LEADING:
@@ -62,10 +82,11 @@ def read_trc(data: bytes) -> Capture:
         lines,
         start=_HEADER_LINES,
         ended=ended,
-        delimiter=b"\t",
+        delimiter=delimiter,
         num_columns=_LEADING + 3 * len(names),
         column_name=column_name,
     )
+    rate = _rate(stated.get("datarate", ""), table[:, 1], tell)
     return Capture(names, table[:, _LEADING:].reshape(len(table), len(names), 3) * scale, rate)
 
 
@@ -87,10 +108,10 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
         f"PathFileType\t4\t(X/Y/Z)\t{title}",
         "\t".join(_KEYS),
         "\t".join(values),
-        "Frame#\tTime\t" + "".join(f"{name}\t\t\t" for name in capture.names),
-        "\t\t" + "".join(f"X{number}\tY{number}\tZ{number}\t" for number in range(1, num_markers + 1)),
+        "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", ""))]),
+        "\t\t" + "\t".join(f"X{number}\tY{number}\tZ{number}" for number in range(1, num_markers + 1)),
     )
-    row_format = "%d\t%.6f\t" + "%.5f\t" * (3 * num_markers)
+    row_format = "%d\t%.6f" + "\t%.5f" * (3 * num_markers)
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(header) + "\n\n")
         for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):
@@ -98,16 +119,24 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
             file.write((text.replace("nan", "") if np.isnan(row).any() else text) + "\n")
 
 
+def _stated(keys: list[str], values: list[str]) -> dict[str, str]:
+    """Values of line 3 by the lower-case keys of line 2; some writers put more than one tab between values."""
+    if sum(map(bool, keys)) == sum(map(bool, values)):
+        keys, values = list(filter(None, keys)), list(filter(None, values))
+    return {key.lower(): value for key, value in zip(keys, values, strict=False)}
+
+
 def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
-    """Names of line 4, one in every three cells; a blank one becomes '*n'.
+    """Names of line 4, one in every three cells; a blank one becomes '*n'. There may be none.
 
     Some writers put a name in every cell instead; that is accepted only if line 5 has three axes per name.
     """
-    cells = titles[_LEADING:]
+    lower = [title.lower() for title in titles[: 2 * _LEADING]]
+    if not lower[0].startswith("frame"):
+        raise CaptureError(_NO_MARKERS)
+    cells = titles[lower.index("time") + 1 if "time" in lower else _LEADING :]
     while cells and not cells[-1]:
         cells.pop()
-    if not titles[0].lower().startswith("frame") or not cells:
-        raise CaptureError("no markers: line 4 should read 'Frame#', 'Time', then the marker names")
     if not any(cell for index, cell in enumerate(cells) if index % 3):
         return tuple(cell or f"*{number}" for number, cell in enumerate(cells[::3], 1))
     names = tuple(cell for cell in cells if cell)
@@ -118,5 +147,35 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
     return names
 
 
-def _cells(line: bytes) -> list[str]:
-    return [cell.strip() for cell in line.decode("utf-8", "replace").split("\t")]
+def _unnamed(rows: list[bytes], num_named: int, delimiter: bytes) -> tuple[str, ...]:
+    """Names '*n' for the trajectories that rows hold behind those of line 4, as Cortex writes them.
+
+    Raises:
+        CaptureError: There is no trajectory at all, or a row has cells that are not three per trajectory.
+    """
+    expected = _LEADING + 3 * num_named
+    widths = [row.rstrip(b" \t" + delimiter).count(delimiter) + 1 for row in rows]
+    width = max(widths, default=0)
+    extra = max(0, width - expected)
+    check_width(width, _HEADER_LINES + 1 + (widths.index(width) if widths else 0))
+    if extra % 3:
+        raise CaptureError(
+            f"line {_HEADER_LINES + 1 + widths.index(width)} has {width} cells, expected {expected}, or three "
+            "more for each trajectory without a name"
+        )
+    if not num_named and not extra and any(row.strip(b" \t" + delimiter) for row in rows):
+        raise CaptureError(_NO_MARKERS)
+    return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))
+
+
+def _rate(text: str, times: Float[np.ndarray, "T"], tell: Tell) -> float:
+    """The frame rate [Hz] that the header states, or else the one of evenly spaced times [s]."""
+    try:
+        return positive_rate(text, name="DataRate")
+    except CaptureError:
+        steps = np.diff(times)
+        if len(steps) < 2 or not (steps > 0.0).all() or np.ptp(steps) > _UNEVEN * steps.mean():
+            raise
+    rate = float(1.0 / steps.mean())
+    tell(f"DataRate is '{text}', expected a positive number; by the column of times it is {rate:.6g} Hz")
+    return rate

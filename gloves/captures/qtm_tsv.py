@@ -1,0 +1,136 @@
+"""The TSV that Qualisys Track Manager exports of 3D data.
+
+Lines of a key and its values (NO_OF_FRAMES, FREQUENCY, MARKER_NAMES, ...), then, if it was asked for, a line of
+column names, then one line per frame: frame number and time, if they were asked for, and three cells per marker
+in millimeters. Exports of QTM 2021 and later begin with FILE_VERSION.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from gloves.captures._text import (
+    MOST_CELLS,
+    Tell,
+    header_cells,
+    meters_per,
+    parse_table,
+    positive_rate,
+    split_lines,
+    warn,
+)
+from gloves.captures.capture import Capture
+from handsim.errors import CaptureError
+
+_BEGINS: Final = (b"NO_OF_FRAMES\t", b"FILE_VERSION\t")
+_KEY: Final = re.compile(rb"[A-Z][A-Z0-9_]*(\t|$)")
+_LEADING: Final = ("frame", "time")
+_UNIT: Final = "mm"  # the only one that QTM writes
+
+
+def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
+    """The markers in the bytes of a Qualisys TSV with 3D data.
+
+    Args:
+        data: The file.
+        tell: Called with a sentence where there are more frames than stated.
+
+    Raises:
+        CaptureError: Not such an export, of other data, cut, or with a cell that is not a number.
+    """
+    lines, ended = split_lines(data)
+    if not lines[0].startswith(_BEGINS):
+        raise CaptureError(
+            "not a Qualisys TSV export: line 1 does not begin with 'NO_OF_FRAMES' or 'FILE_VERSION'"
+        )
+    start = next((index for index, line in enumerate(lines) if not _KEY.match(line)), len(lines))
+    if start == len(lines) and not ended:
+        raise CaptureError("the header is cut: no line of column names or numbers follows it")
+    stated = {
+        cells[0]: cells[1:]
+        for number, line in enumerate(lines[:start], 1)
+        for cells in [header_cells(line, b"\t", number)]
+    }
+    included = " ".join(stated.get("DATA_INCLUDED", ["3D"])).strip()
+    if included != "3D" or "MARKER_NAMES" not in stated:
+        raise CaptureError(f"the file holds {included[:40] or 'no'} data, expected 3D data with MARKER_NAMES")
+    rate = positive_rate(_first(stated, "FREQUENCY"), name="FREQUENCY")
+    names = _names(stated)
+    start, leading = _begin_of_rows(lines, start, 3 * len(names))
+
+    def column_name(column: int) -> str:
+        if column < leading:
+            return _LEADING[column]
+        marker, axis = divmod(column - leading, 3)
+        return f"{names[marker]} {'XYZ'[axis]}"
+
+    table = parse_table(
+        lines,
+        start=start,
+        ended=ended,
+        delimiter=b"\t",
+        num_columns=leading + 3 * len(names),
+        column_name=column_name,
+    )
+    _check_count(_first(stated, "NO_OF_FRAMES"), len(table), tell)
+    positions = table[:, leading:].reshape(len(table), len(names), 3)
+    return Capture(names, positions * meters_per(_UNIT), rate)
+
+
+def _first(stated: dict[str, list[str]], key: str) -> str:
+    """The first value of a key, blank if there is none."""
+    return next(iter(stated.get(key, ())), "")
+
+
+def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
+    """One name per marker; one without a name becomes '*n'."""
+    names = stated["MARKER_NAMES"]
+    while names and not names[-1]:
+        names = names[:-1]
+    text = _first(stated, "NO_OF_MARKERS")
+    count = int(text) if text.isdecimal() and len(text) <= len(str(MOST_CELLS)) else len(names)
+    if count < len(names) or count > MOST_CELLS // 3:
+        raise CaptureError(f"MARKER_NAMES holds {len(names)} names, and NO_OF_MARKERS states {count}")
+    if not count:
+        raise CaptureError("no markers: MARKER_NAMES holds no name")
+    names = names + [""] * (count - len(names))
+    return tuple(name or f"*{number}" for number, name in enumerate(names, 1))
+
+
+def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int]:
+    """Index of the first row of numbers, and how many of its cells precede the positions.
+
+    Args:
+        lines: All lines of the file.
+        start: Index of the first line that is none of the header's.
+        width: Number of cells that positions take.
+    """
+    while start < len(lines) and not lines[start].strip():
+        start += 1
+    if start == len(lines):
+        raise CaptureError("no frames: nothing follows the header")
+    cells = header_cells(lines[start], b"\t", start + 1)
+    if cells[0].lower() == _LEADING[0]:
+        return start + 1, 2 if cells[1:2] and cells[1].lower() == _LEADING[1] else 1
+    try:
+        float(cells[0] or "nan")
+    except ValueError:  # names of columns, without frame and time
+        return start + 1, 0
+    while cells and not cells[-1]:
+        cells.pop()
+    leading = {width: 0, width + 2: 2}.get(len(cells))
+    if leading is None:
+        raise CaptureError(
+            f"line {start + 1} has {len(cells)} cells, expected {width}, or {width + 2} with frame and time"
+        )
+    return start, leading
+
+
+def _check_count(stated: str, found: int, tell: Tell) -> None:
+    """Whether there are as many frames as the header states."""
+    if not stated.isdecimal() or int(stated[:20]) == found:
+        return
+    if int(stated[:20]) > found:
+        raise CaptureError(f"truncated: NO_OF_FRAMES is {stated[:20]}, and {found} frames are there")
+    tell(f"NO_OF_FRAMES is {stated[:20]}, and {found} frames are there; all are read")
