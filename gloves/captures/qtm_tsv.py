@@ -26,6 +26,7 @@ from handsim.errors import CaptureError
 _BEGINS: Final = (b"NO_OF_FRAMES\t", b"FILE_VERSION\t")
 _KEY: Final = re.compile(rb"[A-Z][A-Z0-9_]*(\t|$)")
 _LEADING: Final = ("frame", "time")
+_MOST_DIGITS: Final = 12  # of a count
 _UNIT: Final = "mm"  # the only one that QTM writes
 
 
@@ -52,9 +53,11 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         for number, line in enumerate(lines[:start], 1)
         for cells in [header_cells(line, b"\t", number)]
     }
-    included = " ".join(stated.get("DATA_INCLUDED", ["3D"])).strip()
-    if included != "3D" or "MARKER_NAMES" not in stated:
-        raise CaptureError(f"the file holds {included[:40] or 'no'} data, expected 3D data with MARKER_NAMES")
+    included = _first(stated, "DATA_INCLUDED") or "3D"
+    if included != "3D":
+        raise CaptureError(f"DATA_INCLUDED is '{included[:40]}', expected '3D'; export the 3D data")
+    if "MARKER_NAMES" not in stated:
+        raise CaptureError("the header states no MARKER_NAMES")
     rate = positive_rate(_first(stated, "FREQUENCY"), name="FREQUENCY")
     names = _names(stated)
     start, leading = _begin_of_rows(lines, start, 3 * len(names))
@@ -89,7 +92,7 @@ def _names(stated: dict[str, list[str]]) -> tuple[str, ...]:
     while names and not names[-1]:
         names = names[:-1]
     text = _first(stated, "NO_OF_MARKERS")
-    count = int(text) if text.isdecimal() and len(text) <= len(str(MOST_CELLS)) else len(names)
+    count = int(text[:_MOST_DIGITS]) if text.isdecimal() else len(names)
     if count < len(names) or count > MOST_CELLS // 3:
         raise CaptureError(f"MARKER_NAMES holds {len(names)} names, and NO_OF_MARKERS states {count}")
     if not count:
@@ -129,8 +132,8 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
 
 def _check_count(stated: str, found: int, tell: Tell) -> None:
     """Whether there are as many frames as the header states."""
-    if not stated.isdecimal() or int(stated[:20]) == found:
-        return
-    if int(stated[:20]) > found:
-        raise CaptureError(f"truncated: NO_OF_FRAMES is {stated[:20]}, and {found} frames are there")
-    tell(f"NO_OF_FRAMES is {stated[:20]}, and {found} frames are there; all are read")
+    count = int(stated[:_MOST_DIGITS]) if stated.isdecimal() else found
+    if count > found:
+        raise CaptureError(f"truncated: NO_OF_FRAMES is {count}, and {found} frames are there")
+    if count < found:
+        tell(f"NO_OF_FRAMES is {count}, and {found} frames are there; all are read")

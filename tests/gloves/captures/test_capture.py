@@ -30,13 +30,13 @@ def captures(draw: st.DrawFn) -> Capture:
     return Capture(tuple(names), positions, draw(st.sampled_from([24.0, 59.94, 120.0, 1000.0 / 3.0])))
 
 
-@pytest.mark.parametrize(("suffix", "tolerance"), [(".trc", 1e-8), (".c3d", 1e-6)])
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".trc", 1e-8), (".c3d", 1e-6), (".csv", 1e-9)])
 @settings(max_examples=60, deadline=None)
 @given(capture=captures())
 def test_round_trip(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, tolerance: float, capture: Capture
 ) -> None:
-    """TRC keeps five decimals of millimeters, C3D float32 millimeters: 6e-7 m at ten meters."""
+    """TRC and CSV keep five and six decimals of millimeters, C3D float32: 6e-7 m at ten meters."""
     path = tmp_path_factory.mktemp("capture") / f"take{suffix}"
     write_capture(path, capture)
     again = read_capture(path)
@@ -108,7 +108,7 @@ def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]],
     calls: dict[str, Callable[[], object]] = {
         "unknown suffix": lambda: read_capture(tmp_path / "take.tcr"),
         "no suffix": lambda: read_capture(tmp_path / "take"),
-        "unknown suffix to write": lambda: write_capture(tmp_path / "take.csv", good),
+        "unknown suffix to write": lambda: write_capture(tmp_path / "take.tsv", good),
         "missing file": lambda: read_capture(tmp_path / "take.trc"),
         "a folder": lambda: read_capture(tmp_path / "folder.trc"),
         "empty file": lambda: read_capture(tmp_path / "empty.trc"),

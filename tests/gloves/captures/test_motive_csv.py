@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.captures.formats import read_capture
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
 from gloves.captures.motive_csv import read_motive_csv
 from handsim.errors import CaptureError
 
@@ -65,8 +66,56 @@ def test_markers_are_found_by_type_and_label(parent: bool, timecode: bool) -> No
     [("Meters", 1.0), ("Centimeters", 1e-2), ("Millimeters", 1e-3), (None, 1.0), ("", 1.0)],
 )
 def test_units(unit: str | None, meters: float) -> None:
-    capture = read_motive_csv(motive(UNLABELED, unit=unit, rows=1).encode())
+    capture = read_motive_csv(motive(UNLABELED, unit=unit, rows=1).encode(), [].append)
     np.testing.assert_allclose(capture.positions, [[[0.0, 0.01 * meters, 0.02 * meters]]])
+
+
+def test_a_file_without_a_unit_is_told() -> None:
+    told: list[str] = []
+    read_motive_csv(motive(UNLABELED, unit=None).encode(), told.append)
+    assert told == ["line 1 states no Length Units, read as meters, which Motive writes unless told otherwise"]
+
+
+@pytest.mark.parametrize("version", ["1.20", "1.21"])
+def test_rows_without_labels(version: str) -> None:
+    """Motive 1.x wrote the same rows, types first, without the labels Type, Name and ID."""
+    text = motive(BODY, BODY_MARKER, LABELED, UNLABELED).replace("1.23", version)
+    for label in ("Type", "Name", "ID"):
+        text = text.replace(f"\n,{label},", "\n,,")
+    capture = read_motive_csv(text.encode())
+    assert capture.names == ("Glove:ThumbTip", "Unlabeled 2379")
+    np.testing.assert_allclose(capture.positions[0], [[0.12, 0.13, 0.14], [0.15, 0.16, 0.17]])
+
+
+def test_what_we_write_is_laid_out_as_motive_lays_it_out(tmp_path: Path) -> None:
+    positions = np.array([[[0.1, -0.2, 0.3], [np.nan] * 3], [[0.4, 0.5, 0.6], [1e-7, 2.0, -3.0]]])
+    write_capture(tmp_path / "my take.csv", Capture(("right:ThumbTip", 'a,"b'), positions, 100.0))
+    lines = (tmp_path / "my take.csv").read_text().split("\n")
+    stated = lines[0].split(",")
+    assert dict(zip(stated[::2], stated[1::2], strict=True)) == {
+        "Format Version": "1.23",
+        "Take Name": "my take",
+        "Take Notes": "",
+        "Capture Frame Rate": "100.000000",
+        "Export Frame Rate": "100.000000",
+        "Capture Start Time": "",
+        "Total Frames in Take": "2",
+        "Total Exported Frames": "2",
+        "Rotation Type": "Quaternion",
+        "Length Units": "Millimeters",
+        "Coordinate Space": "Global",
+    }
+    assert lines[1:] == [
+        "",
+        ",Type,Marker,Marker,Marker,Marker,Marker,Marker",
+        ',Name,right:ThumbTip,right:ThumbTip,right:ThumbTip,"a,""b","a,""b","a,""b"',
+        ",ID," + ",".join(3 * [31 * "0" + "1"] + 3 * [31 * "0" + "2"]),
+        ",,Position,Position,Position,Position,Position,Position",
+        "Frame,Time (Seconds),X,Y,Z,X,Y,Z",
+        "0,0.000000,100.000000,-200.000000,300.000000,,,",
+        "1,0.010000,400.000000,500.000000,600.000000,0.000100,2000.000000,-3000.000000",
+        "",
+    ]
 
 
 def test_blank_cells_are_gaps() -> None:

@@ -80,6 +80,12 @@ def test_missing_cells(row: str) -> None:
         lambda data: data[:-1] + b"  ",
         lambda data: data.replace(b"\ta\t\t\tb\t\t\t", b"\ta\tb"),
         lambda data: data.replace(b"\ta\t\t\tb\t\t\t", b"\ta\t\t\tb"),
+        lambda data: data.replace(b"\ta\t\t\tb\t\t\t", b"\ta\t\tb"),
+        lambda data: data.replace(b"#\tTime\ta", b"#\t\tTime\t\ta").replace(b"\t\t\tb", b"\t\tb"),
+        lambda data: data.replace(b"120\t120\t999\t7\tmm", b" 120.0\t\t120.0\t\t 999\t\t7\t\t mm"),
+        lambda data: data.replace(b"PathFileType\t4\t", b"PathFileType  4\t"),
+        lambda data: data.replace(b"\t", b","),
+        lambda data: data.replace(b"\n0\t", b"\n\t\t\t\t\t\t\t\n0\t", 1).replace(b"\t", b","),
     ],
 )
 def test_dialects(change: Callable[[bytes], bytes]) -> None:
@@ -90,6 +96,42 @@ def test_dialects(change: Callable[[bytes], bytes]) -> None:
 
 def test_blank_name_in_the_middle() -> None:
     assert read_trc(trc(ROW, names="Frame#\tTime\t\t\t\tb\t\t\t")).names == ("*1", "b")
+
+
+@pytest.mark.parametrize("delimiter", [b"\t", b","])
+def test_trajectories_without_a_name_follow_those_with_one(delimiter: bytes) -> None:
+    """Cortex writes them into rows of any length; line 4 and the header's count do not know of them."""
+    rows = (ROW + "\t7\t8\t9\t\t\t\t10\t11\t12\t", ROW, ROW + "\t1\t2\t3")
+    capture = read_trc(trc(*rows).replace(b"\t", delimiter))
+    assert capture.names == ("a", "b", "*3", "*4", "*5")
+    np.testing.assert_allclose(capture.positions[:, :2], np.repeat(POINTS, 3, axis=0) * 1e-3)
+    np.testing.assert_allclose(capture.positions[[0, 0, 2], [2, 4, 2], 0], [7e-3, 10e-3, 1e-3])
+    assert np.isnan(capture.positions[[0, 1, 1, 2], [3, 2, 4, 4]]).all()
+
+
+def test_no_trajectory_has_a_name() -> None:
+    capture = read_trc(trc(ROW, names="Frame#\tTime\t", axes="\t\t"))
+    assert capture.names == ("*1", "*2")
+    np.testing.assert_allclose(capture.positions, POINTS * 1e-3)
+
+
+@pytest.mark.parametrize("rate", ["0", "", "?"])
+def test_a_rate_that_only_the_times_state_is_told(rate: str) -> None:
+    told: list[str] = []
+    rows = [ROW.replace("0\t0", f"{frame}\t{frame / 90.0:.4f}", 1) for frame in range(8)]
+    capture = read_trc(trc(*rows, rate=rate), told.append)
+    assert capture.rate == pytest.approx(90.0, rel=1e-3)
+    sentence = f"DataRate is '{rate}', expected a positive number; by the column of times it is 89.9743 Hz"
+    assert told == [sentence]
+
+
+def test_what_we_write_has_as_many_cells_in_every_row(tmp_path: Path) -> None:
+    """Tables of other programs count the cells, and a tab behind the last one makes a column without a name."""
+    positions = np.random.default_rng(5).normal(size=(3, 4, 3))
+    positions[1, 3] = np.nan
+    write_capture(tmp_path / "take.trc", Capture(("a", "b", "c d", "*4"), positions, 100.0))
+    lines = (tmp_path / "take.trc").read_text().split("\n")
+    assert [len(line.split("\t")) for line in lines] == [4, 8, 8, 14, 14, 1, 14, 14, 14, 1]
 
 
 def test_every_cut_is_told_or_harmless(tmp_path: Path) -> None:
@@ -123,7 +165,7 @@ BAD = {
     "rate is a word": trc(ROW, rate="fast"),
     "rate is zero": trc(ROW, rate="0"),
     "rate is missing": trc(ROW, rate=""),
-    "no markers": trc(ROW, names="Frame#\tTime\t\t"),
+    "no markers": trc("0\t0", names="Frame#\tTime\t\t"),
     "line 4 holds no names": trc(ROW, names="1\t0\t1\t2\t3"),
     "names and axes differ": trc(ROW, names="Frame#\tTime\ta\tb\tc"),
     "a word": trc(ROW, "1\t0\t1\t2\t3\t4\tfive\t6"),
