@@ -2,13 +2,14 @@
 
     python benchmarks/foreign_captures.py FOLDER... [--list]
 
-Every .trc, .c3d, .csv and .tsv under the folders is read by `read_capture` and, a C3D, by ezc3d (in a process of
-its own, because a damaged file can end it) and by the package c3d where that is installed; a text by a plain
-parser of this script, which knows only where the numbers begin. Prints for each folder how many files are read
-with the same positions, read with others, refused although another reader opens them, and refused by all. A
-position counts as the same within 1e-6 m and 2e-6 of itself; a point that handsim leaves out as missing has to
-be missing, negative in its residual or exactly zero for the other reader. With --list every file that is not read
-with the same positions is named, with the sentence that refuses it. No file is part of this repository.
+Every .trc, .c3d, .csv and .tsv under the folders is read by `read_capture` and, a C3D, by ezc3d (in a process
+of its own, because a damaged file can end it) and by the package c3d where that is installed; a text by a
+plain parser of this script, which knows only where the numbers begin. Prints for each folder how many files
+are read with the positions that one of the others reads, read with other positions, refused although another
+reader opens them, and refused by all. A position counts as the same within 1e-6 m and 2e-6 of itself; a point
+that handsim leaves out as missing has to be missing, negative in its residual or exactly zero for the other
+reader. With --list every file that is not read with the same positions is named, with the sentence that
+refuses it. No file is part of this repository.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def with_plain_parser(path: Path) -> np.ndarray | None:
 def _positions(
     rows: list[list[str]], leading: int, count: int | None, scale: float, *, least: int = 0
 ) -> np.ndarray | None:
-    """Numbers of rows behind the leading cells, three a point; without a count as many as the longest row has."""
+    """Numbers of rows behind the leading cells, three a point; without a count as many as the longest has."""
     cells = [[cell.strip() for cell in row[leading:]] for row in rows if any(cell.strip() for cell in row)]
     filled = [index + 1 for row in cells for index, cell in enumerate(row) if cell]
     width = count if count is not None else -(-max([*filled, least]) // 3) * 3
@@ -144,7 +145,7 @@ def _vicon(rows: list[list[str]]) -> np.ndarray | None:
 
 
 def same(ours: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two readers found the same positions; trajectories at the end may be left out if they are empty."""
+    """Whether two readers found the same positions; empty trajectories at the end may be left out."""
     ours, other = (
         array[:, : max(np.flatnonzero(~np.isnan(array).all(axis=(0, 2))), default=-1) + 1]
         for array in (ours, other)
@@ -177,7 +178,9 @@ def main() -> None:
     if sys.argv[1:2] == ["--ezc3d"]:
         _write_ezc3d(Path(sys.argv[2]), Path(sys.argv[3]))
         return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--list", action="store_true", help="name every file that is not read the same")
     arguments = parser.parse_args()
@@ -193,7 +196,8 @@ def main() -> None:
         total += counts
     opened = sum(total[kind] for kind in KINDS[:3])
     print("all: " + ", ".join(f"{total[kind]} {kind}" for kind in KINDS))
-    print(f"of {opened} files that another reader opens, {100 * total[KINDS[0]] / max(1, opened):.1f} % are the same")
+    share = 100 * total[KINDS[0]] / max(1, opened)
+    print(f"of {opened} files that another reader opens, {share:.1f} % are the same")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,7 @@
 """Markers on the hand, and what an optical system sees of them.
 
 A `MarkerLayout` (a TOML file) is put on a hand by `attach`; the result is a `GloveFit`. `read_capture` and
-`write_capture` read and write marker files (TRC, C3D, Motive CSV). A `Take` is a simulated capture with
-truth.
+`write_capture` read and write marker files of other programs. A `Take` is a simulated capture with truth.
 """
 
 from typing import TYPE_CHECKING

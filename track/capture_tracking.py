@@ -1,6 +1,6 @@
 """Tracking of a whole capture or stream, frame by frame, and its result as a tracked take.
 
-Marker files have no IDs. Every format that is read (.trc, .c3d, Motive's .csv) has one column per trajectory,
+Marker files have no IDs. Every format that is read has one column per trajectory,
 so a column is an ID for as long as it has a point. After a gap it is a new ID, because a column of
 unlabeled points may continue with another marker. Column names are not used.
 """

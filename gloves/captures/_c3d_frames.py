@@ -1,7 +1,7 @@
 """Where the frames of a C3D file lie, how its numbers are written, and the points in them.
 
-Header and parameters both state it, and some programs write one of them wrong. Where they contradict each other,
-the size of the data decides and the user is told; where it does not decide, the file is refused.
+Header and parameters both state it, and some programs write one of them wrong. Where they contradict each
+other, the size of the data decides and the user is told; where it does not decide, the file is refused.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Header:
     num_frames: int
     """By the numbers of the first and the last frame."""
     scale: float
-    """Negative where positions are written as floats; otherwise the unit of the integers they are written as."""
+    """Negative where positions are written as floats; otherwise the size of one step of integers."""
     start: int
     """First byte of the frames."""
     samples: int
@@ -105,9 +105,7 @@ def read_points(
     return scaled
 
 
-def _scale(
-    parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell
-) -> float:
+def _scale(parameters: Parameters, header: Header, extent: _Extent, num_points: int, tell: Tell) -> float:
     """POINT:SCALE, or the header's where there is none; see `Header.scale`.
 
     Raises:
@@ -124,7 +122,9 @@ def _scale(
         words = 4 * num_points + header.per_frame
         as_floats, as_integers = extent.fits(4 * words), extent.fits(2 * words)
         if as_floats == as_integers:
-            raise CaptureError(f"{text}: one says integers, the other floats, and the file's size does not decide")
+            raise CaptureError(
+                f"{text}: one says integers, the other floats, and the file's size does not decide"
+            )
         tell(f"{text}; by the file's size its numbers are {'floats' if as_floats else 'integers'}")
         return scale if (scale < 0.0) == as_floats else other
     if scale > 0.0 and abs(scale - other) > _SAME_SCALE * scale:
@@ -215,7 +215,8 @@ def _num_frames(
     used = stated * words * size
     behind = data[header.start + used + _MOST_FILLING : header.start + extent.room]
     if extent.room - used >= _MOST_FILLING and any(behind):
-        text = f"the file states {stated} frames of {words} numbers, which are {used} bytes, and has {extent.room}"
+        frames = f"{stated} frames of {words} numbers"
+        text = f"the file states {frames}, which are {used} bytes, and has {extent.room}"
         if not agreed or stated != header.num_frames:
             raise CaptureError(f"damaged: {text}")
         tell(f"{text}; what follows them is not read")

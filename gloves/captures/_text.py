@@ -196,7 +196,12 @@ def _check_last_number(lines: list[bytes], number: int, delimiter: bytes) -> Non
     decimals = {len(cell.partition(b".")[2]) for cell in numbers}
     # A writer that drops zeros at the end has numbers of all lengths, even if the first few have the same.
     fixed = any(cell.endswith(b"0") for cell in numbers) or len(numbers) >= _MANY_NUMBERS
-    if len(decimals) == 1 and fixed and last.strip() and len(last.strip().partition(b".")[2]) < decimals.pop():
+    if (
+        len(decimals) == 1
+        and fixed
+        and last.strip()
+        and len(last.strip().partition(b".")[2]) < decimals.pop()
+    ):
         raise CaptureError(
             f"truncated: line {number}, the last, ends inside its last number and has no line end"
         )

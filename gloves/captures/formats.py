@@ -20,6 +20,7 @@ from handsim.errors import CaptureError, HandSimWarning, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 
+
 def _read_csv(data: bytes, tell: Tell) -> Capture:
     """A CSV by its content, since Motive's and Vicon's have the same suffix."""
     if data.removeprefix(codecs.BOM_UTF8).startswith(MOTIVE_BEGIN):
@@ -27,8 +28,8 @@ def _read_csv(data: bytes, tell: Tell) -> Capture:
     if vicon_sections(split_lines(data)[0]):
         return read_vicon_csv(data, tell)
     raise CaptureError(
-        "not a CSV of markers: expected Motive's, whose line 1 begins with 'Format Version', or Vicon's, where "
-        "a line reads 'Trajectories'"
+        "not a CSV of markers: expected Motive's, whose line 1 begins with 'Format Version', or Vicon's, "
+        "where a line reads 'Trajectories'"
     )
 
 
@@ -42,7 +43,7 @@ def read_capture(path: str | Path) -> Capture:
     """Read a `.trc` or `.c3d` file, a `.csv` of Motive or Vicon, or a `.tsv` of Qualisys.
 
     Args:
-        path: The file; its suffix decides the format, and its content decides between the two kinds of `.csv`.
+        path: The file; its suffix decides the format, its content between the two kinds of `.csv`.
 
     Returns:
         Positions (T, N, 3) in [m], whatever the file's unit, with one trajectory per column, and the rate

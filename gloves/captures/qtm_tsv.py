@@ -1,8 +1,8 @@
 """The TSV that Qualisys Track Manager exports of 3D data.
 
-Lines of a key and its values (NO_OF_FRAMES, FREQUENCY, MARKER_NAMES, ...), then, if it was asked for, a line of
-column names, then one line per frame: frame number and time, if they were asked for, and three cells per marker
-in millimeters. Exports of QTM 2021 and later begin with FILE_VERSION.
+Lines of a key and its values (NO_OF_FRAMES, FREQUENCY, MARKER_NAMES, ...), then, if it was asked for, a line
+of column names, then one line per frame: frame number and time, if they were asked for, and three cells per
+marker in millimeters. Newer exports begin with FILE_VERSION.
 """
 
 from __future__ import annotations

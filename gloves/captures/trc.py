@@ -120,7 +120,7 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
 
 
 def _stated(keys: list[str], values: list[str]) -> dict[str, str]:
-    """Values of line 3 by the lower-case keys of line 2; some writers put more than one tab between values."""
+    """Values of line 3 by the lower-case keys of line 2; some writers put two tabs between values."""
     if sum(map(bool, keys)) == sum(map(bool, values)):
         keys, values = list(filter(None, keys)), list(filter(None, values))
     return {key.lower(): value for key, value in zip(keys, values, strict=False)}
@@ -160,8 +160,8 @@ def _unnamed(rows: list[bytes], num_named: int, delimiter: bytes) -> tuple[str, 
     check_width(width, _HEADER_LINES + 1 + (widths.index(width) if widths else 0))
     if extra % 3:
         raise CaptureError(
-            f"line {_HEADER_LINES + 1 + widths.index(width)} has {width} cells, expected {expected}, or three "
-            "more for each trajectory without a name"
+            f"line {_HEADER_LINES + 1 + widths.index(width)} has {width} cells, expected {expected}, or "
+            "three more for each trajectory without a name"
         )
     if not num_named and not extra and any(row.strip(b" \t" + delimiter) for row in rows):
         raise CaptureError(_NO_MARKERS)

@@ -1,8 +1,8 @@
 """The CSV that Vicon Nexus exports, and Vicon Workstation before it: its section of trajectories.
 
-A section is a line with its title, a line with its rate, a row of names (one in three cells), a row that begins
-with 'Frame' (in Workstation 'Field #') and holds the axes, in Nexus a row of units, one row per frame, and a blank
-line. Sections of other data (Devices, Model Outputs, ...) may precede and follow it.
+A section is a line with its title, a line with its rate, a row of names (one in three cells), a row that
+begins with 'Frame' (in Workstation 'Field #') and holds the axes, in Nexus a row of units, one row per frame,
+and a blank line. Sections of other data (Devices, Model Outputs, ...) may precede and follow it.
 """
 
 from __future__ import annotations

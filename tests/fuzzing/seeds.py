@@ -54,18 +54,42 @@ def capture() -> Capture:
 
 
 def trc(folder: Path) -> list[Path]:
+    """As we write it, and with commas, twice as many delimiters in line 3 and trajectories without a name."""
     write_capture(folder / "take.trc", capture())
-    return [folder / "take.trc"]
+    lines = (folder / "take.trc").read_text().splitlines()
+    lines[2] = lines[2].replace("\t", "\t\t")
+    lines[3] = "\t".join(lines[3].split("\t")[: 2 + 3 * 5])
+    (folder / "commas.trc").write_text("\n".join(lines).replace("\t", ",") + "\n")
+    return [folder / "take.trc", folder / "commas.trc"]
 
 
 def c3d(folder: Path) -> list[Path]:
+    """As we write it, and as integers of the other byte order, with analog numbers and gaps."""
+    from tests.gloves.captures.test_c3d import SGI
+    from tests.gloves.captures.test_c3d import c3d as foreign
+
     write_capture(folder / "take.c3d", capture())
-    return [folder / "take.c3d"]
+    data = foreign(processor=SGI, scale=0.125, analog=3, missing=((1, 0),))
+    (folder / "integers.c3d").write_bytes(data)
+    return [folder / "take.c3d", folder / "integers.c3d"]
 
 
-def motive_csv(folder: Path) -> list[Path]:
+def csv(folder: Path) -> list[Path]:
+    """Two of Motive, with labels of rows and as we write it, and one of Vicon behind another section."""
+    from tests.gloves.captures.test_vicon_csv import DEVICES, nexus
+
     (folder / "take.csv").write_text(MOTIVE)
-    return [folder / "take.csv"]
+    write_capture(folder / "ours.csv", capture())
+    (folder / "vicon.csv").write_text(DEVICES + nexus() + "\n")
+    return [folder / "take.csv", folder / "ours.csv", folder / "vicon.csv"]
+
+
+def tsv(folder: Path) -> list[Path]:
+    from tests.gloves.captures.test_qtm_tsv import qtm
+
+    (folder / "take.tsv").write_text(qtm(version=True, events=("Start",)))
+    (folder / "bare.tsv").write_text(qtm(columns=False, leading=False))
+    return [folder / "take.tsv", folder / "bare.tsv"]
 
 
 def layout(folder: Path) -> list[Path]:

@@ -100,7 +100,8 @@ def _read_checkpoint(path: Path) -> None:
 _ALL: Final = (
     Target("c3d", seeds.c3d, read_capture),
     Target("trc", seeds.trc, read_capture),
-    Target("csv", seeds.motive_csv, read_capture),
+    Target("csv", seeds.csv, read_capture),
+    Target("tsv", seeds.tsv, read_capture),
     Target("layout", seeds.layout, load_layout),
     Target("rig", seeds.rig, load_rig),
     Target("body", seeds.body, load_body),

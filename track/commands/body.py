@@ -26,8 +26,8 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
     The body has the name of the file, and its markers are Marker1, Marker2, ...; both may be changed there.
 
     Args:
-        source: A .trc, .c3d or Motive .csv file, whose names are not used; or the .truth.npz of a simulated
-            capture, for its object.
+        source: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file, whose names are not used; or the
+            .truth.npz of a simulated capture, for its object.
         out: The body's file, .toml.
     """
     if out.suffix.lower() != TOML:

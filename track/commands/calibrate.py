@@ -52,7 +52,8 @@ def calibrate(
     calibrated hands.
 
     Args:
-        capture: A .trc, .c3d or Motive .csv file of half a minute or more; its names are not used.
+        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file of half a minute or more; its
+            names are not used.
         out: The user's file, .json, for handsim track --shape.
         glove: Marker layout: a shipped name or the path of a .toml file.
         size: The size nearest to the hands; auto measures it in the capture.

@@ -62,7 +62,8 @@ def track(
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
 
     Args:
-        capture: A .trc, .c3d or Motive .csv file; its names are not used.
+        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not
+            used.
         out: The tracked take, a .npz file.
         live: Address of a NatNet server instead of a capture: natnet://host or natnet://host:port. Ctrl-C
             or the end of the terminal ends it. Frames are written as they come, to OUT.part until then.
@@ -75,8 +76,8 @@ def track(
         body: A rigid body to track beside the hands, once per body: a .toml file, see handsim body, or one of
             handsim's own objects.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
-        labeled: File for the labeled points, .trc or .c3d; markers are called right:ThumbTip and so on, other
-            points Unlabeled1, Unlabeled2, ...
+        labeled: File for the labeled points, .trc, .c3d or Motive .csv; markers are called right:ThumbTip and
+            so on, other points Unlabeled1, Unlabeled2, ...
     """
     _check_options(capture, live, seconds, out, labeled)
     check_outputs((capture, shape, glove, labeler, *body), (out, labeled))

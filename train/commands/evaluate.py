@@ -34,8 +34,8 @@ def evaluate(
     """Measure a labeler on labeled captures, corrupted as in the paper.
 
     Args:
-        captures: Labeled .trc, .c3d or .csv files, folders searched for them, or the .truth.npz of takes.
-            Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by itself.
+        captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, or the .truth.npz of
+            takes. Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by itself.
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
         occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).

@@ -39,8 +39,9 @@ def label(
     Where a frame holds two hands, the columns are called right:ThumbTip and so on, as by handsim track.
 
     Args:
-        capture: A .trc, .c3d or Motive .csv file.
-        out: Labeled .trc or .c3d file; points that are not markers become columns Unlabeled1, Unlabeled2, ...
+        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file.
+        out: Labeled .trc, .c3d or Motive .csv file; points that are not markers become columns Unlabeled1,
+            Unlabeled2, ...
         glove: Marker layout: a shipped name or the path of a .toml file.
         labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.

@@ -29,7 +29,7 @@ def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -
     """Simulate a capture of two hands; the truth goes beside it.
 
     Args:
-        out: Unlabeled .c3d or .trc file; OUT.truth.npz takes IDs, labels, poses and shapes.
+        out: Unlabeled .c3d, .trc or Motive .csv file; OUT.truth.npz takes IDs, labels, poses and shapes.
         config: What to simulate.
     """
     check_suffix(out, WRITABLE)

@@ -86,7 +86,9 @@ def c3d(
         num_frames if header_frames is None else header_frames,
         0,
     )
-    header += floats(np.array([scale if header_scale is None else header_scale]), processor) + struct.pack(f"{order}2H", 4, int(analog > 0))
+    header += floats(np.array([scale if header_scale is None else header_scale]), processor) + struct.pack(
+        f"{order}2H", 4, int(analog > 0)
+    )
     header += floats(np.array([rate]), processor)
     residual = np.zeros((num_frames, num_points, 1))
     for frame, point in missing:
@@ -197,11 +199,13 @@ def unended(data: bytes, processor: int) -> bytes:
 
 
 def test_damage_to_what_is_not_read_does_not_matter() -> None:
-    """A record of another group than those of points that makes no sense, as one with a text's length for its own."""
+    """A record that makes no sense, of another group than those of points."""
     data = c3d(labels=("a", "b"))
     end = data.index(b"TRIAL") + len("TRIAL") + 3
     broken = b"\x04\x04EMGS" + struct.pack("<H", 7) + b"\x07\xff\xff\xff\xff"
-    np.testing.assert_allclose(read_c3d(data[:end] + broken + data[end + len(broken) :]).positions, POINTS * 1e-3)
+    np.testing.assert_allclose(
+        read_c3d(data[:end] + broken + data[end + len(broken) :]).positions, POINTS * 1e-3
+    )
 
 
 def test_ezc3d_reads_what_we_write(tmp_path: Path) -> None:

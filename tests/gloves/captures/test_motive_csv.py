@@ -73,7 +73,9 @@ def test_units(unit: str | None, meters: float) -> None:
 def test_a_file_without_a_unit_is_told() -> None:
     told: list[str] = []
     read_motive_csv(motive(UNLABELED, unit=None).encode(), told.append)
-    assert told == ["line 1 states no Length Units, read as meters, which Motive writes unless told otherwise"]
+    assert told == [
+        "line 1 states no Length Units, read as meters, which Motive writes unless told otherwise"
+    ]
 
 
 @pytest.mark.parametrize("version", ["1.20", "1.21"])

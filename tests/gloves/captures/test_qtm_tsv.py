@@ -33,7 +33,10 @@ def qtm(
     lines += ["NO_OF_ANALOG\t0", "ANALOG_FREQUENCY\t0", "DESCRIPTION\t--"]
     lines += ["TIME_STAMP\t2025-01-19, 10:19:43.755\t2063631.96175450", f"DATA_INCLUDED\t{included}"]
     lines += [f"EVENT\t{event}\t1\t0.00000" for event in events]
-    lines += ["\t".join(["MARKER_NAMES", *names]), "\t".join(["TRAJECTORY_TYPES", *["Measured"] * len(names)])]
+    lines += [
+        "\t".join(["MARKER_NAMES", *names]),
+        "\t".join(["TRAJECTORY_TYPES", *["Measured"] * len(names)]),
+    ]
     if columns:
         axes = [f"{name} {axis}" for name in names for axis in "XYZ"]
         lines.append("\t".join(["Frame", "Time"] * leading + axes))
@@ -62,7 +65,11 @@ def test_every_setting_of_the_export(
 
 
 def test_blank_cells_and_zeros_are_gaps(tmp_path: Path) -> None:
-    text = qtm().replace("10.500\t11.500\t12.500", "\t\t").replace("23.500\t24.500\t25.500", "0.000\t0.000\t0.000")
+    text = (
+        qtm()
+        .replace("10.500\t11.500\t12.500", "\t\t")
+        .replace("23.500\t24.500\t25.500", "0.000\t0.000\t0.000")
+    )
     text = text.replace("3.500\t4.500\t5.500", "0.000\t0.000\t0.000", 1)
     (tmp_path / "take.tsv").write_text(text)
     with pytest.warns(match="2 points at exactly"):

@@ -126,7 +126,7 @@ def test_a_rate_that_only_the_times_state_is_told(rate: str) -> None:
 
 
 def test_what_we_write_has_as_many_cells_in_every_row(tmp_path: Path) -> None:
-    """Tables of other programs count the cells, and a tab behind the last one makes a column without a name."""
+    """Tables of other programs count cells, and a tab behind the last one makes a column without a name."""
     positions = np.random.default_rng(5).normal(size=(3, 4, 3))
     positions[1, 3] = np.nan
     write_capture(tmp_path / "take.trc", Capture(("a", "b", "c d", "*4"), positions, 100.0))

@@ -10,12 +10,26 @@ from gloves.captures.formats import read_capture
 from gloves.captures.vicon_csv import read_vicon_csv
 from handsim.errors import CaptureError
 
-DEVICES = (
-    "Devices\n1000\n,,Force Plate - Force,,\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n1,0,1,2,3\n1,1,Trajectories,5,6\n\n"
-)
-OUTPUTS = (
-    "Model Outputs\n100\n,,Anna:Angles,,\nFrame,Sub Frame,X,Y,Z\n,,deg,deg,deg\n1,0,90,91,92\n2,0,93,94,95\n\n"
-)
+DEVICES = """\
+Devices
+1000
+,,Force Plate - Force,,
+Frame,Sub Frame,Fx,Fy,Fz
+,,N,N,N
+1,0,1,2,3
+1,1,Trajectories,5,6
+
+"""
+OUTPUTS = """\
+Model Outputs
+100
+,,Anna:Angles,,
+Frame,Sub Frame,X,Y,Z
+,,deg,deg,deg
+1,0,90,91,92
+2,0,93,94,95
+
+"""
 
 
 def nexus(
