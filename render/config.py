@@ -17,7 +17,8 @@ from render.sensors.shutter import ShutterConfig
 from render.skin.look import ALL_TONES, check_tones
 
 NEAR_SENSOR: Final = "d435"
-"""Depth sensor at the user's eyes, 0.4 to 0.6 m from the hands: it measures from 0.2 m on."""
+"""Depth sensor at the user's eyes, 0.4 to 0.6 m from the hands, and of a user's own cameras, which may be as
+near: it measures from 0.2 m on."""
 FAR_SENSOR: Final = "kinect2"
 """Depth sensor of all other placements; it measures from 0.5 m on."""
 
@@ -75,7 +76,8 @@ class RenderConfig:
         """`depth_sensor`, or in the place of auto the one that fits the placement."""
         if self.depth_sensor != "auto":
             return self.depth_sensor
-        return DepthNoiseConfig((NEAR_SENSOR if self.view.placement == "head" else FAR_SENSOR,))
+        near = self.view.placement == "head" or self.view.cameras is not None
+        return DepthNoiseConfig((NEAR_SENSOR if near else FAR_SENSOR,))
 
     def settled(self) -> RenderConfig:
         """The same without auto: the painter of this machine, and the depth sensor of the placement."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import hashlib
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import cv2
 import numpy as np
@@ -15,17 +17,20 @@ from gloves.takes.take import Take
 from gloves.takes.tracked_take import TrackedTake
 from handsim.app.interrupts import Stopped
 from handsim.app.workers import check_workers, in_processes
-from handsim.errors import HandSimError, choices
+from handsim.errors import HandSimError, HandSimWarning, choices
 from handsim.files.atomic import remove_leftovers
 from handsim.files.disk import check_free
 from handsim.files.json_files import claim, load_json, save_json
+from render.cameras.own_cameras import check_hands_in_view
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.formats.annotations.common import without_colors
+from render.formats.merging import CONFIG
 from render.formats.writer import FORMATS, NEED_COLORS, open_writer
 from render.frames.frame import RenderedFrame
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
+from render.own_poses import PoseFile, load_poses
 from render.painting.figures import sample_people
 from render.painting.painter import choose_painter
 from render.scenery.enclosures import enclose
@@ -43,16 +48,16 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int], None]
 """Called with the numbers of finished pictures and of all pictures."""
-CONFIG: Final = "render.json"
 SHEET: Final = "contact_sheet.png"
 _LEFT_OUT: Final = "left_out-{}.json"
 _ON_SHEET: Final = 9
 _PATHS: Final = 1  # spawn keys of choices for the whole take, and for one shard
 _SHARDS: Final = 2
+_MOST_STUDIOS: Final = 32  # of people with painted skins that are kept, some 5 MB each
 
 
 def render_take(
-    path: Path,
+    path: Path | PoseFile,
     out: Path,
     formats: Sequence[str],
     config: RenderConfig,
@@ -63,7 +68,7 @@ def render_take(
     """Draw a take; a second call resumes where the first was stopped.
 
     Args:
-        path: A tracked take (`.npz`), or the truth of a simulated one (`.truth.npz`).
+        path: A tracked take (`.npz`), the truth of a simulated one (`.truth.npz`), or poses of your own.
         out: Folder; each of several formats has a folder of its own in it.
         formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
@@ -81,13 +86,16 @@ def render_take(
     _check_formats(formats, config)
     processes = check_workers(workers)
     config = config.settled()
-    take = load_shown_take(path)
+    take = _load(path, config)
     if config.background.photo > 0.0:
         photo_files(Path(str(config.background.photos)))
     shards = _shards(take, config)
-    views = _viewpoints(take, config).num_cameras
-    settings = {"take": path.name, "frames": take.num_frames, "formats": list(formats)}
-    claim(out / CONFIG, settings | dataclasses.asdict(config), noun="rendering", error=HandSimError)
+    viewpoints = _viewpoints(take, config)
+    views = viewpoints.num_cameras
+    if config.view.cameras is not None:
+        check_hands_in_view(config.view.cameras, viewpoints.cameras(0), take)
+    settings = _settings(path, take, viewpoints, config) | {"formats": list(formats)}
+    claim(out / CONFIG, settings, noun="rendering", error=HandSimError)
     job = functools.partial(_render_shard, path, out, tuple(formats), config)
     done = _finished(out, formats)
     count = views * sum(len(shards[number]) for number in done if number < len(shards))
@@ -115,6 +123,38 @@ def render_take(
         )
     _write_sheet(out, take, config, kept)
     return total - views * len(lost)
+
+
+def _load(path: Path | PoseFile, config: RenderConfig) -> ShownTake:
+    """A take, or poses that are drawn like one."""
+    if not isinstance(path, PoseFile):
+        return load_shown_take(path)
+    take = load_poses(path, seed=config.seed)
+    if config.shutter is not None and not take.is_motion:
+        raise HandSimError(f"{path.path}: poses without times have no motion to blur; add the array times")
+    return take
+
+
+def _settings(
+    path: Path | PoseFile, take: ShownTake, viewpoints: Viewpoints, config: RenderConfig
+) -> dict[str, Any]:
+    """What decides the pictures, as JSON; files that others write count by their content."""
+    name = path.path.name if isinstance(path, PoseFile) else path.name
+    settings: dict[str, Any] = {"take": name, "frames": take.num_frames} | dataclasses.asdict(config)
+    if config.view.cameras is None:
+        del settings["view"]["cameras"]
+    else:
+        settings["view"]["cameras"] = [camera.record() for camera in viewpoints.cameras(0)]
+    if isinstance(path, PoseFile):
+        with path.path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        settings["poses"] = {
+            "sha256": digest,
+            "sides": list(path.sides),
+            "people": path.people,
+            "glove": path.glove,
+        }
+    return settings
 
 
 def left_out_frames(out: Path) -> list[int]:
@@ -162,14 +202,18 @@ def _viewpoints(take: ShownTake, config: RenderConfig) -> Viewpoints:
 
 
 @functools.lru_cache(maxsize=1)
-def _opened(path: Path, config: RenderConfig) -> tuple[ShownTake, Viewpoints]:
+def _opened(path: Path | PoseFile, config: RenderConfig) -> tuple[ShownTake, Viewpoints]:
     """A take and its cameras; cached, because a worker draws many of its shards."""
     cv2.setNumThreads(1)  # there is one process per core
-    take = load_shown_take(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", HandSimWarning)  # told once, before the work
+        take = _load(path, config)
     return take, _viewpoints(take, config)
 
 
-def _render_shard(path: Path, out: Path, formats: tuple[str, ...], config: RenderConfig, shard: int) -> int:
+def _render_shard(
+    path: Path | PoseFile, out: Path, formats: tuple[str, ...], config: RenderConfig, shard: int
+) -> int:
     take, viewpoints = _opened(path, config)
     lost: list[int] = []
 
@@ -229,17 +273,23 @@ def draw_shard(
             without it such a frame is an error.
     """
     seeds = np.random.SeedSequence(config.seed, spawn_key=(_SHARDS, shard)).spawn(1 + len(frames))
-    rng = np.random.default_rng(seeds[0])
-    people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
-    colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in take.bodies]
-    painter = choose_painter(config.with_chosen_painter().painter)
-    studio = Studio(take, people, colors, config.passes, painter=painter)
-    skin = people[0].skin if config.dress == "skin" else None
     around = viewpoints.positions() if viewpoints.num_cameras > 1 else None
-    kept = _choices(config, skin, around, rng)
+    rng = np.random.default_rng(seeds[0])
+    studio = _studio(take, config, rng) if take.cast is None else None
+    kept: dict[int, FrameChoices] = {}
     for frame, seed in zip(frames, seeds[1:], strict=True):
+        person = 0 if take.cast is None else take.cast.person_in(frame, shard)
+        if take.cast is not None:
+            studio = _studio_of(take, config, person)
+            rng = np.random.default_rng(seeds[0])  # all people of a shard are in one place
+        assert studio is not None
         own = np.random.default_rng(seed)
-        chosen = _choices(config, skin, around, own) if config.vary == "frame" else kept
+        if config.vary == "frame":
+            chosen = _choices(config, studio.skin, around, own)
+        else:
+            if person not in kept:
+                kept[person] = _choices(config, studio.skin, around, rng)
+            chosen = kept[person]
         cameras = viewpoints.cameras(frame)
         if leave_out is not None and not studio.is_clear(frame, cameras):
             leave_out(frame)
@@ -247,6 +297,21 @@ def draw_shard(
         for camera in cameras:
             fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
             yield studio.photograph(frame, camera, fresh)
+
+
+def _studio(take: ShownTake, config: RenderConfig, rng: np.random.Generator) -> Studio:
+    """The hands and bodies of a take, on people drawn by a generator."""
+    people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
+    colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in take.bodies]
+    painter = choose_painter(config.with_chosen_painter().painter)
+    return Studio(take, people, colors, config.passes, painter=painter)
+
+
+@functools.lru_cache(maxsize=_MOST_STUDIOS)
+def _studio_of(take: ShownTake, config: RenderConfig, person: int) -> Studio:
+    """The hands of one of the cast, with a skin of their own; cached, because they come back."""
+    assert take.cast is not None
+    return _studio(take.of_person(person), config, take.cast.rng(person))
 
 
 def _choices(

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.fit import GlovedHand
+from gloves.fit import GlovedHand, attach
 from gloves.takes.archives import archive_kind
 from gloves.takes.take import KIND, Take, load_take
 from gloves.takes.tracked_take import LOST, TrackedTake, load_tracked_take
 from handsim.errors import CaptureError
+from handsim.hand.model import HandModel
+from handsim.hand.shape import HandShape, sample_shape
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import quaternion_matrix
 
@@ -34,6 +37,36 @@ class ShownBody:
     """Poses of the body; NaN where it is lost."""
 
 
+_PEOPLE: Final = 4  # spawn key of what a person draws; `render.session` and `render.own_poses` have others
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cast:
+    """Who is in each frame, where poses are of several people."""
+
+    seed: int
+    """Of what the people draw: their hands, where there are no `shapes`, and their skins."""
+    person: Int[np.ndarray, "T"] | None = None
+    """Number of the person in each frame; None: another person in every shard."""
+    shapes: tuple[HandShape, ...] | None = None
+    """Hands of the people; None: adults who are drawn."""
+
+    def person_in(self, frame: int, shard: int) -> int:
+        """Number of the person in a frame of a shard."""
+        return shard if self.person is None else int(self.person[frame])
+
+    def rng(self, person: int) -> np.random.Generator:
+        """The source of a person's skin, the same wherever the person appears."""
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(_PEOPLE, person, 1)))
+
+    def shape(self, person: int) -> HandShape:
+        """A person's hand."""
+        if self.shapes is not None:
+            return self.shapes[0 if self.person is None else person]
+        sequence = np.random.SeedSequence(self.seed, spawn_key=(_PEOPLE, person, 0))
+        return sample_shape(rng=np.random.default_rng(sequence))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownTake:
     """Motion of hands and rigid bodies, and the points that the optical system saw of them."""
@@ -49,6 +82,10 @@ class ShownTake:
     labels: Int[np.ndarray, "T N"]
     """Indices of `label_names`, -1 for a ghost."""
     label_names: tuple[str, ...]
+    cast: Cast | None = None
+    """Who is in each frame; None: those whose hands these are."""
+    is_motion: bool = True
+    """Whether frames follow one another; else they are poses of their own."""
 
     @property
     def num_frames(self) -> int:
@@ -58,6 +95,19 @@ class ShownTake:
     def wrists(self) -> Float[np.ndarray, "T H 27"]:
         """Qpos of all H hands."""
         return np.stack([hand.qpos for hand in self.hands], axis=1)
+
+    def of_person(self, person: int) -> ShownTake:
+        """The same poses, of the hands of one of the cast.
+
+        Raises:
+            LayoutError: The glove does not fit these hands.
+        """
+        assert self.cast is not None
+        model = HandModel(self.cast.shape(person).with_side("right"))
+        hands = tuple(
+            GlovedHand(attach(hand.layout, model).with_side(hand.side), hand.qpos) for hand in self.hands
+        )
+        return dataclasses.replace(self, hands=hands)
 
 
 def load_shown_take(path: Path) -> ShownTake:

@@ -69,6 +69,12 @@ def numbers(owner: str, value: object, shape: tuple[int, ...], expected: str) ->
     return np.array(flat, dtype=np.float64).reshape(shape)
 
 
+def number_list(owner: str, value: object) -> tuple[float, ...]:
+    """A list of finite numbers, of any length."""
+    count = len(value) if isinstance(value, list) else -1
+    return tuple(numbers(owner, value, (count,), "a list of numbers").tolist())
+
+
 def shown(value: object) -> str:
     """A value as a sentence shows it, cut where it is long."""
     text = json.dumps(value, default=str, ensure_ascii=False)

@@ -5,6 +5,7 @@
 - camera: `Camera`, one calibrated camera with its pose, and the presets
 - cameras: `CameraRig`, shipped rigs and rigs from files
 - rig_file: the TOML form of a rig
+- camera_file: the TOML form of cameras with lenses of their own
 - solids: the simple solids that objects are made of
 - objects: rigid objects that a hand holds
 """

@@ -150,7 +150,7 @@ def _read(path: Path) -> CameraRig:
     table = read_rig_file(path)
     try:
         poses = [
-            _aimed(number, *camera) if isinstance(camera, tuple) else camera
+            aimed(f"camera {number}", *camera) if isinstance(camera, tuple) else camera
             for number, camera in enumerate(table.cameras, 1)
         ]
         if not poses:
@@ -160,9 +160,16 @@ def _read(path: Path) -> CameraRig:
         raise RigError(f"{path}: {error}") from error
 
 
-def _aimed(number: int, position: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+def aimed(
+    owner: str, position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
+) -> NDArray[np.float64]:
+    """`look_at` [m] for a camera of a file.
+
+    Raises:
+        RigError: The target is the position.
+    """
     if np.linalg.norm(target - position) < _APART:
-        raise RigError(f"camera {number} looks at its own position; expected a target in front of it")
+        raise RigError(f"{owner} looks at its own position; expected a target in front of it")
     return look_at(position, target)
 
 

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _RIG_KEYS: Final = ("name", "description", "field_of_view", "resolution", "camera")
-_CAMERA_KEYS: Final = ("position", "target", "T_world_camera")
+PLACE_KEYS: Final = ("position", "target", "T_world_camera")
+"""Keys that say where a camera is."""
+_OWN_LENS: Final = ("size", "focal", "lens")
 
 
 class RigTable(NamedTuple):
@@ -44,6 +46,11 @@ def read_rig_file(path: Path) -> RigTable:
 
 
 def _parse(table: Mapping[str, object]) -> RigTable:
+    if any(key in camera for camera in tables_of(table, "camera") for key in _OWN_LENS):
+        raise RigError(
+            "its cameras have sizes and lenses of their own, which handsim render --cameras takes; expected "
+            "a rig, whose cameras share field_of_view and resolution"
+        )
     check_keys(table, "the file", _RIG_KEYS, optional=("description", "resolution", "camera"))
     name, tables = table["name"], tables_of(table, "camera")
     if not isinstance(name, str) or not name or not name.isprintable():
@@ -52,14 +59,19 @@ def _parse(table: Mapping[str, object]) -> RigTable:
     if isinstance(resolution, bool) or not isinstance(resolution, int):
         raise RigError(f"resolution is {shown(resolution)}, expected a whole number of pixels")
     angle = number_of(table, "field_of_view")
-    cameras = [_parse_camera(entry, f"camera {number}") for number, entry in enumerate(tables, 1)]
+    cameras = [parse_place(entry, f"camera {number}") for number, entry in enumerate(tables, 1)]
     return RigTable(name, angle, resolution, cameras)
 
 
-def _parse_camera(
+def parse_place(
     table: Mapping[str, object], owner: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]] | NDArray[np.float64]:
-    check_keys(table, owner, _CAMERA_KEYS, optional=_CAMERA_KEYS)
+    """Where a camera is: position and target (3,) [m], or a pose (4, 4).
+
+    Raises:
+        HandSimError: The table has other keys, or values of another type.
+    """
+    check_keys(table, owner, PLACE_KEYS, optional=PLACE_KEYS)
     if set(table) == {"T_world_camera"}:
         return numbers(
             f"{owner}: T_world_camera", table["T_world_camera"], (4, 4), "four rows of four numbers"

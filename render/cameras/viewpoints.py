@@ -6,6 +6,8 @@ Paths are computed once for a whole take, from the motion of its hands, so that 
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -16,6 +18,7 @@ from handsim.errors import ArgumentError, choices
 from handsim.space.camera import Camera, preset
 from handsim.space.cameras import load_rig, look_at
 from handsim.space.transforms import quaternion_matrix
+from render.cameras.own_cameras import load_cameras
 from render.shown_take import ShownTake
 
 if TYPE_CHECKING:
@@ -53,8 +56,15 @@ class ViewConfig:
     """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
     rig: str = "six"
     """Rig for the placement rig: a shipped name or the path of a .toml file."""
+    cameras: str | None = None
+    """File of your own cameras, instead of all these: ours (.toml), OpenCV's (.yml, .json), or COLMAP's (the
+    folder of cameras.txt and images.txt)."""
 
     def __post_init__(self) -> None:
+        if self.cameras is not None and (self.placement, self.camera, self.views) != ("still", "vga", 1):
+            raise ArgumentError(
+                f"the cameras are those of {self.cameras}; leave out the placement, the camera and the views"
+            )
         if self.placement not in PLACEMENTS:
             raise ArgumentError(choices(self.placement, PLACEMENTS, noun="placement"))
         if self.views < 1:
@@ -75,8 +85,13 @@ class Viewpoints:
     """
 
     def __init__(self, config: ViewConfig, take: ShownTake, *, rng: np.random.Generator) -> None:
-        self._camera = preset(config.camera)
-        self._poses = _PATHS[config.placement](config, take, rng)
+        if config.cameras is not None:
+            self._cameras = load_cameras(config.cameras)
+            self._poses = _kept([camera.T_world_camera for camera in self._cameras], take)
+        else:
+            self._poses = _PATHS[config.placement](config, take, rng)
+            named = (dataclasses.replace(preset(config.camera), name=f"view{n}") for n in itertools.count())
+            self._cameras = tuple(itertools.islice(named, len(self._poses)))
         self._centers = hand_centers(take)
 
     @property
@@ -89,11 +104,8 @@ class Viewpoints:
         return np.concatenate([self._centers, *(path[:, :3, 3] for path in self._poses)])
 
     def cameras(self, frame: int) -> list[Camera]:
-        """The cameras of one frame: `view0`, `view1`, ..."""
-        return [
-            dataclasses.replace(self._camera, name=f"view{number}", T_world_camera=path[frame])
-            for number, path in enumerate(self._poses)
-        ]
+        """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""
+        return [camera.at(path[frame]) for camera, path in zip(self._cameras, self._poses, strict=True)]
 
 
 def hand_centers(take: ShownTake) -> Float[np.ndarray, "T 3"]:
@@ -215,7 +227,11 @@ def _behind_arms(take: ShownTake, positions: NDArray[np.float64]) -> NDArray[np.
 
 
 def _rig(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    poses = load_rig(config.rig).T_world_camera
+    return _kept(load_rig(config.rig).T_world_camera, take)
+
+
+def _kept(poses: Iterable[NDArray[np.float64]], take: ShownTake) -> list[NDArray[np.float64]]:
+    """Paths of cameras that stay at their poses (4, 4)."""
     return [np.broadcast_to(pose, (take.num_frames, 4, 4)) for pose in poses]
 
 

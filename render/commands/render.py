@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, cast
 
 import tyro
 from rich.console import Console
@@ -13,8 +13,12 @@ from rich.console import Console
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimError, choices
+from handsim.files.outputs import check_outputs
+from handsim.hand.topology import Side
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
+from render.formats.merging import merge_renderings
+from render.own_poses import PoseFile
 from render.painting.painter import PainterChoice
 from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind
 from render.scenery.photographs import photo_files
@@ -51,7 +55,7 @@ class RenderOptions:
     """Whether light and background change with every shard or with every frame."""
     depth_sensor: tuple[str, ...] = (_AUTO_SENSOR,)
     """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only, or auto: d435 for
-    the placement head, where hands are too near for a kinect2, which is taken elsewhere."""
+    the placement head and for --cameras, where hands may be too near for a kinect2; that elsewhere."""
     color_sensor: bool = True
     """Whether noisy colors are written beside the perfect ones."""
     motion_blur: bool = False
@@ -82,30 +86,55 @@ class RenderOptions:
 
 
 def render(
-    take: Annotated[Path, tyro.conf.Positional],
+    take: Annotated[Path | None, tyro.conf.Positional] = None,
+    *,
     out: Path,
-    options: Annotated[RenderOptions, tyro.conf.arg(name="")],
+    poses: Path | None = None,
+    hands: tuple[Side, ...] = ("right",),
+    people: int | None = None,
+    glove: str = "dense19",
+    merge: tuple[Path, ...] = (),
+    options: Annotated[RenderOptions, tyro.conf.arg(name="")] = RenderOptions(),
     format: tuple[str, ...] = ("webdataset",),
     workers: int | None = None,
 ) -> None:
     """Draw the hands of a take: colors, depth, normals and ids, with the ground truth of each picture.
 
-    The same command resumes where it was stopped.
+    The same command resumes where it was stopped. Poses of your own are drawn with --poses; --merge makes one
+    folder of several.
 
     Args:
         take: A tracked take (.npz), or the truth of a simulated one (.truth.npz).
         out: Folder for the pictures, their annotations and contact_sheet.png.
+        poses: Poses of your own (.npz) instead of a take; docs/rendering.md has the arrays.
+        hands: Whose poses these are, in the file's order: right, left, or both.
+        people: Number of people that they are distributed over; one for each shard when not given.
+        glove: Their marker layout with --dress glove: a shipped name or the path of a .toml file.
+        merge: Folders of other renderings to be copied into one, with keys and ids of their own.
         options: What to draw.
         format: File formats: webdataset, coco, freihand, interhand, exr, png; several go into folders.
         workers: Processes; all cores when not given.
     """
+    if sum((take is not None, poses is not None, bool(merge))) != 1:
+        raise HandSimError("expected a take, --poses or --merge, and one of them alone")
+    if merge:
+        count = merge_renderings(merge, out)
+        print_line(f"{out}: {count} shards of {len(merge)} renderings")
+        return
+    if poses is None:
+        if (hands, people, glove) != (("right",), None, "dense19"):
+            raise HandSimError("--hands, --people and --glove belong to --poses; a take has its own")
+        source: Path | PoseFile = cast("Path", take)
+    else:
+        source = PoseFile(poses, hands, people, glove)
+    check_outputs((take, poses, options.view.cameras), (out,))
     config = options.config()
     start = time.perf_counter()
     if options.photos is not None:
         _print_left_out(options.photos)
     with progress_bar("images") as (bar, task):
         count = render_take(
-            take,
+            source,
             out,
             format,
             config,

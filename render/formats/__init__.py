@@ -7,5 +7,6 @@
 - clip_writer: the format webdataset, clips in tars.
 - freihand_writer: the format freihand.
 - writer: the writers by name of their format.
+- merging: several renderings copied into one.
 - annotations/: ground truth in the JSON of other data sets.
 """

@@ -27,10 +27,11 @@ from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectanc
 from render.sensors.exposure import Exposure, expose, linear_of
 from render.sensors.shutter import Shutter, combine, shutter_times
 from render.shown_take import ShownTake
+from render.skin.look import SkinLook
 from render.studio.hand_truth import hand_truth
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, UInt8
+    from jaxtyping import Float, Float32, Int, UInt8
     from numpy.typing import NDArray
 
 
@@ -80,6 +81,11 @@ class Studio:
         ]
         self._bodies = [BodyFigure(body, color) for body, color in zip(take.bodies, body_colors, strict=True)]
         self._colors = tuple(body_colors)
+
+    @property
+    def skin(self) -> SkinLook | None:
+        """The people's skin; None where gloves hide it."""
+        return self._people[0].skin if self._people[0].glove is None else None
 
     def photograph(self, frame: int, camera: Camera, choices: FrameChoices) -> RenderedFrame:
         """Draw one frame.
@@ -141,7 +147,8 @@ class Studio:
 
     def _pose(self, hand: GlovedHand, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
         """Qpos (27,) of a hand `shift` seconds after a frame; None where the hand has no pose."""
-        pose = _between(hand.qpos, frame, shift * self.take.rate)
+        people = None if self.take.cast is None else self.take.cast.person
+        pose = _between(hand.qpos, frame, shift * self.take.rate, people)
         if pose is None:
             return None
         pose[3:7] /= np.linalg.norm(pose[3:7])
@@ -251,13 +258,25 @@ class Studio:
         return {"people": people, "body_colors": self._colors, **kind, **chosen}
 
 
-def _between(rows: Float[np.ndarray, "T ..."], frame: int, shift: float) -> NDArray[np.float64] | None:
-    """The row `shift` frames after a frame, interpolated linearly; None where the frame has none."""
+def _between(
+    rows: Float[np.ndarray, "T ..."],
+    frame: int,
+    shift: float,
+    people: Int[np.ndarray, "T"] | None = None,
+) -> NDArray[np.float64] | None:
+    """The row `shift` frames after a frame, interpolated linearly; None where the frame has none.
+
+    Rows without numbers, and those of others than the frame's person, count as the frame's own.
+    """
     if not np.isfinite(rows[frame]).all():
         return None
     step = int(np.floor(shift))
     indices = np.clip([frame + step, frame + step + 1], 0, len(rows) - 1)
-    before, after = (rows[index] if np.isfinite(rows[index]).all() else rows[frame] for index in indices)
+    others = [people is not None and people[index] != people[frame] for index in indices]
+    before, after = (
+        rows[frame] if other or not np.isfinite(rows[index]).all() else rows[index]
+        for index, other in zip(indices, others, strict=True)
+    )
     if before.shape == (27,) and before[3:7] @ after[3:7] < 0.0:
         after = np.concatenate([after[:3], -after[3:7], after[7:]])
     mixed: NDArray[np.float64] = before + (shift - step) * (after - before)

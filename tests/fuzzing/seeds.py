@@ -105,6 +105,32 @@ def rig(folder: Path) -> list[Path]:
     return [folder / "rig.toml"]
 
 
+def camera_files(folder: Path) -> list[Path]:
+    top = 'name = "desk"\n[[camera]]\nname = "left"\nsize = [640, 480]\nfocal = [600.0, 601.0]\n'
+    lens = 'lens = "brown"\ncoefficients = [0.1, -0.05, 0.001, 0.0, 0.0]\n'
+    (folder / "desk.toml").write_text(top + lens + "position = [0.5, 0, 0.2]\ntarget = [0, 0, 0.1]\n")
+    for ending in ("yml", "json"):
+        file = cv2.FileStorage(str(folder / f"stereo.{ending}"), cv2.FILE_STORAGE_WRITE)
+        for name, value in {"image_width": 640, "image_height": 480, "T": np.full((3, 1), 0.05)}.items():
+            file.write(name, value)
+        for name in ("M1", "M2", "R"):
+            file.write(name, np.diag([500.0, 500.0, 1.0]) if name != "R" else np.eye(3))
+        file.write("D1", np.array([[0.1, -0.02, 0.001, 0.002, 0.0]]))
+        file.release()
+    (folder / "cameras.txt").write_text("# cameras\n1 OPENCV 640 480 500 501 320 240 0.1 0.01 0 0\n")
+    (folder / "images.txt").write_text("1 1 0 0 0 0.1 0.2 0.3 1 one.jpg\n\n2 0 1 0 0 0 0 1 1 two.jpg\n\n")
+    names = ("desk.toml", "stereo.yml", "stereo.json", "cameras.txt", "images.txt")
+    return [folder / name for name in names]
+
+
+def own_poses(folder: Path) -> list[Path]:
+    qpos = np.zeros((FRAMES, 27))
+    qpos[:, 3] = 1.0
+    people = {"person": np.arange(FRAMES) % 2, "hand_size": np.array([[0.19, 0.085], [0.17, 0.08]])}
+    np.savez(folder / "poses.npz", qpos=qpos, times=np.arange(FRAMES) / 30.0, **people)
+    return [folder / "poses.npz"]
+
+
 def body(folder: Path) -> list[Path]:
     save_body(folder / "body.toml", RigidTemplate.of(named_object("controller")))
     return [folder / "body.toml"]

@@ -20,6 +20,8 @@ from handsim.errors import HandSimError
 from handsim.files.json_files import claim, load_json
 from handsim.space.cameras import load_rig
 from handsim.space.objects import load_object
+from render.cameras.own_cameras import load_cameras
+from render.own_poses import PoseFile, load_poses
 from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
@@ -104,6 +106,8 @@ _ALL: Final = (
     Target("tsv", seeds.tsv, read_capture),
     Target("layout", seeds.layout, load_layout),
     Target("rig", seeds.rig, load_rig),
+    Target("cameras", seeds.camera_files, load_cameras),
+    Target("poses", seeds.own_poses, lambda path: load_poses(PoseFile(path)), mutate_archive),
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
     Target("truth", seeds.truth, load_take, mutate_archive),

@@ -1,0 +1,156 @@
+"""COLMAP's reconstructions as text: `cameras.txt` with the lenses, `images.txt` with the poses."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.errors import HandSimError, RigError, choices
+from handsim.files.inputs import read_bytes
+from handsim.space.camera import Camera
+from handsim.space.camera_file import checked_cameras
+from handsim.space.lens import Lens
+from handsim.space.transforms import quaternion_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+CAMERAS: Final = "cameras.txt"
+IMAGES: Final = "images.txt"
+_MOST_BYTES: Final = 1 << 28  # images.txt lists all points of each image
+_MODELS: Final = {
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "FULL_OPENCV": 12,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "OPENCV_FISHEYE": 8,
+}
+"""Models that we read, and their numbers of parameters."""
+_ONE_FOCAL: Final = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_NAMELESS: Final = re.compile(r"[^A-Za-z0-9_-]+")
+
+
+def read_colmap_cameras(path: Path) -> tuple[Camera, ...]:
+    """A camera for each image of a reconstruction.
+
+    Args:
+        path: The folder of `cameras.txt` and `images.txt`, or one of the two.
+
+    Returns:
+        Cameras called after their images, with their poses; the reconstruction's unit must be the meter.
+
+    Raises:
+        RigError: A file is missing or damaged, or a model is one that we do not have.
+    """
+    folder = path if path.is_dir() else path.parent
+    lenses = dict(_lens(folder / CAMERAS, line) for line in _lines(folder / CAMERAS))
+    lines = _lines(folder / IMAGES, keep_empty=True)
+    cameras = [_image(folder / IMAGES, line, lenses) for line in lines[::2]]  # points are on the others
+    return checked_cameras(folder / IMAGES, cameras)
+
+
+def _lines(path: Path, *, keep_empty: bool = False) -> list[str]:
+    """Lines without comments; an image without points has an empty one."""
+    try:
+        text = read_bytes(path, error=RigError, most=_MOST_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RigError(
+            f"{path}: not COLMAP's text: it is not UTF-8; colmap model_converter writes it"
+        ) from error
+    lines = [line.strip() for line in text.splitlines() if not line.startswith("#")]
+    if not keep_empty:
+        return [line for line in lines if line]
+    while lines and not lines[-1]:
+        lines.pop()
+    return lines
+
+
+def _lens(path: Path, line: str) -> tuple[str, Camera]:
+    """`CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`."""
+    number, *rest = line.split()
+    owner = f"{path}: camera {number[:20]}"
+    if len(rest) < 3:
+        raise RigError(f"{owner} has {1 + len(rest)} values, expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
+    model = rest[0]
+    if model not in _MODELS:
+        raise RigError(f"{owner}: {choices(model, _MODELS, noun='model')}")
+    width, height, *parameters = _numbers(owner, rest[1:])
+    if len(parameters) != _MODELS[model] or not (width.is_integer() and height.is_integer()):
+        raise RigError(
+            f"{owner}: {width:g} x {height:g} pixels and {len(parameters)} parameters, expected whole "
+            f"numbers and {_MODELS[model]} parameters of {model}"
+        )
+    if model in _ONE_FOCAL:
+        parameters.insert(0, parameters[0])
+    fx, fy, cx, cy, *bent = parameters
+    try:
+        lens = _bent(model, bent)
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return number, Camera(number, (int(width), int(height)), K, lens=lens)
+    except HandSimError as error:
+        raise RigError(f"{owner}: {error}") from error
+
+
+def _bent(model: str, bent: list[float]) -> Lens:
+    if model.endswith("FISHEYE"):
+        return Lens("fisheye", (*bent, 0.0, 0.0, 0.0)[:4])
+    if not any(bent):
+        return Lens()
+    if model.endswith("RADIAL"):
+        k1, k2 = (*bent, 0.0)[:2]
+        return Lens("brown", (k1, k2, 0.0, 0.0, 0.0))
+    if any(bent[5:]):
+        raise RigError("k4, k5 or k6 of FULL_OPENCV is not 0, expected the model OPENCV")
+    return Lens("brown", (*bent, 0.0)[:5])
+
+
+def _image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
+    """`IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, the pose of the world as the camera sees it."""
+    words = line.split(maxsplit=9)
+    if len(words) != 10:
+        raise RigError(
+            f"{path}: the line '{line[:40]}' has {len(words)} values, expected "
+            "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points after it"
+        )
+    owner = f"{path}: image {words[0][:20]}"
+    pose = np.array(_numbers(owner, words[1:8]))
+    length = float(np.linalg.norm(pose[:4]))
+    if abs(length - 1.0) > 1e-3:
+        raise RigError(f"{owner}: a quaternion of length {length:.4g}, expected 1")
+    if words[8] not in lenses:
+        raise RigError(f"{owner}: {choices(words[8], lenses, noun='camera')}")
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3] = quaternion_matrix(pose[:4] / length)
+    T_camera_world[:3, 3] = pose[4:]
+    lens = lenses[words[8]]
+    name = _NAMELESS.sub("_", words[9].rpartition(".")[0] or words[9])[-64:]
+    return Camera(name, lens.size, lens.K, _inverse(T_camera_world), lens.lens)
+
+
+def _inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
+    inverse = np.eye(4)
+    inverse[:3, :3] = transform[:3, :3].T
+    inverse[:3, 3] = -transform[:3, :3].T @ transform[:3, 3]
+    return inverse
+
+
+def _numbers(owner: str, words: list[str]) -> list[float]:
+    def each() -> Iterator[float]:
+        for word in words:
+            try:
+                value = float(word)
+            except ValueError:
+                value = np.nan
+            if not abs(value) < 1e9:
+                raise RigError(f"{owner}: '{word[:40]}' is no number that fits")
+            yield value
+
+    return list(each())

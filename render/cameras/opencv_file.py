@@ -1,0 +1,275 @@
+"""OpenCV's calibration files, YAML or JSON: one camera, or the two of a stereo pair.
+
+Read by our own few lines: the files are flat tables of numbers, and OpenCV's parser may never come back
+from a damaged one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.errors import HandSimError, RigError
+from handsim.files.inputs import read_bytes
+from handsim.space.camera import Camera
+from handsim.space.camera_file import checked_cameras
+from handsim.space.lens import Lens
+from handsim.space.transforms import quaternion_matrix, vector_quaternions
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_MOST_BYTES: Final = 1 << 24
+_MOST_NUMBERS: Final = 16
+"""Of a value that is used; corners of boards may be thousands."""
+_CENTER: Final = 0.5  # OpenCV counts pixels from the first one's center, we from the picture's corner
+_LONGEST_BASELINE: Final = 5.0  # [m]
+_ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M)
+_DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
+_LIST: Final = re.compile(r"[\[\],\s]+")
+_K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
+_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "dist")
+_WIDTH: Final = ("image_width", "imageWidth", "width")
+_HEIGHT: Final = ("image_height", "imageHeight", "height")
+_SIZE: Final = ("image_size", "imageSize", "img_size", "size")
+_FISHEYE: Final = ("fisheye_model", "fisheye")
+_STEREO: Final = {"intrinsics": "extrinsics", "extrinsics": "intrinsics"}
+
+Values = dict[str, tuple[float, ...] | str]
+
+
+def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
+    """The camera of a calibration, or both cameras of a stereo one (docs/rendering.md has the names).
+
+    Args:
+        path: A `.yml`, `.yaml` or `.json` file. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
+            sample writes them, either; the other is read too.
+
+    Returns:
+        Cameras with their poses [m] and intrinsics [px].
+
+    Raises:
+        RigError: It cannot be read, something is missing, or a lens is of a kind that we do not have.
+    """
+    values = _read(path)
+    other = path.with_stem(_STEREO.get(path.stem, path.stem))
+    if other != path and other.is_file():
+        values = _read(other) | values
+    try:
+        cameras = _cameras(values)
+    except HandSimError as error:
+        raise RigError(f"{path}: {error}") from error
+    return checked_cameras(path, cameras)
+
+
+def _cameras(values: Values) -> list[Camera]:
+    if _find(values, _numbered(_K, 1)) is not None:
+        return _stereo(values)
+    if _find(values, ("P1",)) is not None:
+        return _rectified(values)
+    return [_camera(values, "camera", _K, _D, _pose(values))]
+
+
+def _camera(
+    values: Values, name: str, K: tuple[str, ...], D: tuple[str, ...], pose: NDArray[np.float64]
+) -> Camera:
+    matrix = _matrix(values, K, (3, 3))
+    return Camera(name, _size(values), _from_corner(matrix), pose, _lens(values, D))
+
+
+def _stereo(values: Values) -> list[Camera]:
+    """R and T take the first camera's coordinates to the second's."""
+    first = _pose({key: value for key, value in values.items() if key not in ("R", "T")})
+    second = first @ np.linalg.inv(_rigid(_rotation(values, "R"), _translation(values, "T")))
+    return [
+        _camera(values, name, _numbered(_K, number), _numbered(_D, number), pose)
+        for name, number, pose in (("left", 1, first), ("right", 2, second))
+    ]
+
+
+def _rectified(values: Values) -> list[Camera]:
+    """A rectified pair: P2 is K2 (I | t), with the baseline in t."""
+    first, cameras = _pose({key: value for key, value in values.items() if key not in ("R", "T")}), []
+    for name, key in (("left", "P1"), ("right", "P2")):
+        P = _matrix(values, (key,), (3, 4))
+        if not np.linalg.det(P[:, :3]):
+            raise RigError(f"{key} is not a projection matrix of a camera")
+        shift = np.linalg.solve(P[:, :3], P[:, 3]).astype(np.float64)
+        _check_baseline(shift)
+        pose = first @ np.linalg.inv(_rigid(np.eye(3), shift))
+        cameras.append(Camera(name, _size(values), _from_corner(P[:, :3]), pose))
+    return cameras
+
+
+def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
+    moved: NDArray[np.float64] = K.astype(np.float64)
+    moved[:2, 2] += _CENTER
+    return moved
+
+
+def _lens(values: Values, names: tuple[str, ...]) -> Lens:
+    found = _find(values, names)
+    given = () if found is None else _numbers(values, found, None)
+    model = str(values.get("distortion_model", ""))
+    flag = _find(values, _FISHEYE)
+    if model in ("equidistant", "fisheye") or (flag is not None and any(_numbers(values, flag, (1,)))):
+        if len(given) != 4:
+            raise RigError(f"a fisheye lens with {len(given)} coefficients, expected 4")
+        return Lens("fisheye", given)
+    if any(given[5:]):
+        raise RigError(
+            f"{found} has {len(given)} coefficients, of which those after the fifth are not 0, expected the "
+            "lens k1, k2, p1, p2, k3; calibrate without CALIB_RATIONAL_MODEL and the like"
+        )
+    if not any(given):
+        return Lens()
+    if len(given) < 4:
+        raise RigError(f"{found} has {len(given)} coefficients, expected 4 or 5: k1, k2, p1, p2, k3")
+    return Lens("brown", (*given, 0.0)[:5])
+
+
+def _size(values: Values) -> tuple[int, int]:
+    width, height, both = (_find(values, names) for names in (_WIDTH, _HEIGHT, _SIZE))
+    if width is not None and height is not None:
+        size = _numbers(values, width, (1,)) + _numbers(values, height, (1,))
+    elif both is not None:
+        size = _numbers(values, both, (2,))
+    else:
+        raise RigError("no size of the pictures; add image_width and image_height in pixels")
+    if not all(length == int(length) for length in size):
+        raise RigError(f"the pictures are {size[0]:g} x {size[1]:g}, expected whole numbers of pixels")
+    return int(size[0]), int(size[1])
+
+
+def _pose(values: Values) -> NDArray[np.float64]:
+    """`T_world_camera`, or the inverse of the extrinsics R and T; without them the camera is the world."""
+    if "T_world_camera" in values:
+        return _matrix(values, ("T_world_camera",), (4, 4))
+    if "R" in values or "T" in values:
+        outer = _rigid(_rotation(values, "R"), _translation(values, "T", longest=None))
+        return np.linalg.inv(outer).astype(np.float64)
+    return np.eye(4)
+
+
+def _rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = rotation, translation
+    return transform
+
+
+def _rotation(values: Values, key: str) -> NDArray[np.float64]:
+    """A rotation matrix, or a rotation vector [rad]."""
+    given = np.array(_numbers(values, key, None))
+    if given.size == 3:
+        turned: NDArray[np.float64] = quaternion_matrix(vector_quaternions(given[None])[0])
+        return turned
+    if given.size != 9:
+        raise RigError(f"{key} has {given.size} numbers, expected a rotation: 9 of a matrix or 3 of a vector")
+    left, stretch, right = np.linalg.svd(given.reshape(3, 3))
+    if np.abs(stretch - 1.0).max() > 1e-3 or np.linalg.det(given.reshape(3, 3)) < 0.0:
+        raise RigError(f"{key} is not a rotation matrix")
+    rotation: NDArray[np.float64] = (left @ right).astype(np.float64)  # files have few digits
+    return rotation
+
+
+def _translation(
+    values: Values, key: str, *, longest: float | None = _LONGEST_BASELINE
+) -> NDArray[np.float64]:
+    vector = np.array(_numbers(values, key, (3,)))
+    if longest is not None:
+        _check_baseline(vector)
+    return vector
+
+
+def _check_baseline(vector: NDArray[np.float64]) -> None:
+    length = float(np.linalg.norm(vector))
+    if length > _LONGEST_BASELINE:
+        raise RigError(
+            f"the cameras are {length:.4g} m apart, expected at most {_LONGEST_BASELINE:g} m; are these "
+            "millimeters, or squares of the board? Positions are in meters"
+        )
+
+
+def _matrix(values: Values, names: tuple[str, ...], shape: tuple[int, int]) -> NDArray[np.float64]:
+    found = _find(values, names)
+    if found is None:
+        raise RigError(f"no '{names[0]}', expected OpenCV's calibration with that name")
+    return np.array(_numbers(values, found, shape)).reshape(shape)
+
+
+def _numbered(names: tuple[str, ...], number: int) -> tuple[str, ...]:
+    return tuple(name + separator + str(number) for name in names for separator in ("", "_"))
+
+
+def _find(values: Mapping[str, object], names: tuple[str, ...]) -> str | None:
+    return next((name for name in names if name in values), None)
+
+
+def _numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> tuple[float, ...]:
+    if key not in values:
+        raise RigError(f"no '{key}'")
+    given = values[key]
+    if isinstance(given, str) or not np.isfinite(given).all():
+        raise RigError(f"{key} is no list of at most {_MOST_NUMBERS} finite numbers")
+    if shape is not None and len(given) != np.prod(shape):
+        expected = " x ".join(map(str, shape))
+        raise RigError(f"{key} has {len(given)} numbers, expected {expected}")
+    return given
+
+
+def _read(path: Path) -> Values:
+    data = read_bytes(path, error=RigError, most=_MOST_BYTES)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise RigError(f"{path}: not a calibration: it is not UTF-8 text") from error
+    if text.lstrip().startswith("<"):
+        raise RigError(f"{path}: this is XML, expected OpenCV's YAML or JSON")
+    if not text.lstrip().startswith("{"):
+        return dict(_yaml_entries(text))
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise RigError(f"{path}: not a calibration: it is no JSON") from error
+    if not isinstance(content, dict):
+        raise RigError(f"{path}: not a calibration: its JSON is no table")
+    return {str(key): _json_value(value) for key, value in content.items()}
+
+
+def _yaml_entries(text: str) -> Iterator[tuple[str, tuple[float, ...] | str]]:
+    """The values at the top level: numbers, lists of numbers, matrices; anything else as text."""
+    starts = list(_ENTRY.finditer(text))
+    ends = [start.start() for start in starts[1:]]
+    for start, end in itertools.zip_longest(starts, ends):
+        body = text[start.end() : end].strip()
+        data = _DATA.search(body)
+        words = [word for word in _LIST.split(data[1] if data else body, _MOST_NUMBERS + 2) if word]
+        yield start[1], _as_numbers(words) or body.strip("\"' ")
+
+
+def _json_value(value: object) -> tuple[float, ...] | str:
+    if isinstance(value, dict):
+        value = value.get("data")
+    words: list[str] = []
+    waiting = [value]
+    while waiting and len(words) <= _MOST_NUMBERS:
+        first = waiting.pop(0)
+        if isinstance(first, list):
+            waiting[:0] = first[: _MOST_NUMBERS + 1]
+        else:
+            words.append(str(float(first) if isinstance(first, bool) else first))
+    return _as_numbers(words) or str(value)[:80]
+
+
+def _as_numbers(words: list[str]) -> tuple[float, ...]:
+    """Numbers; none where a word is not one, or there are too many."""
+    try:
+        return tuple(float(word) for word in words) if len(words) <= _MOST_NUMBERS else ()
+    except ValueError:
+        return ()
