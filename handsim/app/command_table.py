@@ -25,7 +25,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "Write a trained labeler as an ONNX file, which needs no torch.",
     ),
     "evaluate": ("train.commands.evaluate:evaluate", "Measure a labeler on a labeled capture."),
-    "simulate": ("train.commands.simulate:simulate", "Simulate a capture of two hands, with its truth."),
+    "simulate": ("train.commands.simulate:simulate", "Simulate a capture of hands, with its truth."),
     "calibrate": ("track.commands.calibrate:calibrate", "Fit hands and gloves to a user, from a capture."),
     "track": ("track.commands.track:track", "Follow hands through a marker capture or a live stream."),
     "body": ("track.commands.body:body", "Write a rigid body's markers as a file, to track it with."),

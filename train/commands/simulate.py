@@ -26,7 +26,7 @@ _DISK: Final = 2_000  # bytes of a frame in both files
 
 
 def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -> None:
-    """Simulate a capture of two hands; the truth goes beside it.
+    """Simulate a capture of one hand or two; the truth goes beside it.
 
     Args:
         out: Unlabeled .c3d, .trc or Motive .csv file; OUT.truth.npz takes IDs, labels, poses and shapes.

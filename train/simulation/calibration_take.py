@@ -75,6 +75,25 @@ def simulate_calibration(
         PoseError: A hand finds no way from its touches to free motion.
     """
     config = config or CalibrationTakeConfig()
+    scene = sample_calibration_scene(hands, config, rng=rng)
+    settings = {"kind": "calibration", **dataclasses.asdict(config)}
+    return record_take(scene, load_rig(config.rig), RoomConfig(), settings, rng=rng)
+
+
+def sample_calibration_scene(
+    hands: tuple[GloveFit, ...], config: CalibrationTakeConfig, *, rng: np.random.Generator
+) -> SceneMotion:
+    """The motion of one hand or both in a calibration capture; without rounds, free motion alone.
+
+    Args:
+        hands: One or two hands in their gloves.
+        config: What the user does.
+        rng: Source of all randomness.
+
+    Raises:
+        ArgumentError: There are no hands or more than two.
+        PoseError: A hand finds no way from its touches to free motion.
+    """
     if not 1 <= len(hands) <= len(_OFFSETS):
         raise ArgumentError(f"{len(hands)} hands, expected one or two")
     angles = [calibration_angles(fit.model, config, rng=rng) for fit in hands]
@@ -85,9 +104,7 @@ def simulate_calibration(
         position, quaternion = wrist_path(frames, _FREE.rate, wrist, rng=rng)
         qpos = join_qpos(part[:frames], position=position, quaternion=quaternion)
         moving.append(GlovedHand(fit, qpos))
-    settings = {"kind": "calibration", **dataclasses.asdict(config)}
-    scene = SceneMotion(tuple(moving), rate=_FREE.rate)
-    return record_take(scene, load_rig(config.rig), RoomConfig(), settings, rng=rng)
+    return SceneMotion(tuple(moving), rate=_FREE.rate)
 
 
 def calibration_angles(

@@ -17,8 +17,11 @@ from gloves.optics.strays import StrayConfig
 Kind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller"]
 """A kind of capture: what the hands do (section 5 of Han et al. 2018)."""
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-SimulatedKind = Literal["single-hand", "hand-hand", "hand-pen", "hand-controller", "real-like"]
-"""These, and hands that are like real ones (`train.simulation.real_like`)."""
+SimulatedKind = Literal[
+    "single-hand", "hand-hand", "hand-pen", "hand-controller", "real-like", "calibration", "free"
+]
+"""These, hands that are like real ones (`train.simulation.real_like`), the exercises that a user is
+calibrated by, and hands that move freely (`train.simulation.calibration_take`)."""
 SIMULATED_KINDS: Final[tuple[SimulatedKind, ...]] = get_args(SimulatedKind)
 
 

@@ -1,4 +1,4 @@
-"""Simulated takes of two hands: twins of the four captures that Han et al. 2018 test on (section 5, Table 3).
+"""Simulated takes of hands: twins of the four captures that Han et al. 2018 test on (section 5, Table 3).
 
 A take flows one way: people in gloves, their motion, what cameras see of it, the optical system, the take.
 """
@@ -6,16 +6,21 @@ A take flows one way: people in gloves, their motion, what cameras see of it, th
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 
+from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, PoseError, choices
+from handsim.hand.topology import SIDES, Side
 from handsim.space.cameras import ROOM_CENTER, check_outside_volume, load_rig
-from train.simulation.motion import SceneMotion, sample_scene_motion
+from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
+from train.simulation.motion import RATE, SceneMotion, sample_scene_motion
 from train.simulation.people import sample_adult_hands, wear_gloves
 from train.simulation.real_like import NUM_FRAMES, sample_real_like_scene
 from train.simulation.room import record_take
@@ -30,6 +35,10 @@ from train.simulation.room_settings import (
 
 WRIST_VOLUME: Final = 0.5
 """Half side of the cube that wrists stay in [m]; no camera may stand there."""
+BOTH: Final[tuple[Side, Side]] = ("right", "left")
+APART: Final = ("single-hand", "calibration", "free")
+"""Kinds of capture in which a hand may be alone."""
+_ALIKE: Final = {"real-like": "hand-hand", "free": "single-hand"}  # kinds whose rooms are alike
 _MAX_PEOPLE: Final = 10
 _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)
 
@@ -40,7 +49,8 @@ class TakeConfig:
 
     kind: SimulatedKind = "single-hand"
     num_frames: int | None = None
-    """Frames; the paper's number for this kind when not given, 3000 for real-like."""
+    """Frames; when not given the paper's number for this kind, 3000 for real-like and free, and for
+    calibration touches and 40 s of free motion."""
     glove: str = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
     rig: str = "figure5"
@@ -48,6 +58,9 @@ class TakeConfig:
     seed: int = 0
     optics: OpticsOptions = field(default_factory=OpticsOptions)
     """The optical system, where it differs from the one fitted to this kind of capture."""
+    hands: tuple[Side, ...] = BOTH
+    """Hands to simulate: right, left, or both, which meet or hold an object together in the kinds hand-hand,
+    hand-pen, hand-controller and real-like."""
 
     def __post_init__(self) -> None:
         if self.kind not in SIMULATED_KINDS:
@@ -56,12 +69,22 @@ class TakeConfig:
             raise ArgumentError(f"num_frames is {self.num_frames}, expected at least 1")
         if self.seed < 0:
             raise ArgumentError(f"seed is {self.seed}, expected 0 or more")
+        for side in self.hands:
+            if side not in SIDES:
+                raise ArgumentError(choices(side, SIDES, noun="hand"))
+        if set(self.hands) != set(BOTH) and (self.kind not in APART or len(self.hands) != 1):
+            raise ArgumentError(
+                f"hands are {' '.join(self.hands) or 'none'}, expected right and left, or one of them for "
+                f"the kinds {', '.join(APART)}"
+            )
         self.optics.applied(self.room.optics)  # raises what is out of range
 
     @property
     def room(self) -> RoomConfig:
-        """The room of the paper's capture; of the one with two hands for real-like."""
-        return TWINS["hand-hand" if self.kind == "real-like" else self.kind].room
+        """The room of the paper's capture, or of the one most like this kind."""
+        if self.kind == "calibration":
+            return RoomConfig()
+        return TWINS[_ALIKE.get(self.kind, self.kind)].room
 
 
 def simulate_take(config: TakeConfig) -> Take:
@@ -79,18 +102,17 @@ def simulate_take(config: TakeConfig) -> Take:
         PoseError: None of the people drawn can do what this kind of capture asks for.
     """
     kind = config.kind
-    key = SIMULATED_KINDS.index(kind), 0 if kind == "real-like" else TWINS[kind].draw
+    key = SIMULATED_KINDS.index(kind), TWINS[kind].draw if kind in TWINS else 0
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=key))
     rig, layout = load_rig(config.rig), load_layout(config.glove)
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
-    if kind == "real-like":
-        scene = sample_real_like_scene(layout, config.num_frames or NUM_FRAMES, rng=rng)
-    else:
-        scene = sample_scene(kind, layout, config.num_frames or TWINS[kind].paper.frames, rng=rng)
+    scene = _sample_scene(config, layout, rng)
     optics = config.optics.applied(config.room.optics).worn(layout.radius)
     room = dataclasses.replace(config.room, optics=optics)
     settings = dataclasses.asdict(config) | {"room": dataclasses.asdict(room)}
     del settings["optics"]  # the room has all of them
+    if set(config.hands) == set(BOTH):
+        del settings["hands"]
     return record_take(scene, rig, room, settings, rng=rng)
 
 
@@ -109,12 +131,47 @@ def sample_scene(
         LayoutError: The glove does not fit.
         PoseError: None of the people drawn can do this.
     """
+    return _by_somebody(kind, layout, lambda fits: sample_scene_motion(kind, fits, num_frames, rng=rng), rng)
+
+
+def _sample_scene(config: TakeConfig, layout: MarkerLayout, rng: np.random.Generator) -> SceneMotion:
+    kind = config.kind
+    if kind == "real-like":
+        return sample_real_like_scene(layout, config.num_frames or NUM_FRAMES, rng=rng)
+    if kind not in TWINS:
+        return _by_somebody(kind, layout, functools.partial(_exercise, config, rng=rng), rng)
+    scene = sample_scene(cast("Kind", kind), layout, config.num_frames or TWINS[kind].paper.frames, rng=rng)
+    return dataclasses.replace(scene, hands=tuple(hand for hand in scene.hands if hand.side in config.hands))
+
+
+def _exercise(config: TakeConfig, fits: Sequence[GloveFit], *, rng: np.random.Generator) -> SceneMotion:
+    """What a calibration asks for, or free motion, cut to its number of frames."""
+    count = config.num_frames or (NUM_FRAMES if config.kind == "free" else None)
+    made = CalibrationTakeConfig()
+    if config.kind == "free":
+        made = dataclasses.replace(made, rounds=0)
+    if count is not None:
+        made = dataclasses.replace(made, free=(count + 1) / RATE)
+    worn = tuple(fit for fit in fits if fit.side in config.hands)
+    scene = sample_calibration_scene(worn, made, rng=rng)
+    return dataclasses.replace(
+        scene, hands=tuple(GlovedHand(hand.fit, hand.qpos[:count]) for hand in scene.hands)
+    )
+
+
+def _by_somebody(
+    kind: SimulatedKind,
+    layout: MarkerLayout,
+    act: Callable[[Sequence[GloveFit]], SceneMotion],
+    rng: np.random.Generator,
+) -> SceneMotion:
+    """What the first person does who can."""
     reason: PoseError | None = None
     for _ in range(_MAX_PEOPLE):
         models = sample_adult_hands(rng=rng)
         fits = wear_gloves(layout, models, along=_SLIP_ALONG, around=_SLIP_AROUND, rng=rng)
         try:
-            return sample_scene_motion(kind, fits, num_frames, rng=rng)
+            return act(fits)
         except PoseError as error:
             reason = error
     raise PoseError(f"none of {_MAX_PEOPLE} people can do '{kind}'; the last: {reason}") from reason

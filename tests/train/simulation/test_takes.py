@@ -195,3 +195,36 @@ def test_the_whole_hand_controller_twin_is_near_table_3():
     assert ours.frames == paper.frames == 2645
     for name in ("gaps", "average_length", "average_missing"):
         assert abs(getattr(ours, name) / getattr(paper, name) - 1.0) < 0.25, name
+
+
+@pytest.mark.parametrize("kind", ["single-hand", "calibration", "free"])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_one_hand_alone(kind, side):
+    take = simulate_take(TakeConfig(kind=kind, num_frames=FRAMES, hands=(side,)))
+    assert [hand.shape.side for hand in take.hands] == [side] and take.settings["hands"] == (side,)
+    assert take.num_frames == len(take.hands[0].qpos) == FRAMES
+    assert set(np.unique(take.labels)) <= {-1, *range(19)}
+    assert np.isfinite(take.observed(take.hand_labels[0])).all(axis=-1).mean() > 0.8
+    model = HandModel(take.hands[0].shape)
+    assert model.penetration(take.hands[0].qpos).max() <= SELF_DEEPEST + 1e-6
+    assert np.ptp(take.hands[0].qpos[:, 7:], axis=0).max() > 0.1, "it moves"
+
+
+def test_calibration_has_touches_and_free_motion_of_both_hands():
+    take = simulate_take(TakeConfig(kind="calibration"))
+    assert [hand.shape.side for hand in take.hands] == ["right", "left"] and "hands" not in take.settings
+    assert take.num_frames > 45 * RATE, "40 s of free motion after the touches"
+    free = simulate_take(TakeConfig(kind="free", num_frames=FRAMES))
+    assert len(free.hands) == 2 and free.num_frames == FRAMES
+    apart = np.linalg.norm(free.hands[0].qpos[:, :3] - free.hands[1].qpos[:, :3], axis=1)
+    assert apart.min() > 0.2
+
+
+@pytest.mark.parametrize("kind", ["hand-hand", "hand-pen", "hand-controller", "real-like"])
+def test_hands_that_belong_together_are_not_parted(kind):
+    with pytest.raises(
+        ArgumentError, match="hands are left, expected right and left, or one of them for the"
+    ):
+        TakeConfig(kind=kind, hands=("left",))
+    with pytest.raises(ArgumentError, match="unknown hand 'both'"):
+        TakeConfig(hands=("both",))
