@@ -125,6 +125,8 @@ class TrainConfig:
     in the paper for its 19 and 13 markers."""
     ghosts: int = 2
     """Most ghosts added in the paper's corruption."""
+    corruption: str | None = None
+    """A corruption of your own instead of the paper's: module:name, or the name of an entry point."""
     anisotropy: float = 0.06
     """Log standard deviation of the stretch of each hand along three random directions."""
     knee: float = 0.02

@@ -25,6 +25,7 @@ from handsim.files.json_files import claim
 from train.config import Kind, TrainConfig
 from train.data.augmentation import Corruption
 from train.data.batches import Batch, draw_batch, paper_corruption, right_hands
+from train.data.own_corruption import check_corruption
 from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import Report, evaluate_labeler, paper_report
 from train.evaluation.matching_costs import choose_costs
@@ -89,7 +90,11 @@ def train_labeler(
     check_threads(threads)
     rows, held_out = _split(dataset, config.batch)
     fabric = start_fabric(config, out)
-    settings = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
+    settings: dict[str, Any] = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
+    if config.corruption is None:
+        del settings["train"]["corruption"]
+    else:
+        check_corruption(config.corruption, len(dataset.marker_names))
     with fabric.rank_zero_first():
         claim(out / _CONFIG, settings, noun="training run", error=WeightsError, grows="train.samples")
     torch.manual_seed(config.seed)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+import functools
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
 
 from handsim._checks import check_array
+from handsim._plugins import call_plugin, load_plugin
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS
@@ -12,8 +16,11 @@ from poses.shapes.samplers import sample_angles
 from poses.shapes.validity import make_valid
 
 if TYPE_CHECKING:
-    import numpy as np
     from jaxtyping import Float
+
+SAMPLERS: Final = "handsim.pose_samplers"
+"""Group of entry points of pose samplers."""
+_NOUN: Final = "pose sampler"
 
 
 class PoseSampler(Protocol):
@@ -74,3 +81,39 @@ def sample_poses(
         raise ArgumentError(f"num_poses is {num_poses}, expected a positive number")
     angles = check_array("the sampler's angles", sampler(model, num_poses, rng=rng), (num_poses, NUM_JOINTS))
     return join_qpos(make_valid(model, angles))
+
+
+@functools.lru_cache(maxsize=8)
+def load_sampler(name: str) -> PoseSampler:
+    """A user's sampler by `module:name` or by its entry point; what it returns is checked.
+
+    Args:
+        name: A function like `PoseSampler`, or a class whose instances are; entry points are of the group
+            `handsim.pose_samplers`.
+
+    Returns:
+        A sampler of finite joint angles (T, 20) [rad].
+
+    Raises:
+        ArgumentError: There is none of that name, it does not take a sampler's arguments, or what it returns
+            for two poses of a hand of size M has another shape or is not finite.
+        HandSimError: It raised an error.
+    """
+    sampler: PoseSampler = functools.partial(_drawn, name)
+    sampler(HandModel.named("M"), 2, rng=np.random.default_rng(0))
+    return sampler
+
+
+def _drawn(
+    name: str, model: HandModel, num_poses: int, *, rng: np.random.Generator
+) -> Float[np.ndarray, "T 20"]:
+    sampler = load_plugin(name, group=SAMPLERS, noun=_NOUN)
+    drawn = call_plugin(sampler, name, _NOUN, model, num_poses, rng=rng)
+    owner = f"what {_NOUN} '{name}' returns"
+    try:
+        angles = np.asarray(drawn, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"{owner} is {type(drawn).__name__}, expected joint angles [rad]") from error
+    if angles.shape != (num_poses, NUM_JOINTS):
+        raise ArgumentError(f"{owner} has shape {angles.shape}, expected ({num_poses}, {NUM_JOINTS})")
+    return check_array(owner, angles, (num_poses, NUM_JOINTS))

@@ -58,7 +58,8 @@ def calibrate(
         glove: Marker layout: a shipped name or the path of a .toml file.
         size: The size nearest to the hands; auto measures it in the capture.
         hands: Which hands are in the capture.
-        labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
+        labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
+            not given.
     """
     if out.suffix.lower() != ".json":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .json")

@@ -75,7 +75,8 @@ def track(
         hands: Which hands to track; both, or those of --shape, when not given.
         body: A rigid body to track beside the hands, once per body: a .toml file, see handsim body, or one of
             handsim's own objects.
-        labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
+        labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
+            not given.
         labeled: File for the labeled points, .trc, .c3d or Motive .csv; markers are called right:ThumbTip and
             so on, other points Unlabeled1, Unlabeled2, ...
     """

@@ -37,7 +37,8 @@ def evaluate(
         captures: Labeled .trc, .c3d, .csv or .tsv files, folders searched for them, or the .truth.npz of
             takes. Each hand of a capture of two, with columns right:ThumbTip and so on, is counted by itself.
         glove: Marker layout: a shipped name or the path of a .toml file.
-        labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
+        labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
+            not given.
         occlude: Up to this many draws of a marker to drop, with replacement (the paper: 5 dense, 3 sparse).
         ghosts: Up to this many ghosts, uniform in the frame's box grown by a tenth (the paper: 2).
         every: Take one frame of this many of captures; 1 takes all.

@@ -43,7 +43,8 @@ def label(
         out: Labeled .trc, .c3d or Motive .csv file; points that are not markers become columns Unlabeled1,
             Unlabeled2, ...
         glove: Marker layout: a shipped name or the path of a .toml file.
-        labeler: Folder of a trained labeler, or an exported .onnx file; the shipped one when not given.
+        labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
+            not given.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
     label_on(threads)

@@ -2,5 +2,6 @@
 
 - shards: a training set on disk: `.npy` shards and a manifest; `Dataset` reads it.
 - batches: random rows, stretched, mirrored and centered, as batches.
+- own_corruption: corruption by a user's own function.
 - augmentation: jitter, occlusion, ghosts and random order (`Corruption`, `corrupt`).
 """

@@ -69,6 +69,17 @@ def corrupt(
     present = np.concatenate([present, *(np.isfinite(part).all(-1) for part in parts[1:])], axis=1)
     truth = np.full(present.shape, -1)
     truth[:, :count] = np.arange(count)
+    return shuffled(points, present, truth, rng=rng)
+
+
+def shuffled(
+    points: Float[np.ndarray, "B N 3"],
+    present: Bool[np.ndarray, "B N"],
+    truth: Int[np.ndarray, "B N"],
+    *,
+    rng: np.random.Generator,
+) -> Cloud:
+    """The points [m] that are there in random order, with as little padding as the fullest cloud needs."""
     order = rng.random(present.shape).argsort(axis=1)
     order = np.take_along_axis(
         order, np.take_along_axis(~present, order, 1).argsort(axis=1, kind="stable"), 1

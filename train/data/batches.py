@@ -9,6 +9,7 @@ import numpy as np
 from handsim.hand.topology import SIDES
 from train.config import TrainConfig
 from train.data.augmentation import Cloud, Corruption, corrupt
+from train.data.own_corruption import own_cloud
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -48,6 +49,8 @@ def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Ge
         ghosts = (chosen["ghosts"].astype(np.float64) - center) @ stretch
         corruption = Corruption(occlude=0, ghosts=0, jitter=jitter)
         return Batch(corrupt(observed, corruption, ghosts=ghosts, rng=rng), markers)
+    if config.corruption is not None:
+        return Batch(own_cloud(config.corruption, markers, rng=rng), markers)
     usual = paper_corruption(markers.shape[1]).occlude
     occlude = usual if config.occlude is None else config.occlude
     return Batch(corrupt(markers, Corruption(occlude, config.ghosts, jitter), rng=rng), markers)

@@ -1,6 +1,6 @@
 """Labelers: networks that give every point of a frame its marker, and what turns their scores into labels.
 
-- protocol: what every labeler offers (`Labeler`, `Labeling`), checks of its input, batches.
+- protocol: what every labeler offers (`Labeler`, `Labeling`), checks of its input, batches; a user's own.
 - kinds: the table of networks: how each is built, its loss, and how it becomes a labeler.
 - storage: trained labelers on disk, shipped or a user's; loading and saving them.
 - set_network, set_labeler: the default network, on pairwise distances; the labeler around it.

@@ -1,14 +1,18 @@
-"""The interface of every labeler: points of a frame in, a label and a confidence per point out; no torch."""
+"""The interface of every labeler: points of a frame in, a label and a confidence per point out; no torch.
+
+`OwnLabeler` is one that a user wrote, behind checks.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
 from gloves.captures.plausibility import check_unit
+from handsim._plugins import call_plugin, load_plugin
 from handsim.errors import ArgumentError, WeightsError
 from train.matching.pose_prior import PosePrior
 from train.matching.verification import match_scores
@@ -17,6 +21,9 @@ if TYPE_CHECKING:
     from jaxtyping import Bool, Float, Float32, Int
     from numpy.typing import NDArray
 
+LABELERS: Final = "handsim.labelers"
+"""Group of entry points of labelers."""
+_NOUN: Final = "labeler"
 MAX_POINTS: Final = 512
 _BATCH: Final = 256
 
@@ -153,3 +160,62 @@ def _check_cloud(points: Float[np.ndarray, "N 3"], frame: int) -> NDArray[np.flo
     if len(cloud) > MAX_POINTS:
         raise ArgumentError(f"frame {frame} holds {len(cloud)} points, expected at most {MAX_POINTS}")
     return cloud
+
+
+class OwnLabeler:
+    """A user's `Labeler` behind checks.
+
+    Args:
+        name: `module:name` of a labeler or of a class of them, or an entry point of the group
+            `handsim.labelers`.
+
+    Raises:
+        ArgumentError: There is none of that name, or it lacks `marker_names` or `label_frames`.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._labeler = load_plugin(name, group=LABELERS, noun=_NOUN)
+        names = getattr(self._labeler, "marker_names", None)
+        if not callable(getattr(self._labeler, "label_frames", None)) or not isinstance(names, list | tuple):
+            raise ArgumentError(
+                f"{_NOUN} '{name}' is {type(self._labeler).__name__}, expected marker_names and label_frames "
+                "as train.Labeler has them"
+            )
+        self.marker_names: tuple[str, ...] = tuple(map(str, names))
+
+    def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
+        """Label the points (N, 3) [m] of every frame.
+
+        Raises:
+            ArgumentError: A frame is not (N, 3), not finite, not in meters, or holds more than 512 points; or
+                the labeler returns something that does not fit it.
+            HandSimError: The labeler raised an error.
+        """
+        clouds = check_clouds(frames)
+        returned = call_plugin(self._labeler.label_frames, self._name, _NOUN, clouds)
+        if not isinstance(returned, list) or len(returned) != len(clouds):
+            raise ArgumentError(f"{_NOUN} '{self._name}' returns no list of {len(clouds)} labelings")
+        return [self._checked(one, len(cloud)) for one, cloud in zip(returned, clouds, strict=True)]
+
+    def _checked(self, labeling: Any, count: int) -> Labeling:
+        owner = f"{_NOUN} '{self._name}'"
+        try:
+            labels, confidence = (
+                np.asarray(labeling.labels),
+                np.asarray(labeling.confidence, dtype=np.float64),
+            )
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ArgumentError(f"{owner} returns {type(labeling).__name__}, expected a Labeling") from error
+        if labels.shape != (count,) or labels.dtype.kind not in "iu" or confidence.shape != (count,):
+            raise ArgumentError(
+                f"{owner} returns labels {labels.shape} of type {labels.dtype} and confidences "
+                f"{confidence.shape}, expected whole numbers ({count},) and numbers ({count},)"
+            )
+        most = len(self.marker_names) - 1
+        known = labels[labels >= 0]
+        if labels.min(initial=-1) < -1 or labels.max(initial=-1) > most or len(set(known)) < len(known):
+            raise ArgumentError(f"{owner} returns labels beyond -1 to {most}, or a marker twice in a frame")
+        if not ((confidence >= 0.0) & (confidence <= 1.0)).all():
+            raise ArgumentError(f"{owner} returns confidences that are not from 0 to 1")
+        return Labeling(labels.astype(np.int64), confidence)

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from gloves.layout import load_layout
+from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import HandSimError, WeightsError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
-from train.labelers.protocol import Labeler, checked_names
+from train.labelers.protocol import LABELERS, Labeler, OwnLabeler, checked_names
 from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
@@ -33,12 +34,14 @@ def shipped_labelers() -> tuple[str, ...]:
 
 
 def load_labeler(name_or_path: str | Path) -> Labeler:
-    """The shipped labeler of a glove, one that `handsim train` wrote to a folder, or an exported .onnx file.
+    """A labeler: the shipped one of a glove, one that was trained or exported, or one of your own.
 
-    Only the first two need torch.
+    Only shipped ones and folders need torch.
 
     Args:
-        name_or_path: A glove with a shipped labeler, a folder, or an .onnx file.
+        name_or_path: A glove with a shipped labeler, a folder that `handsim train` wrote, an .onnx file,
+            `module:name` of a `Labeler` or of a class of them, or the name of an entry point of the group
+            `handsim.labelers`.
 
     Returns:
         A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
@@ -50,6 +53,9 @@ def load_labeler(name_or_path: str | Path) -> Labeler:
         from train.labelers.onnx_labeler import OnnxLabeler
 
         return OnnxLabeler(Path(name_or_path))
+    name = str(name_or_path)
+    if not Path(name).exists() and (is_plugin(name) or name in list_plugins(LABELERS)):
+        return OwnLabeler(name)
     from train.labelers.kinds import labeler_of
 
     network, card = load_network(name_or_path)
@@ -68,7 +74,7 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
         weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
         if not weights.is_file() or not card.is_file():
             unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler")
-            raise WeightsError(f"{unknown}, a folder that handsim train wrote, or an .onnx file")
+            raise WeightsError(f"{unknown}, a folder that handsim train wrote, an .onnx file, or module:name")
     return _read_network(weights, card)
 
 

@@ -37,6 +37,9 @@ class DatasetConfig:
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
     population: Population = dataclasses.field(default_factory=lambda: Population(children=0.2))
     poses: PoseMix = dataclasses.field(default_factory=PoseMix)
+    sampler: str | None = None
+    """A pose sampler of your own for hands that are alone, instead of that mix: module:name, or the name of
+    an entry point."""
     scenes: SceneMix = dataclasses.field(default_factory=SceneMix)
     ghosts: GhostConfig = dataclasses.field(default_factory=GhostConfig)
     optics: OpticsConfig = dataclasses.field(default_factory=OpticsConfig)

@@ -18,7 +18,8 @@ from poses.contact.two_hands import sample_two_hand_poses
 from poses.grasps.grasp_scene import wrist_poses
 from poses.grasps.object_motion import sample_held_poses, settle_hold
 from poses.shapes.samplers import PoseMix
-from poses.shapes.validity import sample_valid_angles
+from poses.shapes.sampling import PoseSampler
+from poses.shapes.validity import make_valid, sample_valid_angles
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -61,6 +62,7 @@ def sample_frame_scene(
     poses: PoseMix,
     volume: float,
     *,
+    sampler: PoseSampler | None = None,
     redrawn: Counter[str] | None = None,
     rng: np.random.Generator,
 ) -> FrameScene:
@@ -72,6 +74,7 @@ def sample_frame_scene(
         scenes: How often each kind of scene is drawn.
         poses: How single hands are posed.
         volume: Half side of the cube the wrist is in [m].
+        sampler: Draws the angles of single hands instead.
         redrawn: Counts the scenes that became one of a hand alone, by reason.
         rng: Source of all randomness.
     """
@@ -88,15 +91,24 @@ def sample_frame_scene(
     except PoseError:
         if redrawn is not None:
             redrawn[reason] += 1
-    return sample_single_hand(model, num_rows, poses, volume, rng=rng)
+    return sample_single_hand(model, num_rows, poses, volume, sampler=sampler, rng=rng)
 
 
 def sample_single_hand(
-    model: HandModel, num_frames: int, poses: PoseMix, volume: float, *, rng: np.random.Generator
+    model: HandModel,
+    num_frames: int,
+    poses: PoseMix,
+    volume: float,
+    *,
+    sampler: PoseSampler | None = None,
+    rng: np.random.Generator,
 ) -> FrameScene:
     """Poses of one hand in any orientation, in a cube of half side `volume` [m]."""
     position = ROOM_CENTER + rng.uniform(-volume, volume, size=(num_frames, 3))
-    angles = sample_valid_angles(model, num_frames, poses, rng=rng)
+    if sampler is None:
+        angles = sample_valid_angles(model, num_frames, poses, rng=rng)
+    else:
+        angles = make_valid(model, sampler(model, num_frames, rng=rng))
     quaternion = random_quaternions(num_frames, rng=rng)
     return FrameScene((model,), (join_qpos(angles, position=position, quaternion=quaternion),))
 

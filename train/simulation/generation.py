@@ -23,6 +23,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES
 from handsim.space.cameras import ROOM_CENTER, check_outside_volume, list_rigs, load_rig
+from poses.shapes.sampling import load_sampler
 from train.data.shards import (
     CONFIG,
     MANIFEST,
@@ -74,8 +75,12 @@ def generate_dataset(
             f"min_cameras is {config.min_cameras}, but rig '{rig.name}' has {len(rig.positions)}"
         )
     attach_markers(layout, HandModel.named("M"))  # raises before anything is written
+    if config.sampler is not None:
+        load_sampler(config.sampler)
     known = dataclasses.replace(config, optics=config.optics.worn(layout.radius))
     settings = {**dataclasses.asdict(known), "layout": dataclasses.asdict(layout)}
+    if config.sampler is None:
+        del settings["sampler"]
     if config.rig not in list_rigs():  # a file may change
         settings["cameras"] = {
             "T_world_camera": rig.T_world_camera.tolist(),

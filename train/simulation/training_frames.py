@@ -20,6 +20,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
 from handsim.space.cameras import CameraRig
 from handsim.space.objects import named_object
+from poses.shapes.sampling import load_sampler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import FrameScene, sample_frame_scene
 from train.simulation.people import wear_gloves
@@ -68,7 +69,14 @@ def simulate_frames(
         rng: Source of all randomness.
     """
     scene = sample_frame_scene(
-        models, len(block), config.scenes, config.poses, config.volume, redrawn=redrawn, rng=rng
+        models,
+        len(block),
+        config.scenes,
+        config.poses,
+        config.volume,
+        sampler=None if config.sampler is None else load_sampler(config.sampler),
+        redrawn=redrawn,
+        rng=rng,
     )
     around = np.deg2rad(config.slip_around)
     fits = wear_gloves(layout, scene.hands, along=config.slip_along, around=around, rng=rng)

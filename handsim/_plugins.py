@@ -1,0 +1,101 @@
+"""Functions and classes of users' own, by `module:name` or by the name of an entry point."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import re
+import sys
+import traceback
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+from handsim.errors import ArgumentError, HandSimError, choices
+
+_NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+
+
+def is_plugin(name: str) -> bool:
+    """Whether a name is written like `module:name`."""
+    return _NAME.fullmatch(name) is not None
+
+
+def list_plugins(group: str) -> tuple[str, ...]:
+    """Names of the entry points of a group, as installed packages registered them."""
+    return tuple(sorted({point.name for point in metadata.entry_points(group=group)}))
+
+
+@functools.lru_cache(maxsize=64)
+def load_plugin(name: str, *, group: str, noun: str) -> Any:
+    """What a name stands for, imported now; a class is called without arguments, once.
+
+    The current folder is searched last, after everything that is installed.
+
+    Args:
+        name: `module:name`, or the name of an entry point.
+        group: The group of entry points, such as `handsim.pose_samplers`.
+        noun: What it is, for messages.
+
+    Raises:
+        ArgumentError: There is nothing of that name, or its module cannot be imported.
+    """
+    target = name
+    if not is_plugin(name):
+        points = {point.name: point.value for point in metadata.entry_points(group=group)}
+        if name not in points:
+            known = choices(name, points, noun=noun) if points else f"unknown {noun} '{name[:200]}'"
+            raise ArgumentError(
+                f"{known}; expected module:name, or a name that a package registers as {group}"
+            )
+        target = points[name]
+    module, _, attribute = target.partition(":")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    try:
+        found: Any = importlib.import_module(module)
+        for part in attribute.split("."):
+            found = getattr(found, part)
+        return found() if inspect.isclass(found) else found
+    except ModuleNotFoundError as error:
+        raise ArgumentError(f"{noun} '{name}': {error}; it is looked for in {here} too") from error
+    except AttributeError as error:
+        raise ArgumentError(f"{noun} '{name}': {error}") from error
+    except Exception as error:
+        raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_told(error)}") from error
+
+
+def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: Any, **options: Any) -> Any:
+    """Call what a user wrote, and tell in one sentence what went wrong.
+
+    Raises:
+        ArgumentError: It does not take these arguments.
+        HandSimError: It raised an error; the sentence has its line. Ours goes on as it is.
+    """
+    if not callable(function):
+        raise ArgumentError(f"{noun} '{name}' is {type(function).__name__}, expected a function or a class")
+    try:
+        inspect.signature(function).bind(*args, **options)
+    except TypeError as error:
+        expected = ", ".join([*("array" if hasattr(one, "shape") else type(one).__name__ for one in args)])
+        keywords = "".join(f", {key}=..." for key in options)
+        raise ArgumentError(
+            f"{noun} '{name}' does not take the arguments ({expected}{keywords}): {error}"
+        ) from error
+    except ValueError:  # a builtin without a signature
+        pass
+    try:
+        return function(*args, **options)
+    except HandSimError:
+        raise
+    except Exception as error:
+        raise HandSimError(f"{noun} '{name}' failed: {_told(error)}") from error
+
+
+def _told(error: Exception) -> str:
+    """An error and the line that raised it."""
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({last.filename}, line {last.lineno})"
