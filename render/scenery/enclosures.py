@@ -54,6 +54,8 @@ class Surroundings:
     """Along the camera's axis [m]; 0 for what is not ahead."""
     axes: Int8[np.ndarray, "H W"]
     """Axis of the world that the surface's normal has."""
+    signs: Int8[np.ndarray, "H W"]
+    """Whether it points along that axis (1) or against it (-1)."""
 
     def put_behind(self, pictures: Pictures, camera: Camera) -> Pictures:
         """Pictures of hands and objects with depth and normals behind them, too.
@@ -66,12 +68,8 @@ class Surroundings:
         bare = (pictures.instances == 0) & (self.depth > 0.0)
         normals = pictures.normals
         if normals is not None:
-            rays = np.nan_to_num(camera.rays()) @ camera.T_world_camera[:3, :3].T
-            rows, columns = np.nonzero(bare)
-            axes = self.axes[bare]
-            signs = -np.sign(rays[rows, columns, axes])
             normals = normals.copy()
-            normals[bare] = camera.T_world_camera[:3, :3][axes] * signs[:, None]
+            normals[bare] = camera.T_world_camera[:3, :3][self.axes[bare]] * self.signs[bare][:, None]
         return dataclasses.replace(
             pictures, depth=np.where(bare, self.depth, pictures.depth), normals=normals
         )
@@ -139,7 +137,9 @@ def _drawn(
         light = cv2.GaussianBlur(light, (0, 0), background.blur * shape[0])
     rgb = np.rint(255.0 * cv2.pow(light.astype(np.float32), 1.0 / _GAMMA)).astype(np.uint8)
     depth = met.distances.reshape(shape) * np.where(known, rays[..., 2], 0.0)
-    return Surroundings(rgb, np.maximum(depth, 0.0).astype(np.float32), met.axes.reshape(shape))
+    along = np.take_along_axis(world, met.axes.reshape(-1, 1).astype(np.int64), axis=1)
+    signs = -np.sign(along).astype(np.int8).reshape(shape)
+    return Surroundings(rgb, np.maximum(depth, 0.0).astype(np.float32), met.axes.reshape(shape), signs)
 
 
 @functools.lru_cache(maxsize=2)

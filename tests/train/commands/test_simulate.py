@@ -102,7 +102,7 @@ def test_the_optics_are_options_of_the_command(tmp_path, capsys):
     assert said.count("\n") == 1 and "noise is -1, expected a finite number that is not negative" in said
 
 
-@pytest.mark.parametrize("name", ["take.csv", "take.npz", "take"])
+@pytest.mark.parametrize("name", ["take.tsv", "take.npz", "take"])
 def test_another_suffix_is_refused_before_the_work(name, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # An hour of frames would take minutes.
