@@ -8,9 +8,9 @@ import pytest
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import load_tracked_take
+from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from render.cameras.viewpoints import ViewConfig
-from render.frames.keypoints import hand_keypoints
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture

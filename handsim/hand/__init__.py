@@ -8,6 +8,7 @@
 - mjcf: the hand as a MuJoCo model
 - kinematics: `T_world_bone` of many poses
 - model: `HandModel`, which joins all of these
+- keypoints: the 21 keypoints of a hand, their names and their skeleton
 - jacobian: Jacobian of skinned points
 - contact: overlap of a hand with itself and with another
 - motion: `HandMotion` and `BodyMotion`, poses at a steady rate

@@ -50,7 +50,7 @@ class HandTruth:
     qpos: Float[np.ndarray, "27"]
     """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
     keypoints: Float[np.ndarray, "21 3"]
-    """Keypoints in the world [m]; see `render.frames.keypoints`."""
+    """Keypoints in the world [m]; see `handsim.hand.keypoints`."""
     pixels: Float[np.ndarray, "21 2"]
     """Pixels of the keypoints, inside the picture or not [px]; NaN where the lens cannot see them."""
     visible: Bool[np.ndarray, "21"]

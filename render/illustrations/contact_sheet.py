@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from handsim.errors import HandSimError
+from handsim.hand.keypoints import KEYPOINT_DIGITS, SKELETON
 from render.formats.annotations.common import CENTER, as_sensed
 from render.frames.frame import HandTruth, RenderedFrame
-from render.frames.keypoints import KEYPOINT_DIGITS, SKELETON
 from render.illustrations.captions import pad, side_by_side
 from render.illustrations.palette import BACKGROUND, bone_colors
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.fit import GloveFit
+from handsim.hand.keypoints import keypoint_flesh
 from handsim.hand.skin.surface import vertex_normals
 from render.frames.frame import PARTS_A_HAND
-from render.frames.keypoints import keypoint_flesh
 from render.painting.materials import (
     MARKER_COLOR,
     Material,

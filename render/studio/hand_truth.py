@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera
 from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures
-from render.frames.keypoints import hand_keypoints
 from render.painting.figures import HandFigure
 from render.skin.forearm import FOREARM
 

@@ -7,12 +7,12 @@ import pytest
 
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import load_layout
+from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
 from handsim.space.camera import Camera, pinhole
 from handsim.space.cameras import look_at
 from render.frames.frame import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
-from render.frames.keypoints import hand_keypoints
 
 
 @pytest.fixture(scope="session")

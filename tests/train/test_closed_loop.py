@@ -10,8 +10,8 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from handsim.app.cli import main
+from handsim.hand.keypoints import hand_keypoints
 from render.cameras.viewpoints import ViewConfig
-from render.frames.keypoints import hand_keypoints
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture

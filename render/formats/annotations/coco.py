@@ -12,10 +12,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from handsim.hand.keypoints import KEYPOINT_NAMES, SKELETON
 from handsim.space.camera import Camera
 from render.formats.annotations.common import CENTER, hand_mask, is_seen, rounded, run_lengths
 from render.frames.frame import HandTruth, RenderedFrame
-from render.frames.keypoints import KEYPOINT_NAMES, SKELETON
 
 CATEGORY: Final[dict[str, Any]] = {
     "id": 1,

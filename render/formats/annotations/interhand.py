@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from handsim.errors import DatasetError
+from handsim.hand.keypoints import NUM_KEYPOINTS
 from handsim.hand.topology import DIGITS, SIDES, Side
 from handsim.space.camera import Camera
 from render.formats.annotations.common import by_side, centered_K, is_seen, rounded, to_json
 from render.formats.annotations.joint_orders import to_order
 from render.frames.frame import HandTruth, RenderedFrame
-from render.frames.keypoints import NUM_KEYPOINTS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

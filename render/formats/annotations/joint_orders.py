@@ -1,4 +1,4 @@
-"""Joint orders of other data sets, as indices of our 21 (`render.frames.keypoints`), and conversions.
+"""Joint orders of other data sets, as indices of our 21 (`handsim.hand.keypoints`), and conversions.
 
 One table, because a wrong permutation looks almost right. The index `ABSENT` marks a joint that we lack.
 
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.errors import ArgumentError, choices
-from render.frames.keypoints import NUM_KEYPOINTS
+from handsim.hand.keypoints import NUM_KEYPOINTS
 
 if TYPE_CHECKING:
     from jaxtyping import Float

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from handsim.hand.keypoints import KEYPOINT_DIGITS, hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import JOINTS, NUM_BONES, NUM_JOINTS
 from render.formats.annotations.common import rounded
 from render.formats.annotations.joint_orders import joint_order, to_order
-from render.frames.keypoints import KEYPOINT_DIGITS, hand_keypoints
 
 if TYPE_CHECKING:
     from jaxtyping import Float

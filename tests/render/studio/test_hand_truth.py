@@ -8,13 +8,13 @@ import trimesh
 
 from gloves.fit import attach
 from gloves.layout import load_layout
+from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS, PALM, bones_of
 from handsim.space.camera import Camera, pinhole
 from handsim.space.cameras import look_at
 from poses import sample_poses
 from render.frames.frame import Pictures
-from render.frames.keypoints import hand_keypoints
 from render.painting.figures import HandFigure, sample_people
 from render.painting.rasterizer import Triangles, join, rasterize
 from render.skin.look import ALL_TONES

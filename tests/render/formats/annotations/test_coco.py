@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from handsim.hand.keypoints import KEYPOINT_NAMES
 from render.formats.annotations.common import hand_mask
 from render.formats.writer import open_writer
 from render.frames.frame import RenderedFrame
-from render.frames.keypoints import KEYPOINT_NAMES
 
 
 @pytest.fixture

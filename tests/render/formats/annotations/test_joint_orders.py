@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from handsim.errors import ArgumentError
+from handsim.hand.keypoints import KEYPOINT_NAMES
 from render.formats.annotations.joint_orders import ABSENT, JOINT_ORDERS, from_order, joint_order, to_order
-from render.frames.keypoints import KEYPOINT_NAMES
 
 # Names as the formats' own documents list them, in our words.
 THUMB = ("thumb_CMC", "thumb_MCP", "thumb_IP", "thumb_tip")

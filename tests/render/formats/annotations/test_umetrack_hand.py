@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
 from handsim.space.transforms import axis_angle_matrix, random_quaternions
 from render.formats.annotations.joint_orders import to_order
 from render.formats.annotations.umetrack_hand import umetrack_hand, umetrack_wrist
-from render.frames.keypoints import hand_keypoints
 
 
 def bone_frames(record: dict, angles: np.ndarray, wrist: np.ndarray) -> np.ndarray:
