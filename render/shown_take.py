@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.fit import GlovedHand, attach
-from gloves.takes.archives import archive_kind
-from gloves.takes.take import KIND, Take, load_take
-from gloves.takes.tracked_take import LOST, TrackedTake, load_tracked_take
+from gloves.takes.motion import load_any_take
+from gloves.takes.take import Take
+from gloves.takes.tracked_take import LOST, TrackedTake
 from handsim.errors import CaptureError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape, sample_shape
 from handsim.space.objects import RigidObject, named_object, object_names
-from handsim.space.transforms import quaternion_matrix
+from handsim.space.transforms import pose_matrices
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -116,7 +116,7 @@ def load_shown_take(path: Path) -> ShownTake:
     Raises:
         CaptureError: The file is missing, of another kind or schema, damaged, or without any pose.
     """
-    shown = show_take(load_take(path) if archive_kind(path) == KIND else load_tracked_take(path))
+    shown = show_take(load_any_take(path))
     if not np.isfinite(shown.wrists()[..., 0]).any():
         raise CaptureError(f"{path}: there is no hand in any frame, expected one to draw")
     return shown
@@ -149,7 +149,7 @@ def _show_tracked(take: TrackedTake) -> ShownTake:
         for index, hand in enumerate(take.hands)
     )
     bodies = tuple(
-        _body(body.name, body.positions, _transforms(take.body_poses[:, index]))
+        _body(body.name, body.positions, pose_matrices(take.body_poses[:, index]))
         for index, body in enumerate(take.bodies)
     )
     labels = take.labels.astype(np.int64)
@@ -159,13 +159,3 @@ def _show_tracked(take: TrackedTake) -> ShownTake:
 def _body(name: str, markers: NDArray[np.float64], poses: NDArray[np.float64]) -> ShownBody:
     obj = named_object(name) if name in object_names() else None
     return ShownBody(name, obj, markers if obj is None else obj.markers, poses)
-
-
-def _transforms(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Transforms (T, 4, 4) of positions and quaternions (T, 7); NaN where there are none."""
-    transforms = np.tile(np.eye(4), (len(poses), 1, 1))
-    there = np.isfinite(poses[:, 0])
-    transforms[there, :3, :3] = quaternion_matrix(poses[there, 3:])
-    transforms[:, :3, 3] = poses[:, :3]
-    transforms[~there] = np.nan
-    return transforms

@@ -4,4 +4,5 @@
 - growing: the same while it is recorded, safe however the recording ends
 - take: `Take`, a simulated capture and its truth
 - tracked_take: `TrackedTake`, the output of a tracker
+- motion: the motion in either, for other programs
 """

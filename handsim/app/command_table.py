@@ -21,8 +21,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "label": ("train.commands.label:label", "Label every frame of a marker capture."),
     "export": (
-        "train.commands.export:export",
-        "Write a trained labeler as an ONNX file, which needs no torch.",
+        "track.commands.export:export",
+        "Write a take's motion for other programs (.glb, .bvh, .usdc, .csv, ...), or a labeler as .onnx.",
     ),
     "evaluate": ("train.commands.evaluate:evaluate", "Measure a labeler on a labeled capture."),
     "simulate": ("train.commands.simulate:simulate", "Simulate a capture of hands, with its truth."),

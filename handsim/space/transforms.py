@@ -46,6 +46,16 @@ def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.fl
     return quaternions
 
 
+def pose_matrices(poses: Float[np.ndarray, "T 7"]) -> NDArray[np.float64]:
+    """Transforms (T, 4, 4) of positions and wxyz quaternions; NaN where these are NaN."""
+    transforms = np.tile(np.eye(4), (len(poses), 1, 1))
+    there = np.isfinite(poses[:, 0])
+    transforms[there, :3, :3] = quaternion_matrix(poses[there, 3:])
+    transforms[:, :3, 3] = poses[:, :3]
+    transforms[~there] = np.nan
+    return transforms
+
+
 def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation vectors [rad]."""
     quaternions: NDArray[np.float64] = Rotation.from_rotvec(vectors).as_quat(scalar_first=True)

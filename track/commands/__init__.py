@@ -1,6 +1,8 @@
 """Commands of `handsim` on tracking, one per module.
 
 `user_options`: the user's hands from a command's options.
+`export`: `handsim export`, takes and labelers for other programs.
+`hand`: `handsim hand`, a hand for other programs.
 `body`: `handsim body`, a rigid body's markers as a file.
 `calibrate`: `handsim calibrate`, the user's hands and gloves from a capture.
 `track`: `handsim track`, a tracked take from a capture or a live stream.

@@ -5,7 +5,6 @@
 - label: `handsim label` labels a capture.
 - evaluate: `handsim evaluate` measures a labeler.
 - simulate: `handsim simulate` simulates a capture with its truth.
-- export: `handsim export` writes a labeler as an ONNX file.
 - labeling_tables: `handsim reproduce` prints the paper's tables of labeling beside ours.
 - demo: the steps of `handsim demo` that generate and label.
 """

@@ -1,0 +1,201 @@
+"""Hands and things as glTF 2.0 (.glb): skins, skeletons and their motion.
+
+Axes: y up, meters. At the top stand the palm of each hand with its other bones below it, named `right_palm`,
+`right_index_proximal` ..., its skin, and the things. Each bone has a key per frame. What has no pose in some
+frames has the scale 0 there, which every reader shows as nothing; its other keys stay as they were.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim._version import __version__
+from handsim.files.atomic import atomic_write
+from handsim.hand.model import HandModel
+from handsim.hand.skin.surface import vertex_normals
+from handsim.hand.topology import BONE_NAMES, NUM_BONES, PALM
+from handsim.motion_files.glb_buffer import GlbBuffer
+from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand, MovingThing, changes
+from handsim.motion_files.local_poses import CHILDREN, local_rotations, smooth_quaternions
+from handsim.motion_files.mesh_normals import corner_normals, split_vertices
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_SKIN, _THING = 0, 1  # materials
+_MATERIALS: Final = [
+    {
+        "name": name,
+        "pbrMetallicRoughness": {
+            "baseColorFactor": color,
+            "metallicFactor": 0.0,
+            "roughnessFactor": roughness,
+        },
+        "doubleSided": False,
+    }
+    for name, color, roughness in (
+        ("skin", [0.66, 0.38, 0.28, 1.0], 0.65),
+        ("thing", [0.16, 0.2, 0.26, 1.0], 0.5),
+    )
+]
+
+
+def write_glb(path: Path, motion: HandsInMotion) -> None:
+    """Write hands and things; a motion of one frame is written as a pose, without an animation.
+
+    Args:
+        path: A .glb file.
+        motion: What to write.
+
+    Raises:
+        OSError: The file cannot be written.
+        ArgumentError: The file would be larger than a .glb can be.
+    """
+    content = _Scene(motion).pack()
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+
+
+class _Scene:
+    """The document while it grows."""
+
+    def __init__(self, motion: HandsInMotion) -> None:
+        self._motion = motion
+        self._buffer = GlbBuffer()
+        self._meshes: list[dict[str, Any]] = []
+        self._skins: list[dict[str, Any]] = []
+        self._channels: list[dict[str, Any]] = []
+        self._samplers: list[dict[str, Any]] = []
+        self._turn = motion.R_file_world
+        self._nodes: list[dict[str, Any]] = []
+        self._top: list[int] = []
+        self._seconds = (
+            self._buffer.add(motion.seconds.astype("<f4"), bounds=True) if motion.num_frames > 1 else None
+        )
+        for hand in motion.hands:
+            self._add_hand(hand)
+        for thing in motion.things:
+            self._add_thing(thing)
+
+    def pack(self) -> bytes:
+        """The whole file."""
+        document: dict[str, Any] = {
+            "asset": {"version": "2.0", "generator": f"handsim {__version__}"},
+            "scene": 0,
+            "scenes": [{"nodes": self._top}],
+            "nodes": self._nodes,
+            "meshes": self._meshes,
+            "skins": self._skins,
+            "materials": _MATERIALS,
+        }
+        if self._channels:
+            document["animations"] = [
+                {"name": "motion", "channels": self._channels, "samplers": self._samplers}
+            ]
+        return self._buffer.pack(document)
+
+    def _add_hand(self, hand: MovingHand) -> None:
+        qpos = hand.held_qpos
+        positions, rotations = qpos[:, :3] @ self._turn.T, hand.model.forward_kinematics(qpos)[..., :3, :3]
+        quaternions = smooth_quaternions(local_rotations(self._turn @ rotations))
+        first = len(self._nodes)
+        for bone in range(NUM_BONES):
+            node: dict[str, Any] = {
+                "name": f"{hand.side}_{BONE_NAMES[bone]}",
+                "translation": (positions[0] if bone == PALM else hand.model.skeleton.offsets[bone]).tolist(),
+                "rotation": _xyzw(quaternions[0, bone]).tolist(),
+            }
+            if CHILDREN[bone]:
+                node["children"] = [first + child for child in CHILDREN[bone]]
+            self._nodes.append(node)
+            self._animate(first + bone, "rotation", _xyzw(quaternions[:, bone]))
+        self._animate(first, "translation", positions)
+        self._hide(first, hand.present)
+        self._skins.append(
+            {
+                "name": f"{hand.side}_skeleton",
+                "joints": list(range(first, first + NUM_BONES)),
+                "skeleton": first,
+                "inverseBindMatrices": self._buffer.add(
+                    np.linalg.inv(hand.model.rest_transforms).astype("<f4")
+                ),
+            }
+        )
+        self._meshes.append(self._skin_mesh(hand.model, f"{hand.side}_hand"))
+        # At the top, as the bones: readers ignore the transform of a skinned mesh, and warn where it has one.
+        self._top += [first, len(self._nodes)]
+        self._nodes.append(
+            {"name": f"{hand.side}_hand", "mesh": len(self._meshes) - 1, "skin": len(self._skins) - 1}
+        )
+
+    def _skin_mesh(self, model: HandModel, name: str) -> dict[str, Any]:
+        """The skin at rest, in the wrist's frame."""
+        surface, add = model.surface, self._buffer.add
+        attributes = {
+            "POSITION": add(surface.vertices.astype("<f4"), target="vertices", bounds=True),
+            "NORMAL": add(vertex_normals(surface.vertices, surface.faces).astype("<f4"), target="vertices"),
+            # A bone without a share must be 0, or validators complain.
+            "JOINTS_0": add(
+                np.where(surface.bone_weights > 0.0, surface.bone_indices, 0).astype("u1"), target="vertices"
+            ),
+            "WEIGHTS_0": add(surface.bone_weights.astype("<f4"), target="vertices"),
+        }
+        return {"name": name, "primitives": [self._primitive(attributes, surface.faces, _SKIN)]}
+
+    def _add_thing(self, thing: MovingThing) -> None:
+        poses = thing.held_poses
+        positions = poses[:, :3, 3] @ self._turn.T
+        quaternions = _xyzw(smooth_quaternions(self._turn @ poses[:, :3, :3]))
+        number = len(self._nodes)
+        node: dict[str, Any] = {
+            "name": thing.name,
+            "translation": positions[0].tolist(),
+            "rotation": quaternions[0].tolist(),
+        }
+        if thing.shape is not None:
+            node["mesh"] = len(self._meshes)
+            normals = corner_normals(thing.shape.vertices, thing.shape.faces)
+            vertices, outward, faces = split_vertices(thing.shape.faces, normals)
+            attributes = {
+                "POSITION": self._buffer.add(
+                    thing.shape.vertices[vertices].astype("<f4"), target="vertices", bounds=True
+                ),
+                "NORMAL": self._buffer.add(outward.astype("<f4"), target="vertices"),
+            }
+            primitive = self._primitive(attributes, faces, _THING)
+            self._meshes.append({"name": thing.name, "primitives": [primitive]})
+        self._nodes.append(node)
+        self._top.append(number)
+        self._animate(number, "rotation", quaternions)
+        self._animate(number, "translation", positions)
+        self._hide(number, thing.present)
+
+    def _primitive(self, attributes: dict[str, int], faces: NDArray[Any], material: int) -> dict[str, Any]:
+        indices = self._buffer.add(faces.ravel().astype("<u4"), target="indices")
+        return {"attributes": attributes, "indices": indices, "material": material}
+
+    def _animate(self, node: int, path: str, values: NDArray[np.float64]) -> None:
+        """A key in every frame, with straight motion between them."""
+        if self._seconds is not None:
+            self._channel(node, path, self._seconds, values, "LINEAR")
+
+    def _hide(self, node: int, present: NDArray[np.bool_]) -> None:
+        """Scale 0 where there is no pose."""
+        if present.all() or self._seconds is None:
+            return
+        frames = changes(present)
+        times = self._buffer.add(self._motion.seconds[frames].astype("<f4"), bounds=True)
+        self._channel(node, "scale", times, np.repeat(present[frames, None], 3, axis=1), "STEP")
+
+    def _channel(self, node: int, path: str, times: int, values: NDArray[Any], interpolation: str) -> None:
+        output = self._buffer.add(values.astype("<f4"))
+        self._channels.append({"sampler": len(self._samplers), "target": {"node": node, "path": path}})
+        self._samplers.append({"input": times, "output": output, "interpolation": interpolation})
+
+
+def _xyzw(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions in glTF's order."""
+    return np.roll(quaternions, -1, axis=-1)

@@ -1,0 +1,71 @@
+"""OpenSim's motion file, .mot: joint angles in degrees, a column per coordinate and side.
+
+The columns are `right_wrist_tx` to `tz` [m], `right_wrist_rx` to `rz` (body-fixed rotations about x, y and z,
+as in OpenSim's own free joint), then `right_` and the name of each joint. Axes are the take's; numbers of
+frames without a pose are NaN.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from handsim.files.atomic import atomic_write
+from handsim.hand.topology import JOINT_NAMES
+from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
+from handsim.space.transforms import quaternion_matrix
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+
+def write_mot(path: Path, motion: HandsInMotion) -> None:
+    """Write the angles of all hands.
+
+    Args:
+        path: A .mot file.
+        motion: What to write.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    table = np.concatenate([motion.seconds[:, None], *(_coordinates(hand) for hand in motion.hands)], axis=1)
+    wrist = [f"wrist_{kind}{axis}" for kind in "tr" for axis in "xyz"]
+    names = ["time", *(f"{hand.side}_{name}" for hand in motion.hands for name in (*wrist, *JOINT_NAMES))]
+    header = [
+        path.stem,
+        "version=1",
+        f"nRows={len(table)}",
+        f"nColumns={table.shape[1]}",
+        "inDegrees=yes",
+        "endheader",
+        "\t".join(names),
+    ]
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("\n".join(header) + "\n")
+        np.savetxt(file, table, fmt="%.9f", delimiter="\t")
+
+
+def _coordinates(hand: MovingHand) -> Float[np.ndarray, "T 26"]:
+    """Position of the wrist [m], its rotations and the joint angles [deg]; NaN without a pose."""
+    qpos = hand.held_qpos
+    angles = np.rad2deg(np.concatenate([euler_xyz(quaternion_matrix(qpos[:, 3:7])), qpos[:, 7:]], axis=1))
+    coordinates = np.concatenate([qpos[:, :3], angles], axis=1)
+    coordinates[~hand.present] = np.nan
+    return coordinates
+
+
+def euler_xyz(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Angles (T, 3) about x, y and z [rad] of R = Rx Ry Rz, without jumps from frame to frame."""
+    flat = np.hypot(rotations[:, 0, 0], rotations[:, 0, 1])
+    y = np.arctan2(rotations[:, 0, 2], flat)
+    locked = flat < 1e-9
+    x = np.arctan2(-rotations[:, 1, 2], rotations[:, 2, 2])
+    z = np.arctan2(-rotations[:, 0, 1], rotations[:, 0, 0])
+    # There only a sum or a difference of two angles counts.
+    x = np.where(locked, np.arctan2(rotations[:, 2, 1], rotations[:, 1, 1]), x)
+    angles: NDArray[np.float64] = np.unwrap(np.stack([x, y, np.where(locked, 0.0, z)], axis=1), axis=0)
+    return angles
