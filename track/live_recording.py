@@ -14,10 +14,12 @@ from typing import Any, Final, Self
 
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
 from gloves.takes.tracked_take import (
+    KEYPOINTS,
     KIND,
     RATED_FRAMES,
     SCHEMA,
     TrackedTake,
+    keypoints_of,
     take_columns,
     take_header,
     unpack_take,
@@ -81,7 +83,8 @@ class LiveRecorder:
                 self._archive.flush_due()
                 return
             values = frame_values(frame, tracked)
-            self._archive.add(values, len(frame.points))
+            keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
+            self._archive.add({**values, KEYPOINTS: keypoints}, len(frame.points))
         except OSError as error:
             raise CaptureError(
                 f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "

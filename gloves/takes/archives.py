@@ -8,7 +8,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -59,7 +59,7 @@ def write_archive(
 def read_archive(
     path: str | Path,
     kind: str,
-    schema: int,
+    schemas: Sequence[int],
     unpack: Callable[[dict[str, Any], dict[str, np.ndarray]], Content],
 ) -> Content:
     """Read what `write_archive` wrote.
@@ -67,7 +67,7 @@ def read_archive(
     Args:
         path: The file.
         kind: The expected kind.
-        schema: Version of the form.
+        schemas: Versions of the form that can be read.
         unpack: Makes the content from header and arrays; an exception means that they are damaged.
 
     Raises:
@@ -80,8 +80,9 @@ def read_archive(
         raise CaptureError(f"{path}: {KINDS[found]}, expected {KINDS[kind]}")
     if "schema" not in header:
         raise CaptureError(f"{path}: not a {kind}, or a damaged one")
-    if header["schema"] != schema:
-        raise CaptureError(f"{path}: a {kind} of schema {header['schema']}, expected {schema}")
+    if header["schema"] not in schemas:
+        expected = " or ".join(map(str, schemas))
+        raise CaptureError(f"{path}: a {kind} of schema {header['schema']}, expected {expected}")
     try:
         return unpack(header, arrays)
     except _DAMAGE as error:

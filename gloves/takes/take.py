@@ -147,7 +147,7 @@ def load_take(path: str | Path) -> Take:
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
     """
-    return read_archive(path, KIND, SCHEMA, _unpack)
+    return read_archive(path, KIND, (SCHEMA,), _unpack)
 
 
 _TYPES: Final = {"points": "f8", "ids": "i4", "labels": "i2", "qpos": "f8", "T_world_body": "f8"}

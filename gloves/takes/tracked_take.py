@@ -23,6 +23,7 @@ from gloves.takes.archives import (
 )
 from gloves.takes.growing import Column
 from handsim.errors import ArgumentError, choices
+from handsim.hand.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, bridge_gaps
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
@@ -33,7 +34,9 @@ if TYPE_CHECKING:
     from numpy.typing import DTypeLike, NDArray
 
 KIND: Final = "tracked take"
-SCHEMA: Final = 1
+SCHEMA: Final = 2
+READABLE: Final = (1, SCHEMA)
+"""Schema 1 had no joint positions."""
 STATUSES: Final = ("lost", "coasting", "found", "tracked")
 """Names of the status numbers as files hold them ("found": initialized); only a lost hand has no pose."""
 LOST, COASTING, INITIALIZED, TRACKED = range(4)
@@ -157,15 +160,24 @@ class TrackedTake:
             raise ArgumentError(f"the {side} hand has no pose in any frame")
         return bridge_gaps(self.times, qpos, self.rate)
 
+    def keypoints(self) -> Float[np.ndarray, "T H 21 3"]:
+        """The wrist, the joints and the tips of the hands in the world [m]; NaN where a hand is lost.
+
+        Their names are `handsim.hand.keypoints.KEYPOINT_NAMES`.
+        """
+        return keypoints_of(self.hands, self.qpos)
+
     def save(self, path: Path) -> None:
         """Write the take (.npz), whole or not at all; `load_tracked_take` gives the same numbers again.
+
+        The file also holds `keypoints`, for programs that have no model of the hand.
 
         Raises:
             OSError: The file cannot be written.
         """
         arrays = {name: np.asarray(getattr(self, name), dtype) for name, dtype in _ARRAYS.items()}
         arrays |= {} if self.numbers is None else {NUMBERS: self.numbers}
-        arrays |= worn_arrays(self.hands, self.bodies)
+        arrays |= {KEYPOINTS: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
         write_archive(path, KIND, SCHEMA, header, arrays)
 
@@ -179,6 +191,7 @@ def take_header(
         "rate": rate,
         "layouts": [dataclasses.asdict(hand.layout) for hand in hands],
         "statuses": STATUSES,
+        "keypoint_names": KEYPOINT_NAMES,
         "bodies": [{"name": body.name, "marker_names": list(body.marker_names)} for body in bodies],
         "settings": settings,
     }
@@ -213,7 +226,18 @@ def take_columns(hands: int, markers: int, bodies: int) -> tuple[Column, ...]:
     columns = [
         Column(name, f"<{dtype}", shapes.get(name, ()), missing.get(name)) for name, dtype in _ARRAYS.items()
     ]
-    return (*columns, Column(NUMBERS, "<i8", ()))
+    return (*columns, Column(NUMBERS, "<i8", ()), Column(KEYPOINTS, "<f8", (hands, NUM_KEYPOINTS, 3)))
+
+
+def keypoints_of(
+    hands: Sequence[GloveFit], qpos: Float[np.ndarray, "T H 27"]
+) -> Float[np.ndarray, "T H 21 3"]:
+    """Keypoints in the world [m] of some poses of each hand; NaN where these are."""
+    keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS, 3), np.nan)
+    for index, hand in enumerate(hands):
+        there = np.isfinite(qpos[:, index, 0])
+        keypoints[there, index] = hand_keypoints(hand.model, qpos[there, index])
+    return keypoints
 
 
 def usual_rate(times: Float[np.ndarray, "T"]) -> float:
@@ -236,11 +260,13 @@ def load_tracked_take(path: str | Path) -> TrackedTake:
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
     """
-    return read_archive(path, KIND, SCHEMA, unpack_take)
+    return read_archive(path, KIND, READABLE, unpack_take)
 
 
 NUMBERS: Final = "numbers"
 """The name of the frame numbers, which only the takes of streams have."""
+KEYPOINTS: Final = "keypoints"
+"""The name of the joint positions, which follow from the poses and are not read."""
 RATED_FRAMES: Final = 100_000
 """Frames of a stream that its rate is measured on."""
 _ARRAYS: Final = {
@@ -263,6 +289,7 @@ _ATTACHMENT: Final = ("points", "normals", "bone_indices", "bone_weights")
 _TYPES: Final[dict[str, DTypeLike]] = {
     **_ARRAYS,
     NUMBERS: "i8",
+    KEYPOINTS: "f8",
     "hands": HAND_DTYPE,
     "body_places": "f8",
     **{f"attachment_{name}": "f8" for name in _ATTACHMENT if name != "bone_indices"},

@@ -12,7 +12,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "handsim.commands.demo:demo",
         "Run the whole chain on a built-in example; ends with a page of pictures.",
     ),
-    "hand": ("gloves.commands.hand:hand", "Write a hand as a MuJoCo model, and its skin as a mesh."),
+    "hand": ("track.commands.hand:hand", "Write a hand as a MuJoCo model, a URDF or a rigged mesh."),
     "glove": ("render.commands.glove:GLOVE", "List, show, start and check marker layouts."),
     "generate": ("train.commands.generate:generate", "Make a training set; goes on where it was stopped."),
     "train": (

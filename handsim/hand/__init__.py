@@ -6,6 +6,7 @@
 - capsules: flesh as capsules
 - skin/: the skin as a mesh with weights
 - mjcf: the hand as a MuJoCo model
+- urdf: the hand as a URDF robot
 - kinematics: `T_world_bone` of many poses
 - model: `HandModel`, which joins all of these
 - keypoints: the 21 keypoints of a hand, their names and their skeleton

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 FLESH_DENSITY: Final = 1100.0
 """Density of the hand [kg/m^3], soft tissue and bone together."""
 CAPSULE_GROUP: Final = 0
+SERVO_STIFFNESS: Final = 1.0
+"""Torque of a servo per angle off its control [N m/rad]."""
+SERVO_DAMPING: Final = 0.03
+"""Torque of a servo against the speed of its joint [N m s/rad]."""
 
 
 class Site(NamedTuple):
@@ -29,9 +33,18 @@ class Site(NamedTuple):
 
 
 def build_spec(
-    skeleton: Skeleton, capsules: Capsules, *, name: str = "hand", sites: tuple[Site, ...] = ()
+    skeleton: Skeleton,
+    capsules: Capsules,
+    *,
+    name: str = "hand",
+    sites: tuple[Site, ...] = (),
+    actuators: bool = False,
 ) -> mujoco.MjSpec:
-    """Editable MuJoCo specification of a hand; compile it, or write it with `.to_xml()`."""
+    """Editable MuJoCo specification of a hand; compile it, or write it with `.to_xml()`.
+
+    With `actuators` each joint has a position servo of its name: a control is an angle [rad] within the
+    joint's range.
+    """
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False
@@ -54,6 +67,17 @@ def build_spec(
             limited=True,
             damping=0.01,
         )
+    if actuators:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # light bones with stiff servos
+        for number, joint in enumerate(JOINTS):
+            servo = spec.add_actuator(
+                name=joint.name,
+                target=joint.name,
+                trntype=mujoco.mjtTrn.mjTRN_JOINT,
+                ctrllimited=True,
+                ctrlrange=skeleton.ranges[number],
+            )
+            servo.set_to_position(kp=SERVO_STIFFNESS, kv=SERVO_DAMPING)
     counts: dict[int, int] = {}
     for bone, start, end, radius in zip(
         capsules.bones, capsules.starts, capsules.ends, capsules.radii, strict=True

@@ -19,6 +19,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, PALM
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
 from handsim.motion_files.local_poses import CHILDREN, local_rotations
+from handsim.space.transforms import euler_angles
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -51,7 +52,7 @@ def write_bvh(path: Path, motion: HandsInMotion) -> None:
         content = [*_joint(np.zeros(3), moves=True), *_end(np.eye(3)[0])]
         lines += _indented([f"JOINT {_word(thing.name)}", "{", *_indented(content), "}"])
         poses = thing.held_poses
-        angles = euler_zyx(turn @ poses[:, :3, :3] @ turn.T)
+        angles = _degrees(turn @ poses[:, :3, :3] @ turn.T)
         columns.append(np.concatenate([_CENTIMETERS * poses[:, :3, 3] @ turn.T, angles], axis=1))
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
         file.write("HIERARCHY\n" + "\n".join([*lines, "}"]) + "\n")
@@ -71,20 +72,12 @@ def _hand_columns(hand: MovingHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.
     rotations = turn @ hand.model.forward_kinematics(qpos)[..., :3, :3] @ np.swapaxes(rest, -1, -2) @ turn.T
     local = local_rotations(rotations)
     position = _CENTIMETERS * qpos[:, :3] @ turn.T
-    return np.concatenate([position, *(euler_zyx(local[:, bone]) for bone in _order(PALM))], axis=1)
+    return np.concatenate([position, *(_degrees(local[:, bone]) for bone in _order(PALM))], axis=1)
 
 
-def euler_zyx(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
-    """Angles (T, 3) about z, y and x [deg] of R = Rz Ry Rx, without jumps from frame to frame."""
-    flat = np.hypot(rotations[:, 0, 0], rotations[:, 1, 0])
-    y = np.arctan2(-rotations[:, 2, 0], flat)
-    locked = flat < 1e-9
-    x = np.arctan2(rotations[:, 2, 1], rotations[:, 2, 2])
-    z = np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
-    # There only a difference of two angles counts.
-    x = np.where(locked, np.arctan2(-rotations[:, 1, 2], rotations[:, 1, 1]), x)
-    z = np.where(locked, 0.0, z)
-    degrees: NDArray[np.float64] = np.rad2deg(np.unwrap(np.stack([z, y, x], axis=1), axis=0))
+def _degrees(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Angles (T, 3) about z, y and x [deg], without jumps from frame to frame."""
+    degrees: NDArray[np.float64] = np.rad2deg(np.unwrap(euler_angles(rotations), axis=0))
     return degrees
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from handsim.files.atomic import atomic_write
 from handsim.hand.topology import JOINT_NAMES
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
-from handsim.space.transforms import quaternion_matrix
+from handsim.space.transforms import euler_angles, quaternion_matrix
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -52,20 +52,10 @@ def write_mot(path: Path, motion: HandsInMotion) -> None:
 def _coordinates(hand: MovingHand) -> Float[np.ndarray, "T 26"]:
     """Position of the wrist [m], its rotations and the joint angles [deg]; NaN without a pose."""
     qpos = hand.held_qpos
-    angles = np.rad2deg(np.concatenate([euler_xyz(quaternion_matrix(qpos[:, 3:7])), qpos[:, 7:]], axis=1))
-    coordinates = np.concatenate([qpos[:, :3], angles], axis=1)
+    # Rx Ry Rz is the inverse of Rz Ry Rx with the opposite angles.
+    inverse = np.swapaxes(quaternion_matrix(qpos[:, 3:7]), -1, -2)
+    turns = np.unwrap(-euler_angles(inverse)[:, ::-1], axis=0)
+    angles = np.rad2deg(np.concatenate([turns, qpos[:, 7:]], axis=1))
+    coordinates: NDArray[np.float64] = np.concatenate([qpos[:, :3], angles], axis=1)
     coordinates[~hand.present] = np.nan
     return coordinates
-
-
-def euler_xyz(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
-    """Angles (T, 3) about x, y and z [rad] of R = Rx Ry Rz, without jumps from frame to frame."""
-    flat = np.hypot(rotations[:, 0, 0], rotations[:, 0, 1])
-    y = np.arctan2(rotations[:, 0, 2], flat)
-    locked = flat < 1e-9
-    x = np.arctan2(-rotations[:, 1, 2], rotations[:, 2, 2])
-    z = np.arctan2(-rotations[:, 0, 1], rotations[:, 0, 0])
-    # There only a sum or a difference of two angles counts.
-    x = np.where(locked, np.arctan2(rotations[:, 2, 1], rotations[:, 1, 1]), x)
-    angles: NDArray[np.float64] = np.unwrap(np.stack([x, y, np.where(locked, 0.0, z)], axis=1), axis=0)
-    return angles

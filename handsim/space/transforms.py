@@ -71,6 +71,21 @@ def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
     return matrix
 
 
+def euler_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Angles (T, 3) [rad] with which `euler_matrix` makes these rotations: yaw, pitch, roll.
+
+    Where the pitch is a right angle, only a sum or difference of the others counts, and the yaw is zero.
+    """
+    flat = np.hypot(rotations[:, 0, 0], rotations[:, 1, 0])
+    pitch = np.arctan2(-rotations[:, 2, 0], flat)
+    locked = flat < 1e-9
+    yaw = np.where(locked, 0.0, np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
+    free, fixed = rotations[:, 2, 1:], np.stack([-rotations[:, 1, 2], rotations[:, 1, 1]], axis=1)
+    sine, cosine = np.where(locked[:, None], fixed, free).T
+    angles: NDArray[np.float64] = np.stack([yaw, pitch, np.arctan2(sine, cosine)], axis=1)
+    return angles
+
+
 def random_quaternions(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:
     """Uniform random rotations as wxyz quaternions (count, 4)."""
     raw: NDArray[np.float64] = rng.standard_normal((count, 4))

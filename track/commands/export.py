@@ -40,11 +40,11 @@ def export(
     """Write the motion of a take, or a trained labeler, for other programs.
 
     Args:
-        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); or a labeler, which is
-            the name of a glove with a shipped one or the folder of a trained one.
+        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); or a labeler, by the
+            name of a glove with a shipped one or the folder of a trained one.
         out: The file. Of a take .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint
-            angles and positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json; of a
-            labeler .onnx, which labels without torch.
+            angles and positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json;
+            of a labeler .onnx, which labels without torch.
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default.
     """
@@ -52,8 +52,8 @@ def export(
         _export_take(Path(source), out, fps, up)
     elif source.lower().endswith(".json"):
         raise ArgumentError(
-            f"cannot export '{source}', expected a take (.npz) or a labeler; `handsim hand --shape` writes the "
-            "hand of a user's file"
+            f"cannot export '{source}', expected a take (.npz) or a labeler; `handsim hand --shape` writes "
+            "the hand of a user's file"
         )
     else:
         _export_labeler(source, out)
@@ -88,8 +88,8 @@ def _export_labeler(source: str, out: Path) -> None:
 
     if out.suffix.lower() != ".onnx":
         raise ArgumentError(
-            f"cannot write the labeler '{source}' as '{out}', expected a name that ends in .onnx; takes, which "
-            f"end in .npz, become {', '.join(_FORMATS)}"
+            f"cannot write the labeler '{source}' as '{out}', expected a name that ends in .onnx; takes, "
+            f"which end in .npz, become {', '.join(_FORMATS)}"
         )
     check_outputs([source], [out])
     network, card = load_network(source)
