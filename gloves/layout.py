@@ -22,9 +22,11 @@ from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, PALM
 FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60
 _RADIUS_RANGE: Final = (0.0005, 0.015)  # [m]
-_ALONG_RANGE: Final = (-0.3, 1.3)
+ALONG_RANGE: Final = (-0.3, 1.3)
+"""Of `MarkerPlace.along`."""
 _AROUND_RANGE: Final = (-180.0, 180.0)  # [deg]
-_ACROSS_RANGE: Final = (-1.0, 1.0)
+ACROSS_RANGE: Final = (-1.0, 1.0)
+"""Of `MarkerPlace.across`."""
 _SHIPPED: Final = Path(__file__).parent / "layouts"
 _LAYOUT_KEYS: Final = ("name", "description", "radius_mm", "marker")
 _MARKER_KEYS: Final = ("name", "bone", "along", "around", "across")
@@ -74,9 +76,9 @@ class MarkerPlace:
             raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
         degrees = math.degrees(self.around)
         for key, value, (low, high) in (
-            ("along", self.along, _ALONG_RANGE),
+            ("along", self.along, ALONG_RANGE),
             ("around", round(degrees, 9), _AROUND_RANGE),
-            ("across", self.across, _ACROSS_RANGE),
+            ("across", self.across, ACROSS_RANGE),
         ):
             if not low <= value <= high:
                 unit = " degrees" if key == "around" else ""
@@ -155,7 +157,7 @@ def load_layout(name_or_path: str | Path) -> MarkerLayout:
         raise LayoutError(f"{unknown}, or the path of a .toml file")
     table = read_toml(path, error=LayoutError)
     try:
-        return _parse_layout(table)
+        return parse_layout(table)
     except HandSimError as error:
         raise LayoutError(f"{path}: {error}") from error
 
@@ -166,12 +168,9 @@ def save_layout(path: str | Path, layout: MarkerLayout) -> None:
     Raises:
         LayoutError: The file cannot be written.
     """
-    lines = [f"name = {quoted(layout.name)}", f"radius_mm = {written(layout.radius * 1e3)}"]
-    for marker in layout.markers:
-        lines += _marker_lines(marker)
     try:
         with atomic_write(path) as temporary:
-            temporary.write_text("\n".join(lines) + "\n", "utf-8")
+            temporary.write_text("\n".join(layout_lines(layout)) + "\n", "utf-8")
     except OSError as error:
         raise LayoutError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -202,6 +201,14 @@ def starter_layout() -> str:
     return "\n".join(lines) + "\n"
 
 
+def layout_lines(layout: MarkerLayout) -> list[str]:
+    """The lines of a layout's file."""
+    lines = [f"name = {quoted(layout.name)}", f"radius_mm = {written(layout.radius * 1e3)}"]
+    for marker in layout.markers:
+        lines += _marker_lines(marker)
+    return lines
+
+
 def _marker_lines(marker: MarkerPlace) -> list[str]:
     """The lines of one [[marker]] table, after a blank one."""
     lines = ["", "[[marker]]", f"name = {quoted(marker.name)}", f"bone = {quoted(marker.bone)}"]
@@ -209,7 +216,12 @@ def _marker_lines(marker: MarkerPlace) -> list[str]:
     return [*lines, f"across = {written(marker.across)}"] if marker.across else lines
 
 
-def _parse_layout(table: Mapping[str, object]) -> MarkerLayout:
+def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
+    """The layout of a file's table.
+
+    Raises:
+        HandSimError: A value is missing, unknown or out of range.
+    """
     check_keys(table, "the file", _LAYOUT_KEYS, optional=("description", "marker"))
     text_of(table, "description", default="")
     markers = tuple(

@@ -79,7 +79,7 @@ def track_live(
         LiveStatus() as status,
         ExitStack() as stack,
     ):
-        first = [] if fewest_points is None else _first_frames(stream, fewest_points, seconds, status)
+        first = [] if fewest_points is None else first_frames(stream, fewest_points, seconds, status)
         tracker = start([frame for frame in first if len(frame.points) >= (fewest_points or 0)])
         recorder = stack.enter_context(LiveRecorder(tracker, out, start.settings))
         status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
@@ -96,7 +96,7 @@ def track_live(
         return TrackedSource(take, recorder.num_frames, _notes(stream, step))
 
 
-def _first_frames(
+def first_frames(
     stream: PointStream, fewest_points: float, seconds: float | None, status: LiveStatus
 ) -> list[StreamedFrame]:
     """The first frames of a stream, until there were enough points for a second, or ten seconds are over."""

@@ -41,7 +41,8 @@ from train.labelers.storage import labeler_for_glove
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
 
-_SHOWN: Final = 0.8  # share of one hand's markers in a frame in which its size can be measured
+SHOWN: Final = 0.8
+"""Share of one hand's markers in a frame in which its size can be measured."""
 _TIMED: Final = 100_000  # frames whose computing time is kept
 
 
@@ -85,7 +86,7 @@ def track(
     user = users_of(glove, size, shape, hands)
     bodies = load_bodies(body)
     source = None if capture is None else read_capture(capture)
-    start = _Start(user, labeler_for_glove(glove, labeler), bodies, glove)
+    start = TrackerStart(user, labeler_for_glove(glove, labeler), bodies, glove)
     start.settings.update(
         capture=live if capture is None else capture.name,
         glove=glove,
@@ -96,7 +97,7 @@ def track(
         warm_up(user, start.labeler)
     measures = shape is None and size in (None, "auto")
     if source is None:
-        fewest = _SHOWN * user[0].layout.num_markers if measures else None
+        fewest = SHOWN * user[0].layout.num_markers if measures else None
         tracked = track_live(str(live), seconds, start, out, fewest_points=fewest)
     else:
         tracked = _track_file(source, start, out, measures=measures)
@@ -114,7 +115,7 @@ def track(
         warnings.warn(suspicion, HandSimWarning, stacklevel=2)
 
 
-class _Start:
+class TrackerStart:
     """Makes the tracker of a command, which measures its computing time.
 
     Args:
@@ -127,7 +128,8 @@ class _Start:
     def __init__(
         self, user: Sequence[GloveFit], labeler: Labeler, bodies: Sequence[RigidTemplate], glove: str
     ) -> None:
-        self._user, self.labeler, self._bodies, self._glove = user, labeler, bodies, glove
+        self.user, self.labeler, self._bodies, self._glove = user, labeler, bodies, glove
+        """The hands and their labeler; once a tracker is made, the hands as measured."""
         self.settings: dict[str, Any] = {}
         """What makes the take, as JSON."""
         self.seconds: deque[float] = deque(maxlen=_TIMED)
@@ -136,8 +138,8 @@ class _Start:
     def __call__(self, frames: Sequence[StreamedFrame]) -> Tracker:
         """The tracker; its hands are measured in some frames, if there are any."""
         if frames:
-            sides = [hand.side for hand in self._user]
-            self._user, words = measured_users(self._glove, sides, frames, self.labeler)
+            sides = [hand.side for hand in self.user]
+            self.user, words = measured_users(self._glove, sides, frames, self.labeler)
             self.settings["user"] = f"auto, {words or USUAL_SIZE}"
             if words is None:
                 warnings.warn(
@@ -147,7 +149,7 @@ class _Start:
                 )
             else:
                 print_line(f"size of the hands: {words}")
-        return TimedTracker(self._user, self.labeler, self._bodies, self.seconds)
+        return TimedTracker(self.user, self.labeler, self._bodies, self.seconds)
 
 
 class TimedTracker(Tracker):
@@ -204,7 +206,7 @@ def _check_options(
         check_suffix(labeled, WRITABLE)
 
 
-def _track_file(source: Capture, start: _Start, out: Path, *, measures: bool) -> TrackedSource:
+def _track_file(source: Capture, start: TrackerStart, out: Path, *, measures: bool) -> TrackedSource:
     """Track a capture and write the take."""
     with Console(stderr=True).status("measuring the hands"):
         tracker = start(sample_frames(list(capture_frames(source))) if measures else ())

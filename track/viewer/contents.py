@@ -1,0 +1,193 @@
+"""What a file or folder is, found by its content, and the view that shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from gloves.captures.formats import READABLE, read_capture
+from gloves.layout import list_layouts, load_layout
+from gloves.takes.archives import archive_kind
+from gloves.takes.growing import is_growing
+from gloves.takes.take import KIND as SIMULATED
+from gloves.takes.take import load_take
+from gloves.takes.tracked_take import load_tracked_take
+from handsim.errors import ArgumentError, FileError
+from handsim.files.atomic import read_toml
+from handsim.files.outputs import check_outputs
+from handsim.hand.model import HandModel
+from handsim.space.cameras import CameraRig, list_rigs, load_rig
+from track.user import load_user
+from track.viewer.layout_editor import LayoutEditor, edited_path
+from track.viewer.recordings.captures import CaptureRecording
+from track.viewer.recordings.datasets import DatasetRecording
+from track.viewer.recordings.recording import Recording
+from track.viewer.recordings.takes import TrackedRecording, TruthRecording
+from track.viewer.scene.frame_view import FrameView
+from track.viewer.scene.rig_view import show_rig, show_volume
+from track.viewer.scene.stage import set_stage
+from track.viewer.status_panel import StatusPanel
+from track.viewer.timeline import Timeline
+from track.viewer.user_view import UserView
+from train.data.shards import Dataset
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+ACCEPTED: Final = (
+    "a marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture "
+    f"({', '.join(READABLE)}), a tracked take or a simulated take's truth (.npz), or a user's file (.json)"
+)
+"""What can be viewed."""
+_LOOKED_AT: Final = 200  # frames that decide where the first look goes
+
+Run = Callable[[Callable[[], bool]], None]
+"""Serves a page until the function that it is given says that it shall end."""
+
+
+class Content(NamedTuple):
+    """What was found, ready to be shown."""
+
+    kind: str
+    """In words."""
+    show: Callable[[ViserServer], Run]
+    """Puts it into a page; the result serves that page."""
+
+
+def open_content(name: str, *, out: Path | None = None, size: str = "M", rig: str | None = None) -> Content:
+    """Read what shall be shown.
+
+    Args:
+        name: A path, or the name of a shipped layout or rig.
+        out: Where a changed layout is saved; a new name beside it when None.
+        size: Size of the hand that wears a layout.
+        rig: Cameras of a capture or take: a shipped name or the path of a .toml file.
+
+    Raises:
+        ArgumentError: It is nothing that can be viewed, or an option is for something else.
+        FileError: It cannot be read.
+    """
+    path = Path(name)
+    if not path.exists() and name in list_layouts():
+        return _layout(name, None, out, size)
+    if not path.exists() and name in list_rigs():
+        return _rig(name)
+    if not path.exists() and not is_growing(path) and not path.suffix:
+        raise ArgumentError(f"{name}: no such file, folder or shipped name, expected {ACCEPTED}")
+    suffix = path.suffix.lower()
+    if suffix == ".toml" and not path.is_dir():
+        keys = read_toml(path, error=FileError).keys()
+        if keys & {"camera", "field_of_view"}:
+            return _rig(path)
+        if "radius_mm" in keys:
+            return _layout(path, path, out, size)
+        raise ArgumentError(f"{path}: a TOML file of another kind, expected {ACCEPTED}")
+    if out is not None:
+        raise ArgumentError(f"--out is {out}, but {name} is no marker layout: nothing would be saved")
+    if suffix == ".json":
+        hands = load_user(path)
+        return Content("user", lambda server: _still(UserView(server, hands)))
+    recording = _recording(path, None if rig is None else load_rig(rig))
+    kind = type(recording).__name__.removesuffix("Recording").lower()
+    return Content(kind, lambda server: show_recording(server, recording))
+
+
+def _recording(path: Path, rig: CameraRig | None) -> Recording:
+    if path.is_dir():
+        return DatasetRecording(Dataset(path), rig)
+    if path.suffix.lower() in READABLE:
+        return CaptureRecording(read_capture(path), rig)
+    if path.suffix.lower() == ".npz" or is_growing(path):
+        if archive_kind(path) == SIMULATED:
+            return TruthRecording(load_take(path), rig)
+        return TrackedRecording(load_tracked_take(path), rig)
+    raise ArgumentError(f"{path}: a file of another kind, expected {ACCEPTED}")
+
+
+def _layout(name: str | Path, path: Path | None, out: Path | None, size: str) -> Content:
+    layout, model = load_layout(name), HandModel.named(size)
+    given = shipped_file(str(name)) if path is None else path
+    if out is not None:
+        check_outputs((given,), (out,))
+        if out.exists():
+            raise ArgumentError(f"--out is {out}, which exists already, expected a new name")
+    target = out or edited_path(Path(f"{layout.name}.toml") if path is None else path)
+    return Content("layout", lambda server: _still(LayoutEditor(server, given, layout, model, target)))
+
+
+def _rig(name: str | Path) -> Content:
+    rig = load_rig(name)
+
+    def show(server: ViserServer) -> Run:
+        show_rig(server, rig)
+        show_volume(server, rig)
+        degrees = np.rad2deg(rig.field_of_view)
+        server.gui.add_markdown(
+            f"**{rig.name}**: {len(rig.positions)} cameras of {degrees:.0f}° and {rig.resolution} px. "
+            "Dots are seen by two cameras or more, blue ones by all. The green cube is where wrists move in "
+            "training sets."
+        )
+        set_stage(server, rig.positions, ground=0.0)
+        return _still(rig)
+
+    return Content("rig", show)
+
+
+def show_recording(server: ViserServer, recording: Recording) -> Run:
+    """Put a recording into a page, with its timeline.
+
+    Args:
+        server: Where the page is.
+        recording: What is shown.
+
+    Returns:
+        What serves the page.
+    """
+    panel: StatusPanel
+    view: FrameView
+
+    def show(index: int) -> None:
+        frame = recording.frame(index)
+        view.show(frame)
+        panel.show(index, frame, hurried=timeline.playing)
+
+    timeline = Timeline(server, recording.times, show)
+    panel = StatusPanel(server, recording, timeline.jump)
+    view = FrameView(server, recording)
+    set_stage(server, first_look(recording))
+    timeline.update()
+    return timeline.run
+
+
+def first_look(recording: Recording) -> np.ndarray:
+    """Points [m] that the first look shall show: those of frames all over the recording."""
+    indices = np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int))
+    frames = [recording.frame(int(index)) for index in indices]
+    wrists = [frame.qpos[:, :3] for frame in frames]
+    labeled = [frame.points[frame.labels >= 0] for frame in frames]
+    points = np.concatenate([*wrists, *labeled])
+    if not np.isfinite(points).all(axis=1).any():
+        points = np.concatenate([frame.points for frame in frames])
+    return points
+
+
+def shipped_file(name: str) -> Path:
+    """The file of a shipped layout."""
+    import gloves.layout
+
+    return Path(gloves.layout.__file__).parent / "layouts" / f"{name}.toml"
+
+
+def _still(_shown: object) -> Run:
+    """Serves a page that does nothing by itself."""
+
+    def run(ended: Callable[[], bool]) -> None:
+        import time
+
+        while not ended():
+            time.sleep(0.2)
+
+    return run

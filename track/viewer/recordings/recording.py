@@ -1,0 +1,120 @@
+"""What the viewer shows over time: frames of hands, points and bodies, made one at a time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from handsim.hand.model import HandModel
+from handsim.space.cameras import CameraRig
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float, Int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownFrame:
+    """One frame: H hands, N points, B bodies, R rays."""
+
+    time: float
+    """[s]"""
+    words: tuple[str, ...] = ()
+    """The state of the frame, one line each."""
+    hands: tuple[HandModel, ...] = ()
+    qpos: Float[np.ndarray, "H 27"] = field(default_factory=lambda: np.empty((0, 27)))
+    """Poses in the world [m, rad]; NaN where a hand has none."""
+    points: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    """World [m]."""
+    labels: Int[np.ndarray, "N"] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Indices of `Recording.label_names`, -1 for a ghost."""
+    seen: Bool[np.ndarray, "N"] = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
+    """Which points were seen; the others are filled in from a pose."""
+    bodies: Float[np.ndarray, "B 7"] = field(default_factory=lambda: np.empty((0, 7)))
+    """Position [m] and orientation (wxyz) of each body; NaN where it is lost."""
+    rays: Float[np.ndarray, "R 2 3"] = field(default_factory=lambda: np.empty((0, 2, 3)))
+    """Lines of sight from markers to the cameras that see them [m]."""
+
+
+class ShownBody(NamedTuple):
+    """A rigid body and its shape; without a shape its axes are drawn."""
+
+    name: str
+    vertices: Float[np.ndarray, "V 3"] | None = None
+    """In its own frame [m]."""
+    faces: Int[np.ndarray, "F 3"] | None = None
+
+
+class Curve(NamedTuple):
+    """A number that changes over the frames."""
+
+    name: str
+    values: Float[np.ndarray, "T"]
+
+
+class Doubt(NamedTuple):
+    """A frame that deserves a look."""
+
+    frame: int
+    words: str
+
+
+class Recording(ABC):
+    """T frames, made when they are asked for.
+
+    Args:
+        times: Time of each frame [s], increasing.
+        label_names: Name of each label.
+        most_points: The largest number of points in a frame.
+        radius: Radius of a marker [m].
+        bodies: The rigid bodies, in the order of `ShownFrame.bodies`.
+        rig: The cameras, where they are known.
+        curves: What to plot over time.
+        doubts: Frames that deserve a look, the most doubtful first.
+    """
+
+    def __init__(
+        self,
+        times: Float[np.ndarray, "T"],
+        label_names: tuple[str, ...],
+        *,
+        most_points: int,
+        radius: float = 0.0035,
+        bodies: tuple[ShownBody, ...] = (),
+        rig: CameraRig | None = None,
+        curves: tuple[Curve, ...] = (),
+        doubts: tuple[Doubt, ...] = (),
+    ) -> None:
+        self.times, self.label_names, self.most_points = times, label_names, most_points
+        self.radius, self.bodies, self.rig = radius, bodies, rig
+        self.curves, self.doubts = curves, doubts
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, T."""
+        return len(self.times)
+
+    @abstractmethod
+    def frame(self, index: int) -> ShownFrame:
+        """One of the frames."""
+
+
+def doubtful_frames(
+    confidence: Float[np.ndarray, "T"], below: float, most: int = 12
+) -> list[tuple[int, float]]:
+    """The worst frame of each run of frames whose confidence is below a limit, the worst run first.
+
+    Args:
+        confidence: Of each frame, 0 to 1; NaN counts as certain.
+        below: The limit.
+        most: Number of runs.
+    """
+    low = np.nan_to_num(confidence, nan=1.0) < below
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], low, [False]]).astype(np.int8)))
+    worst = []
+    for first, last in edges.reshape(-1, 2):
+        frame = int(first + np.nanargmin(confidence[first:last]))
+        worst.append((frame, float(confidence[frame])))
+    return sorted(worst, key=lambda entry: (entry[1], entry[0]))[:most]

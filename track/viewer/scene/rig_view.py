@@ -1,0 +1,90 @@
+"""Cameras in the page: their frusta, and the space in which they see."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.space.cameras import ROOM_CENTER, CameraRig
+from handsim.space.transforms import rotation_quaternions
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+    from viser import ViserServer
+
+_HALF_SIDE: Final = 0.3  # [m] of the cube that wrists move in, as in training sets
+_SPACING: Final = 0.1  # [m] between the points whose cameras are counted
+_MOST_POINTS: Final = 40_000
+_FEW, _MANY = np.array([214, 96, 60]), np.array([40, 120, 180])
+
+
+def show_rig(server: ViserServer, rig: CameraRig, *, scale: float = 0.12) -> None:
+    """The cameras as frusta, each with its number on the first one's side.
+
+    Args:
+        server: Where the page is.
+        rig: The cameras.
+        scale: Size of a frustum [m].
+    """
+    quaternions = rotation_quaternions(rig.T_world_camera[:, :3, :3])
+    for number, (position, quaternion) in enumerate(zip(rig.positions, quaternions, strict=True), 1):
+        server.scene.add_camera_frustum(
+            f"/cameras/{number}",
+            fov=rig.field_of_view,
+            aspect=1.0,
+            scale=scale,
+            thickness=0.004,
+            color=(60, 66, 76),
+            position=position,
+            wxyz=quaternion,
+        )
+        server.scene.add_label(
+            f"/cameras/{number}/number", str(number), font_screen_scale=0.8, anchor="bottom-center"
+        )
+
+
+def show_volume(server: ViserServer, rig: CameraRig) -> None:
+    """The cube that wrists move in, and dots that tell how many cameras see a place.
+
+    Args:
+        server: Where the page is.
+        rig: The cameras.
+    """
+    center = np.array(ROOM_CENTER)
+    server.scene.add_line_segments(
+        "/volume", points=box_edges(center - _HALF_SIDE, center + _HALF_SIDE), colors=(40, 120, 60)
+    )
+    places, counts = camera_counts(rig)
+    share = (counts / len(rig.positions))[:, None]
+    server.scene.add_point_cloud(
+        "/coverage",
+        points=places,
+        colors=np.round((1.0 - share) * _FEW + share * _MANY).astype(np.uint8),
+        point_size=0.012,
+        point_shape="circle",
+    )
+
+
+def camera_counts(rig: CameraRig) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Places [m] that at least two cameras see, above the floor, and by how many each is seen.
+
+    Returns:
+        Places (N, 3) on a grid within the box of the cameras, and counts (N,).
+    """
+    low, high = rig.positions.min(axis=0), rig.positions.max(axis=0)
+    low[2] = min(0.0, low[2])
+    spacing = max(_SPACING, float((np.prod(high - low + _SPACING) / _MOST_POINTS) ** (1 / 3)))
+    axes = [np.arange(low[axis], high[axis] + spacing / 2, spacing) for axis in range(3)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    counts = rig.in_view(grid).sum(axis=1)
+    return grid[counts >= 2], counts[counts >= 2]
+
+
+def box_edges(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
+    """The twelve edges (12, 2, 3) of a box."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
+    pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(corners[a] - corners[b]).sum() == 1]
+    edges: NDArray[np.float64] = (low + corners * (high - low))[np.array(pairs)]
+    return edges

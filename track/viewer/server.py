@@ -1,0 +1,81 @@
+"""The web server of the viewer: on this machine's own address, without a tunnel to the outside."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+from handsim.errors import ArgumentError, HandSimError
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+LOOPBACK: Final = "127.0.0.1"
+"""The address that only this machine reaches."""
+_HINT: Final = "install it with: pip install 'handsim[view]'"
+_PORTS: Final = range(8080, 8100)
+"""Ports that are tried in this order where none is named."""
+
+
+@contextmanager
+def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServer]:
+    """A running web server; the end of the block closes it and its pages.
+
+    Args:
+        host: Address to listen at.
+        port: Port to listen at; the first free one from 8080 on when None, any free one when 0.
+        title: Title of the page's panel.
+
+    Raises:
+        HandSimError: The package viser is not installed.
+        ArgumentError: There is no such address here, or the port is taken or not allowed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise HandSimError(f"the viewer needs the package viser; {_HINT}") from error
+
+    class Server(viser.ViserServer):
+        """A server that never opens viser's public tunnel: any page could ask for it."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return None
+
+    free = _free_port(host, port)
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a panel of its own
+        server = Server(host=host, port=free, label=title, verbose=False)
+    try:
+        server.gui.configure_theme(
+            show_logo=False, show_share_button=False, control_layout="collapsible", control_width="medium"
+        )
+        yield server
+    finally:
+        server.stop()
+
+
+def address_of(server: ViserServer) -> str:
+    """The address of the page, for a browser on this machine."""
+    host = server.get_host()
+    if host in ("0.0.0.0", "::"):
+        host = "localhost"
+    return f"http://[{host}]:{server.get_port()}" if ":" in host else f"http://{host}:{server.get_port()}"
+
+
+def _free_port(host: str, port: int | None) -> int:
+    """A port that can be listened at; viser itself would search on without a word."""
+    if port is not None and not 0 <= port <= 65535:
+        raise ArgumentError(f"--port is {port}, expected 0 to 65535")
+    reason = ""
+    for number in _PORTS if port is None else (port,):
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            with socket.create_server((host, number), family=family) as probe:
+                return int(probe.getsockname()[1])
+        except OSError as error:
+            reason = error.strerror or str(error)
+    named = f"--host {host}" if port is None else f"--host {host} --port {port}"
+    raise ArgumentError(f"{named} cannot be listened at ({reason}), expected an own address and a free port")
