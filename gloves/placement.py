@@ -12,14 +12,17 @@ from gloves.attachment import attach_markers
 from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
+from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONE_NAMES, PALM
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
-_STEPS: Final = 6
+_STEPS: Final = 12
 _NEAR: Final = 1e-5  # [m]
+_REACHED: Final = 5e-4  # [m]
+_SPACING: Final = 4e-3  # [m] between the skin's vertices, about
 
 
 def place_marker(
@@ -27,8 +30,8 @@ def place_marker(
 ) -> MarkerLayout:
     """The layout with one marker moved to the place on the skin that is nearest to a point.
 
-    The marker goes to the bone that carries the skin there. On the palm it lies straight above or below its
-    place in the palm's plane.
+    The marker stays on its bone where that reaches the point, or else goes to the one that carries the skin
+    there. On the palm it lies straight above or below its place in the palm's plane.
 
     Args:
         layout: The glove.
@@ -41,26 +44,50 @@ def place_marker(
     """
     surface = model.surface
     nearest = int(((surface.vertices - point) ** 2).sum(axis=1).argmin())
-    bone = int(surface.bone_indices[nearest, 0])
-    wanted, best = np.array(point, dtype=np.float64), None
-    least = math.inf
+    normal = vertex_normals(surface.vertices, surface.faces)[nearest]
+    aside = point - surface.vertices[nearest]
+    aside -= (aside @ normal) * normal
+    aside *= min(1.0, _SPACING / max(float(np.linalg.norm(aside)), _NEAR))
+    center = surface.vertices[nearest] + aside + layout.radius * normal
+    bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
+    best, least = layout, math.inf
+    for bone in dict.fromkeys(bones):
+        candidate, missed = _place_on(layout, index, bone, model, center)
+        if missed < least:
+            best, least = candidate, missed
+        if least < _REACHED:
+            break
+    if math.isinf(least):
+        raise LayoutError(f"marker '{layout.names[index]}' meets no skin there; move it nearer to the hand")
+    return best
+
+
+def _place_on(
+    layout: MarkerLayout, index: int, bone: int, model: HandModel, center: NDArray[np.float64]
+) -> tuple[MarkerLayout, float]:
+    """The layout with a marker's center on one bone as near to a place as can be, and how far it misses [m].
+
+    The layout is the given one, and the distance infinite, where the bone's rays meet no skin.
+    """
+    wanted, start = center, model.rest_transforms[bone]
+    middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
+    best, least = layout, math.inf
     for _ in range(_STEPS):  # the center is one radius off the skin, not along the ray that finds the skin
         moved = _place(layout.markers[index], bone, model, wanted)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)
         try:
-            center = attach_markers(candidate, model).points[index]
-        except LayoutError:
-            break
-        missed = point - center
-        if np.linalg.norm(missed) < least:
-            least, best = float(np.linalg.norm(missed)), candidate
+            missed = center - attach_markers(candidate, model).points[index]
+        except LayoutError:  # beside the skin, as beyond a finger's tip
+            wanted = wanted + 0.1 * (middle - wanted)
+            continue
+        distance = float(np.linalg.norm(missed))
+        if distance < least:
+            least, best = distance, candidate
         if least < _NEAR:
             break
         wanted = wanted + missed
-    if best is None:
-        raise LayoutError(f"marker '{layout.names[index]}' meets no skin there; move it nearer to the hand")
-    return best
+    return best, least
 
 
 def _place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.float64]) -> MarkerPlace:

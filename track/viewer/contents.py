@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -146,8 +147,6 @@ def show_recording(server: ViserServer, recording: Recording) -> Run:
     Returns:
         What serves the page.
     """
-    panel: StatusPanel
-    view: FrameView
 
     def show(index: int) -> None:
         frame = recording.frame(index)
@@ -155,22 +154,30 @@ def show_recording(server: ViserServer, recording: Recording) -> Run:
         panel.show(index, frame, hurried=timeline.playing)
 
     timeline = Timeline(server, recording.times, show)
-    panel = StatusPanel(server, recording, timeline.jump)
+    panel = StatusPanel(server, recording)
     view = FrameView(server, recording)
+    panel.add_lists(timeline.jump)
     set_stage(server, first_look(recording))
     timeline.update()
     return timeline.run
 
 
 def first_look(recording: Recording) -> np.ndarray:
-    """Points [m] that the first look shall show: those of frames all over the recording."""
-    indices = np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int))
-    frames = [recording.frame(int(index)) for index in indices]
-    wrists = [frame.qpos[:, :3] for frame in frames]
-    labeled = [frame.points[frame.labels >= 0] for frame in frames]
-    points = np.concatenate([*wrists, *labeled])
-    if not np.isfinite(points).all(axis=1).any():
-        points = np.concatenate([frame.points for frame in frames])
+    """Points [m] that the first look shall show: those of a hand's skin or, without hands, of the points.
+
+    They are of the first frame that has any; frames far apart are tried, not all.
+    """
+    points = np.empty((0, 3))
+    for index in np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int)):
+        frame = recording.frame(int(index))
+        there = np.isfinite(frame.qpos).all(axis=1)
+        skins = [
+            model.skin(qpos[None])[0]
+            for model, qpos in itertools.compress(zip(frame.hands, frame.qpos, strict=True), there)
+        ]
+        if skins:
+            return np.concatenate(skins)
+        points = points if len(points) else frame.points
     return points
 
 

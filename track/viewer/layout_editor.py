@@ -47,6 +47,8 @@ class LayoutEditor:
         self._shift = np.array([0.0, 0.0, _HEIGHT])
         self.fit: GloveFit = attach(layout, model)
         """The hand in its glove as it is now."""
+        self.changed = False
+        """Whether a marker was moved since the layout was read or saved."""
         self._chosen: int | None = None
         qpos = np.zeros(NUM_QPOS)
         qpos[2], qpos[3] = _HEIGHT, 1.0
@@ -87,6 +89,7 @@ class LayoutEditor:
                 self.state.content = str(error)
                 return
             self.fit = attach(layout, self.fit.model)
+            self.changed = True
             self._show()
             self._tell()
 
@@ -104,6 +107,7 @@ class LayoutEditor:
                     temporary.write_text(text, "utf-8")
             except OSError as error:
                 raise LayoutError(f"{self._out}: cannot be written: {error.strerror or error}") from error
+        self.changed = False
         return f"saved {self._out}" if kept else f"saved {self._out}, without the comments of {self._path}"
 
     def _add_controls(self, layout: MarkerLayout) -> None:
@@ -115,7 +119,7 @@ class LayoutEditor:
         every = gui.add_checkbox("names", False)
         labels = frozenset(range(layout.num_markers))
         every.on_update(lambda _: self.balls.name(labels if every.value else frozenset()))
-        button = gui.add_button("Save", hint=f"Writes {self._out}")
+        button = gui.add_button("Save layout", hint=f"Writes {self._out}")
         button.on_click(lambda _: self._save())
 
     def _save(self) -> None:
@@ -134,11 +138,12 @@ class LayoutEditor:
             self.choose(index)
 
     def _drag(self, event: Any) -> None:
-        if self._chosen is None:
-            return
-        self.move(self._chosen, np.array(self.gizmo.position))
+        chosen = self._chosen
+        if chosen is None or (event.phase != "end" and self._lock.locked()):
+            return  # a step of the drag that comes too early; the last one counts
+        self.move(chosen, np.array(self.gizmo.position))
         if event.phase == "end":
-            self.choose(self._chosen)  # the gizmo goes where the marker is
+            self.choose(chosen)  # the gizmo goes where the marker is
 
     def _show(self) -> None:
         count = self.fit.layout.num_markers

@@ -54,7 +54,8 @@ def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServ
         )
         yield server
     finally:
-        server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
 
 
 def address_of(server: ViserServer) -> str:

@@ -26,17 +26,24 @@ class StatusPanel:
     Args:
         server: Where the page is.
         recording: What is shown.
-        go_to: Called with a frame whose row was clicked.
     """
 
-    def __init__(self, server: ViserServer, recording: Recording, go_to: Callable[[int], None]) -> None:
-        self._recording, self._due = recording, 0.0
+    def __init__(self, server: ViserServer, recording: Recording) -> None:
+        self._server, self._recording, self._due = server, recording, 0.0
         self.text = server.gui.add_markdown("")
         """The state of the frame."""
+
+    def add_lists(self, go_to: Callable[[int], None]) -> None:
+        """Add the rows and the plots.
+
+        Args:
+            go_to: Called with a frame whose row was clicked.
+        """
+        server, recording = self._server, self._recording
         if recording.doubts:
             with server.gui.add_folder("Doubtful frames"):
                 for doubt in recording.doubts:
-                    row = server.gui.add_button(f"{doubt.frame}: {doubt.words}")
+                    row = server.gui.add_button(f"{doubt.frame}: {doubt.words}", color="gray")
                     row.on_click(partial(_jump, go_to, doubt.frame))
         if recording.curves and recording.num_frames > 1:
             with server.gui.add_folder("Over time", expand_by_default=True):

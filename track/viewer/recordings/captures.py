@@ -34,6 +34,8 @@ class CaptureRecording(Recording):
             tuple(itertools.compress(capture.names, named)),
             most_points=int(counts.max()),
             rig=rig,
+            has_hands=False,
+            has_filled=False,
         )
 
     def frame(self, index: int) -> ShownFrame:

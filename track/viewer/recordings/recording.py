@@ -73,6 +73,8 @@ class Recording(ABC):
         rig: The cameras, where they are known.
         curves: What to plot over time.
         doubts: Frames that deserve a look, the most doubtful first.
+        has_hands: Whether there are hands in any frame.
+        has_filled: Whether there are points that were not seen.
     """
 
     def __init__(
@@ -86,10 +88,13 @@ class Recording(ABC):
         rig: CameraRig | None = None,
         curves: tuple[Curve, ...] = (),
         doubts: tuple[Doubt, ...] = (),
+        has_hands: bool = True,
+        has_filled: bool = True,
     ) -> None:
         self.times, self.label_names, self.most_points = times, label_names, most_points
         self.radius, self.bodies, self.rig = radius, bodies, rig
         self.curves, self.doubts = curves, doubts
+        self.has_hands, self.has_filled = has_hands, has_filled
 
     @property
     def num_frames(self) -> int:
@@ -102,7 +107,7 @@ class Recording(ABC):
 
 
 def doubtful_frames(
-    confidence: Float[np.ndarray, "T"], below: float, most: int = 12
+    confidence: Float[np.ndarray, "T"], below: float, most: int = 8
 ) -> list[tuple[int, float]]:
     """The worst frame of each run of frames whose confidence is below a limit, the worst run first.
 

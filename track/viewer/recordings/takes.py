@@ -136,6 +136,7 @@ class TruthRecording(Recording):
             radius=take.hands[0].layout.radius if take.hands else 0.0035,
             bodies=bodies,
             rig=shipped_rig(take.settings.get("rig")) if rig is None else rig,
+            has_filled=False,
         )
 
     def frame(self, index: int) -> ShownFrame:

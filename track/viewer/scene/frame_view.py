@@ -35,6 +35,7 @@ class FrameView:
 
     def __init__(self, server: ViserServer, recording: Recording) -> None:
         self._server, self._recording = server, recording
+        self._cameras_node = server.scene.add_frame("/cameras", show_axes=False)
         self._hands_node = server.scene.add_frame("/hands", show_axes=False)
         self.skins: list[HandSkin] = []
         """The skins of the hands, in their order."""
@@ -77,12 +78,16 @@ class FrameView:
         with self._server.gui.add_folder("Show"):
             self._names = self._server.gui.add_checkbox("names", False, hint="A click on a point names it.")
             self._ghosts = self._server.gui.add_checkbox("unlabeled points", True)
-            self._filled = self._server.gui.add_checkbox("filled-in markers", True)
-            self._hands = self._server.gui.add_checkbox("skin", True)
+            self._filled = self._server.gui.add_checkbox(
+                "filled-in markers", True, visible=self._recording.has_filled
+            )
+            self._hands = self._server.gui.add_checkbox("skin", True, visible=self._recording.has_hands)
+            cameras = self._server.gui.add_checkbox("cameras", True, visible=self._recording.rig is not None)
             rays = self._recording.frame(0).rays if self._recording.num_frames else np.empty((0, 2, 3))
             self._sight = self._server.gui.add_checkbox("lines of sight", False, visible=len(rays) > 0)
         for switch in (self._names, self._ghosts, self._filled, self._sight):
             switch.on_update(lambda _: self._refresh())
+        cameras.on_update(lambda _: setattr(self._cameras_node, "visible", cameras.value))
         self._hands.on_update(lambda _: setattr(self._hands_node, "visible", self._hands.value))
 
     def _refresh(self) -> None:

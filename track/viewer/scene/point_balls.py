@@ -26,7 +26,7 @@ def label_colors(names: Sequence[str]) -> UInt8[np.ndarray, "K 3"]:
     # Hues in the order of the glove, so that neighbors differ little and digits differ much; two brightnesses
     # tell neighbors apart.
     colors = [
-        colorsys.hsv_to_rgb(0.92 * order[name] / max(len(order), 1), 0.85, 0.95 if order[name] % 2 else 0.75)
+        colorsys.hsv_to_rgb(0.92 * order[name] / max(len(order), 1), 1.0, 0.9 if order[name] % 2 else 0.6)
         for name in bare
     ]
     return np.round(255 * np.array(colors).reshape(-1, 3)).astype(np.uint8)
@@ -112,7 +112,7 @@ class PointBalls:
             if label not in self._texts:
                 self._texts[label] = self._server.scene.add_label(
                     f"{self._name}/names/{label}",
-                    self._names[label],
+                    self._names[label].rsplit(":", 1)[-1],  # the hand is seen
                     font_screen_scale=0.7,
                     anchor="bottom-left",
                 )

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _HALF_SIDE: Final = 0.3  # [m] of the cube that wrists move in, as in training sets
-_SPACING: Final = 0.1  # [m] between the points whose cameras are counted
+_SPACING: Final = 0.2  # [m] between the points whose cameras are counted
 _MOST_POINTS: Final = 40_000
 _FEW, _MANY = np.array([214, 96, 60]), np.array([40, 120, 180])
 
