@@ -49,9 +49,8 @@ def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServ
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a panel of its own
         server = Server(host=host, port=free, label=title, verbose=False)
     try:
-        server.gui.configure_theme(
-            show_logo=False, show_share_button=False, control_layout="collapsible", control_width="medium"
-        )
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
         yield server
     finally:
         with contextlib.redirect_stdout(io.StringIO()):

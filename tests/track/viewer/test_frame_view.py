@@ -1,0 +1,110 @@
+"""What a browser computes from the packets that it gets is the hand that the model says."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from track.viewer.contents import show_recording
+from track.viewer.recordings.takes import TrackedRecording
+from track.viewer.scene.frame_view import FrameView
+
+
+def test_bones_in_the_page_carry_the_skin_to_where_the_model_has_it(server, page_of, tracked):
+    recording = TrackedRecording(tracked)
+    view = FrameView(server, recording)
+    view.show(recording.frame(0))
+    page = page_of(server)
+    for index in (0, 7, 3, 29, 12):
+        view.show(recording.frame(index))
+        page.settle()
+        for number, hand in enumerate(tracked.hands):
+            name = f"/hands/{number}"
+            qpos = tracked.qpos[index, number]
+            assert (name in page.hidden) == bool(np.isnan(qpos).any())
+            if name not in page.hidden:
+                np.testing.assert_allclose(page.skin(name), hand.model.skin(qpos[None])[0], atol=5e-5)
+
+
+def test_a_frame_sends_poses_and_never_a_mesh_again(server, page_of, tracked):
+    recording = TrackedRecording(tracked)
+    view = FrameView(server, recording)
+    view.show(recording.frame(0))
+    page = page_of(server)
+    before, meshes = page.bytes, page.counts["SkinnedMeshMessage"]
+    assert meshes == 2 and before > 100_000
+    view.show(recording.frame(1))
+    page.settle()
+    assert 0 < page.bytes - before < 15_000
+    before = page.bytes
+    view.show(recording.frame(1))
+    page.settle()
+    assert page.bytes == before, "nothing changed, so nothing is sent"
+    assert page.counts["SkinnedMeshMessage"] == meshes
+
+
+def test_points_have_their_places_colors_and_sizes(server, page_of, tracked):
+    recording = TrackedRecording(tracked)
+    view = FrameView(server, recording)
+    page = page_of(server)
+    view.show(recording.frame(20))
+    page.settle()
+    balls = page.nodes["/points"]
+    places, sizes = (balls[name].reshape(-1, width) for name, width in
+                     (("batched_positions", 3), ("batched_scales", 1)))  # fmt: skip
+    colors = balls["batched_colors"].reshape(-1, 3)
+    there = np.isfinite(tracked.points[20, :, 0])
+    count = int(there.sum())
+    np.testing.assert_allclose(places[:count], tracked.points[20, there], atol=1e-6)
+    np.testing.assert_allclose(places[count], tracked.markers[20, 0, 4], atol=1e-6)  # filled in
+    assert (sizes[:count] == 1.0).all() and 0.0 < sizes[count, 0] < 1.0 and (sizes[count + 1 :] == 0.0).all()
+    assert np.ptp(colors[count - 1]) == 0, "a ghost is gray"
+    assert np.ptp(colors[0]) > 100 and (colors[0] == colors[18]).all(), "one marker of two hands, one color"
+    assert tracked.label_names[0].split(":")[1] == tracked.label_names[19].split(":")[1]
+
+
+def test_bodies_are_where_they_are_tracked_and_hidden_where_they_are_lost(server, page_of, tracked):
+    recording = TrackedRecording(tracked)
+    view = FrameView(server, recording)
+    page = page_of(server)
+    view.show(recording.frame(0))
+    page.settle()
+    assert "/bodies/controller" in page.hidden
+    view.show(recording.frame(1))
+    page.settle()
+    assert "/bodies/controller" not in page.hidden
+    np.testing.assert_allclose(page.places["/bodies/controller"], tracked.body_poses[1, 0, :3])
+
+
+def test_switches_take_things_away_and_names_follow_their_points(server, page_of, tracked):
+    recording = TrackedRecording(tracked)
+    view = FrameView(server, recording)
+    view.show(recording.frame(5))
+    page = page_of(server)
+    page.press("names")
+    page.press("unlabeled points", False)
+    page.press("filled-in markers", False)
+    page.press("skin", False)
+    page.settle()
+    assert page.nodes["/points/names/0"]["text"] == "ThumbCMC"
+    np.testing.assert_allclose(page.places["/points/names/0"], tracked.points[5, 0], atol=1e-6)
+    shown = page.nodes["/points"]["batched_scales"] > 0
+    assert shown.sum() == 37 and "/hands" in page.hidden
+    view.show(recording.frame(29))
+    page.settle()
+    assert "/points/names/19" in page.hidden, "the left hand is lost"
+
+
+def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
+    run = show_recording(server, TrackedRecording(tracked))
+    page = page_of(server)
+    page.press("frame", 21)
+    page.settle()
+    steps = iter([False, False])
+    run(lambda: next(steps, True))
+    page.settle()
+    texts = [props["_markdown"] for props in page.panel.values() if "_markdown" in props]
+    assert any("**frame 21** of 30" in text and "**right** tracked, RMS 1.00 mm" in text for text in texts)
+    rows = [props["label"] for props in page.panel.values() if "label" in props]
+    assert [row for row in rows if ": " in row] == [
+        "10: right coasting", "25: left lost", "20: right:ThumbTip 40 %",
+    ]  # fmt: skip
