@@ -44,7 +44,8 @@ class LayoutEditor:
         self, server: ViserServer, path: Path, layout: MarkerLayout, model: HandModel, out: Path
     ) -> None:
         self._server, self._path, self._out, self._lock = server, path, out, threading.Lock()
-        self._shift = np.array([0.0, 0.0, _HEIGHT])
+        self.shift = np.array([0.0, 0.0, _HEIGHT])
+        """Where the wrist is in the page [m]."""
         self.fit: GloveFit = attach(layout, model)
         """The hand in its glove as it is now."""
         self.changed = False
@@ -68,14 +69,14 @@ class LayoutEditor:
 
     def skin_points(self) -> np.ndarray:
         """The vertices of the skin in the page [m]."""
-        points: np.ndarray = self.fit.model.surface.vertices + self._shift
+        points: np.ndarray = self.fit.model.surface.vertices + self.shift
         return points
 
     def choose(self, index: int) -> None:
         """Choose the marker that the gizmo moves."""
         with self._lock:
             self._chosen = index
-            self.gizmo.position = self.fit.attachment.points[index] + self._shift
+            self.gizmo.position = self.fit.attachment.points[index] + self.shift
             self.gizmo.visible = True
             self.names.value = self.fit.layout.names[index]  # type: ignore[misc]  # viser sets it itself
             self._tell()
@@ -84,7 +85,7 @@ class LayoutEditor:
         """Move a marker to the skin near a point of the page [m]; where there is none it stays."""
         with self._lock:
             try:
-                layout = place_marker(self.fit.layout, index, self.fit.model, point - self._shift)
+                layout = place_marker(self.fit.layout, index, self.fit.model, point - self.shift)
             except LayoutError as error:
                 self.state.content = str(error)
                 return
@@ -147,7 +148,7 @@ class LayoutEditor:
 
     def _show(self) -> None:
         count = self.fit.layout.num_markers
-        points = self.fit.attachment.points + self._shift
+        points = self.fit.attachment.points + self.shift
         self.balls.show(points, np.arange(count), np.ones(count, dtype=np.bool_))
 
     def _tell(self) -> None:

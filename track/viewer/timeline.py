@@ -118,7 +118,7 @@ class Timeline:
     def _advance(self) -> None:
         clock, begin = self._anchor
         now = begin + (time.perf_counter() - clock) * _SPEEDS[self._speed.value]
-        if now > self._times[-1]:
+        if now >= 2.0 * self._times[-1] - self._times[-2]:  # the last frame has its time too
             self._index = 0
             self._set_anchor()
             return

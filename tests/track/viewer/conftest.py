@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, defaultdict
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -66,6 +67,17 @@ class Page:
             seen = self.bytes
             time.sleep(quiet)
 
+    def wait(self, condition: Callable[[], bool], limit: float = 30.0) -> None:
+        """Wait until something is so."""
+        end = time.monotonic() + limit
+        while not condition():
+            assert time.monotonic() < end, "it never came"
+            time.sleep(0.02)
+
+    def says(self, words: str) -> bool:
+        """Whether a text of the panel has these words."""
+        return any(words in props.get("_markdown", "") for props in list(self.panel.values()))
+
     def close(self) -> None:
         self._socket.close()
         self._thread.join()
@@ -103,9 +115,9 @@ class Page:
         elif kind == "SetBoneOrientationMessage":
             self.bones[name][message["bone_index"]]["wxyz"] = message["wxyz"]
         elif kind == "SetPositionMessage":
-            self.places[name] = message["position"]
+            self.places[name] = np.array(message["position"])
         elif kind == "SetOrientationMessage":
-            self.turns[name] = message["wxyz"]
+            self.turns[name] = np.array(message["wxyz"])
         elif kind == "SetSceneNodeVisibilityMessage":
             (self.hidden.discard if message["visible"] else self.hidden.add)(name)
         elif kind == "RemoveSceneNodeMessage":
@@ -165,7 +177,7 @@ def _poses() -> np.ndarray:
 
 @pytest.fixture
 def tracked(_poses) -> TrackedTake:
-    """Two hands and a controller in wild poses; the left hand is lost in the last frames, the controller in the first."""
+    """Two hands in wild poses, the left one lost in the last frames; a controller, lost in the first one."""
     layout = load_layout("dense19")
     hands = tuple(nominal_fit(layout, size, side) for size, side in (("L", "right"), ("M", "left")))
     status = np.full((FRAMES, 2), TRACKED, dtype=np.int8)

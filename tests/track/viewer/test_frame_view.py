@@ -84,6 +84,7 @@ def test_switches_take_things_away_and_names_follow_their_points(server, page_of
     page.press("unlabeled points", False)
     page.press("filled-in markers", False)
     page.press("skin", False)
+    page.wait(lambda: "/hands" in page.hidden and "/points/names/0" in page.places)
     page.settle()
     assert page.nodes["/points/names/0"]["text"] == "ThumbCMC"
     np.testing.assert_allclose(page.places["/points/names/0"], tracked.points[5, 0], atol=1e-6)
@@ -98,12 +99,8 @@ def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
     run = show_recording(server, TrackedRecording(tracked))
     page = page_of(server)
     page.press("frame", 21)
-    page.settle()
-    steps = iter([False, False])
-    run(lambda: next(steps, True))
-    page.settle()
-    texts = [props["_markdown"] for props in page.panel.values() if "_markdown" in props]
-    assert any("**frame 21** of 30" in text and "**right** tracked, RMS 1.00 mm" in text for text in texts)
+    run(lambda: page.says("**frame 21** of 30"))
+    assert page.says("**right** tracked, RMS 1.00 mm")
     rows = [props["label"] for props in page.panel.values() if "label" in props]
     assert [row for row in rows if ": " in row] == [
         "10: right coasting", "25: left lost", "20: right:ThumbTip 40 %",

@@ -1,0 +1,49 @@
+"""A marker that is put on a point of the skin is there when the glove is put on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gloves.attachment import attach_markers
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from gloves.placement import place_marker
+from handsim.hand.model import HandModel
+from handsim.hand.skin.surface import vertex_normals
+
+LAYOUT = load_layout("dense19")
+MODELS = {side: HandModel.named("M", side=side) for side in ("right", "left")}
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_marker_that_is_put_where_it_is_stays_there(side):
+    fit = nominal_fit(LAYOUT, "L", side)
+    for index in range(LAYOUT.num_markers):
+        moved = place_marker(LAYOUT, index, fit.model, fit.attachment.points[index])
+        assert moved.markers[index].bone == LAYOUT.markers[index].bone
+        assert moved.markers[:index] == LAYOUT.markers[:index]
+        assert moved.markers[index + 1 :] == LAYOUT.markers[index + 1 :]
+        again = attach_markers(moved, fit.model).points[index]
+        np.testing.assert_allclose(again, fit.attachment.points[index], atol=2e-4)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.sampled_from(["right", "left"]),
+    st.integers(0, LAYOUT.num_markers - 1),
+    st.integers(0, 10**6),
+    st.floats(0.0, 0.02),
+)
+def test_a_marker_goes_to_the_skin_below_the_point(side, index, place, height):
+    model = MODELS[side]
+    surface = model.surface
+    vertex = place % len(surface.vertices)
+    normal = vertex_normals(surface.vertices, surface.faces)[vertex]
+    point = surface.vertices[vertex] + (LAYOUT.radius + height) * normal
+    center = attach_markers(place_marker(LAYOUT, index, model, point), model).points[index]
+    nearest = np.linalg.norm(surface.vertices - point, axis=1).min()
+    assert np.linalg.norm(center - point) < nearest - LAYOUT.radius + 0.012
+    assert LAYOUT.radius - 1e-3 < np.linalg.norm(surface.vertices - center, axis=1).min() < 0.008

@@ -1,0 +1,172 @@
+"""Every kind of file opens by its content; anything else is told in one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import write_capture
+from gloves.layout import starter_layout
+from handsim.app.cli import main
+from handsim.errors import ArgumentError, CaptureError, HandSimError
+from handsim.hand.model import HandModel
+from handsim.space.cameras import named_rig
+from track.user import save_user
+from track.viewer.contents import ACCEPTED, open_content
+from track.viewer.recordings.captures import CaptureRecording
+from track.viewer.recordings.datasets import DatasetRecording
+from track.viewer.recordings.recording import doubtful_frames
+from track.viewer.recordings.takes import TruthRecording, frame_confidence
+from track.viewer.scene.rig_view import box_edges, camera_counts
+from train.data.shards import Dataset
+
+
+@pytest.fixture(scope="module")
+def training_set(tmp_path_factory):
+    out = tmp_path_factory.mktemp("set") / "set"
+    assert main(["generate", "--glove", "sparse13", "--num-frames", "40", "--out", str(out), "--workers", "1",
+                 "--frames-per-hand", "16"]) == 0  # fmt: skip
+    return out
+
+
+@pytest.fixture
+def capture():
+    rng = np.random.default_rng(1)
+    positions = rng.uniform(0.0, 0.3, (50, 6, 3))
+    positions[3, 2] = np.nan
+    names = ("Anna:ThumbTip", "*12", "Unlabeled 7", "IndexTip", "anna:Unlabeled3", "_unlabeled_4")
+    return Capture(names, positions, 100.0)
+
+
+@pytest.fixture
+def files(tmp_path, tracked, simulated, capture, training_set):
+    """One file of each kind, by kind."""
+    tracked.save(tmp_path / "a.npz")
+    simulated.save(tmp_path / "b.npz")
+    write_capture(tmp_path / "c.trc", capture)
+    write_capture(tmp_path / "d.c3d", capture)
+    (tmp_path / "e.toml").write_text(starter_layout())
+    cameras = "\n".join(f"[[camera]]\nposition = [{x}, 0, 1]\ntarget = [0, 0, 1]" for x in (-1, 1))
+    (tmp_path / "f.toml").write_text(f'name = "pair"\nfield_of_view = 60\n{cameras}\n')
+    save_user(tmp_path / "g.json", [tracked.hands[0], tracked.hands[0].with_side("left")])
+    return {
+        "tracked": tmp_path / "a.npz",
+        "truth": tmp_path / "b.npz",
+        "capture": tmp_path / "c.trc",
+        "capture c3d": tmp_path / "d.c3d",
+        "layout": tmp_path / "e.toml",
+        "rig": tmp_path / "f.toml",
+        "user": tmp_path / "g.json",
+        "dataset": training_set,
+        "layout shipped": "sparse13",
+        "rig shipped": "six",
+    }
+
+
+def test_every_kind_opens_and_fills_a_page(files, server, page_of):
+    expected = {
+        "tracked": "/hands/1", "truth": "/bodies/pen", "capture": "/points", "capture c3d": "/points",
+        "layout": "/markers", "rig": "/cameras/2", "user": "/before/left/skin", "dataset": "/hands/0",
+        "layout shipped": "/hand", "rig shipped": "/coverage",
+    }  # fmt: skip
+    for name, path in files.items():
+        server.scene.reset()
+        server.gui.reset()
+        content = open_content(str(path))
+        assert content.kind == name.split()[0]
+        run = content.show(server)
+        run(lambda: True)
+        assert expected[name] in page_of(server).nodes, name
+
+
+def test_anything_else_is_told_in_one_sentence(tmp_path, capture):
+    (tmp_path / "wand.toml").write_text('name = "wand"\n')
+    (tmp_path / "notes.txt").write_text("remember the milk")
+    for name in ("wand.toml", "notes.txt"):
+        with pytest.raises(ArgumentError) as caught:
+            open_content(str(tmp_path / name))
+        assert ACCEPTED in str(caught.value) and name in str(caught.value)
+    with pytest.raises(ArgumentError, match="no such file, folder or shipped name, expected a marker layout"):
+        open_content("dense20")
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    with pytest.raises(CaptureError):
+        open_content(str(tmp_path / "other.npz"))
+    with pytest.raises(HandSimError, match=r"missing\.npz"):
+        open_content(str(tmp_path / "missing.npz"))
+    with pytest.raises(HandSimError, match="holds none"):
+        open_content(str(tmp_path))
+    write_capture(tmp_path / "take.trc", capture)
+    with pytest.raises(ArgumentError, match="is no marker layout: nothing would be saved"):
+        open_content(str(tmp_path / "take.trc"), out=tmp_path / "new.toml")
+
+
+def test_names_that_systems_give_to_unnamed_points_are_no_labels(capture):
+    recording = CaptureRecording(capture)
+    assert recording.label_names == ("Anna:ThumbTip", "IndexTip")
+    frame = recording.frame(3)
+    np.testing.assert_array_equal(frame.labels, [0, -1, 1, -1, -1])
+    np.testing.assert_array_equal(frame.points[2], capture.positions[3, 3])
+    assert recording.most_points == 6 and frame.time == pytest.approx(0.03)
+
+
+def test_a_training_set_shows_its_rows_and_who_sees_them(training_set):
+    dataset = Dataset(training_set)
+    recording, rig = DatasetRecording(dataset), named_rig("figure5")
+    for index in (39, 0, 17):
+        row, frame = dataset.rows()[index], recording.frame(index)
+        observed = np.isfinite(row["observed"][:, 0])
+        np.testing.assert_array_equal(frame.seen[:13], observed)
+        np.testing.assert_array_equal(frame.points[:13][observed], row["observed"][observed])
+        np.testing.assert_array_equal(frame.points[:13][~observed], row["markers"][~observed])
+        assert frame.hands[0].shape.length == pytest.approx(dataset.hands(0)[row["hand"]].length)
+        assert len(frame.rays) == sum(int(bits).bit_count() for bits in row["cameras"])
+        for marker, camera in frame.rays:
+            number = int(np.linalg.norm(row["markers"] - marker, axis=1).argmin())
+            eye = int(np.linalg.norm(rig.positions - camera, axis=1).argmin())
+            assert row["cameras"][number] >> eye & 1
+
+
+def test_a_rig_of_a_take_is_shown_only_if_it_is_shipped(simulated):
+    assert TruthRecording(simulated).rig.name == "six"
+    for name in ("/etc/passwd", 3, None):
+        assert TruthRecording(dataclasses.replace(simulated, settings={"rig": name})).rig is None
+
+
+def test_doubtful_frames_are_the_worst_of_their_runs(tracked):
+    confidence = np.array([1.0, 0.5, 0.4, 0.9, np.nan, 0.6, 1.0, 0.1])
+    assert doubtful_frames(confidence, 0.8) == [(7, 0.1), (2, 0.4), (5, 0.6)]
+    assert doubtful_frames(confidence, 0.8, most=1) == [(7, 0.1)]
+    assert doubtful_frames(np.ones(3), 0.8) == []
+    certain = frame_confidence(tracked)
+    assert certain[10] == certain[25] == 0.0 and certain[20] == 0.4
+    assert (np.delete(certain, [10, 20, 25]) == 0.99).all(), "lost for long is no news"
+
+
+def test_places_are_counted_by_the_cameras_that_see_them():
+    rig = named_rig("six")
+    places, counts = camera_counts(rig)
+    assert counts.min() == 2 and counts.max() <= 6 and len(places) > 50
+    np.testing.assert_array_equal(rig.in_view(places).sum(axis=1), counts)
+    edges = box_edges(np.zeros(3), np.array([1.0, 2.0, 3.0]))
+    assert edges.shape == (12, 2, 3)
+    assert sorted(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)) == [1.0] * 4 + [2.0] * 4 + [3.0] * 4
+
+
+def test_a_damaged_set_is_not_shown(training_set, tmp_path):
+    folder = tmp_path / "set"
+    shutil.copytree(training_set, folder)
+    rows = next(folder.glob("rows-*.npy"))
+    rows.write_bytes(rows.read_bytes()[:-7])
+    with pytest.raises(HandSimError, match="damaged"):
+        open_content(str(folder))
+
+
+def test_the_size_of_the_hand_under_a_layout_is_chosen(tmp_path, server, page_of):
+    (tmp_path / "glove.toml").write_text(starter_layout())
+    open_content(str(tmp_path / "glove.toml"), size="XL").show(server)
+    vertices = page_of(server).nodes["/hand"]["vertices"].reshape(-1, 3)
+    np.testing.assert_allclose(vertices, HandModel.named("XL").surface.vertices, atol=1e-6)

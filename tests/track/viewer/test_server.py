@@ -1,0 +1,49 @@
+"""The page is served to this machine alone, and never through a tunnel."""
+
+from __future__ import annotations
+
+import socket
+import sys
+import urllib.request
+
+import pytest
+
+from handsim.errors import ArgumentError, HandSimError
+from track.viewer.server import LOOPBACK, address_of, opened_server
+
+
+def test_the_page_is_served_here_until_the_end(capsys):
+    with opened_server(LOOPBACK, 0, "title") as server:
+        address = address_of(server)
+        assert address.startswith("http://127.0.0.1:")
+        assert b"<html" in urllib.request.urlopen(address).read()
+    with pytest.raises(OSError):
+        urllib.request.urlopen(address, timeout=2.0)
+    assert capsys.readouterr().out == ""
+
+
+def test_no_page_can_ask_for_a_public_address(server, page_of):
+    page = page_of(server)
+    page.send("ShareUrlRequest")
+    page.settle()
+    assert server.request_share_url() is None
+    assert page.counts["ShareUrlUpdated"] == 0
+
+
+def test_a_port_that_is_taken_or_none_is_told():
+    with socket.create_server((LOOPBACK, 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(
+            ArgumentError, match=rf"--port {port} cannot be listened at .*own address and a free"
+        ):
+            opened_server(LOOPBACK, port, "").__enter__()
+    with pytest.raises(ArgumentError, match="--port is 65536, expected 0 to 65535"):
+        opened_server(LOOPBACK, 65536, "").__enter__()
+    with pytest.raises(ArgumentError, match=r"--host 192\.0\.2\.1 cannot be listened at"):
+        opened_server("192.0.2.1", None, "").__enter__()
+
+
+def test_without_viser_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(HandSimError, match=r"pip install 'handsim\[view\]'"):
+        opened_server(LOOPBACK, 0, "").__enter__()
