@@ -203,7 +203,7 @@ def _between(
     after = np.minimum(before + 1, len(rows) - 1)
     first = np.where(share[:, None] == 1.0, rows[after], rows[before])
     second = np.where(share[:, None] == 0.0, rows[before], rows[after])
-    between = first + share[:, None] * (second - first)
+    between: NDArray[np.float64] = first + share[:, None] * (second - first)
     there = np.isfinite(between[:, 0])
     starts = Rotation.from_quat(first[there, quaternions], scalar_first=True)
     ends = Rotation.from_quat(second[there, quaternions], scalar_first=True)

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.errors import HandSimWarning, RigError
+from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera
 from handsim.space.camera_file import read_camera_file
 from render.cameras.colmap_file import CAMERAS, IMAGES, read_colmap_cameras
 from render.cameras.opencv_file import read_opencv_cameras
-from render.frames.keypoints import hand_keypoints
 from render.shown_take import ShownTake
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ import pytest
 
 from handsim.app.cli import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning
+from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.shape import named_shape, sample_shape
@@ -18,7 +19,6 @@ from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses import sample_poses
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
-from render.frames.keypoints import hand_keypoints
 from render.own_poses import PoseFile, load_poses
 from render.sensors.shutter import ShutterConfig
 from render.session import draw_frames, render_take

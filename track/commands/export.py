@@ -40,8 +40,8 @@ def export(
     """Write the motion of a take, or a trained labeler, for other programs.
 
     Args:
-        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); or a labeler, by the
-            name of a glove with a shipped one or the folder of a trained one.
+        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); or a labeler, by
+            the name of a glove with a shipped one or the folder of a trained one.
         out: The file. Of a take .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint
             angles and positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json;
             of a labeler .onnx, which labels without torch.
