@@ -43,7 +43,7 @@ _DAMAGE: Final = (
 
 @dataclass(frozen=True, slots=True)
 class PoseFile:
-    """A file of poses, and what the file does not say of them.
+    """A file of poses (T, 27) [m, rad], and what the file does not say of them.
 
     Raises:
         ArgumentError: A side is unknown or comes twice, or `people` is less than 1.
