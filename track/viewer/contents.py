@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -43,7 +42,7 @@ ACCEPTED: Final = (
     f"({', '.join(READABLE)}), a tracked take or a simulated take's truth (.npz), or a user's file (.json)"
 )
 """What can be viewed."""
-_LOOKED_AT: Final = 200  # frames that decide where the first look goes
+_LOOKED_AT: Final = 30  # frames that decide where the first look goes
 
 Run = Callable[[Callable[[], bool]], None]
 """Serves a page until the function that it is given says that it shall end."""
@@ -163,22 +162,15 @@ def show_recording(server: ViserServer, recording: Recording) -> Run:
 
 
 def first_look(recording: Recording) -> np.ndarray:
-    """Points [m] that the first look shall show: those of a hand's skin or, without hands, of the points.
-
-    They are of the first frame that has any; frames far apart are tried, not all.
-    """
-    points = np.empty((0, 3))
-    for index in np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int)):
-        frame = recording.frame(int(index))
-        there = np.isfinite(frame.qpos).all(axis=1)
-        skins = [
-            model.skin(qpos[None])[0]
-            for model, qpos in itertools.compress(zip(frame.hands, frame.qpos, strict=True), there)
-        ]
-        if skins:
-            return np.concatenate(skins)
-        points = points if len(points) else frame.points
-    return points
+    """Points [m] that the first look shall show: wrists and labeled points, or all points, of some frames."""
+    indices = np.unique(np.linspace(0, recording.num_frames - 1, _LOOKED_AT).astype(int))
+    frames = [recording.frame(int(index)) for index in indices]
+    wrists = [frame.qpos[:, :3] for frame in frames]
+    labeled = [frame.points[frame.labels >= 0] for frame in frames]
+    points = np.concatenate([*wrists, *labeled])
+    if np.isfinite(points).all(axis=1).any():
+        return points
+    return np.concatenate([frame.points for frame in frames])
 
 
 def shipped_file(name: str) -> Path:

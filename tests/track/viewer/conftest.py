@@ -38,6 +38,7 @@ class Page:
         self.bones: dict[str, dict[int, dict]] = defaultdict(lambda: defaultdict(dict))
         self.hidden: set[str] = set()
         self.panel: dict[str, dict] = {}
+        self.camera: dict[str, np.ndarray] = {}
         self.counts: Counter[str] = Counter()
         self.bytes = 0
         self._socket = connect(
@@ -120,6 +121,9 @@ class Page:
             self.turns[name] = np.array(message["wxyz"])
         elif kind == "SetSceneNodeVisibilityMessage":
             (self.hidden.discard if message["visible"] else self.hidden.add)(name)
+        elif kind in ("SetCameraPositionMessage", "SetCameraLookAtMessage"):
+            key = "look_at" if "LookAt" in kind else "position"
+            self.camera[key] = np.array(message[key])
         elif kind == "RemoveSceneNodeMessage":
             self.nodes.pop(name, None)
         elif kind == "SceneNodeUpdateMessage":

@@ -95,6 +95,19 @@ def test_switches_take_things_away_and_names_follow_their_points(server, page_of
     assert "/points/names/19" in page.hidden, "the left hand is lost"
 
 
+def test_the_eye_is_led_to_the_hands(server, page_of, tracked):
+    recording = TrackedRecording(tracked)
+    view = FrameView(server, recording)
+    view.show(recording.frame(29))
+    page = page_of(server)
+    page.press("Look at the hands")
+    page.wait(lambda: page.counts["SetCameraLookAtMessage"] > 0)
+    page.settle()
+    right = np.concatenate([tracked.qpos[29, :1, :3], tracked.markers[29, 0]])
+    np.testing.assert_allclose(page.camera["look_at"], right.mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(page.camera["position"] - page.camera["look_at"], [1, 1, 1], atol=1e-6)
+
+
 def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
     run = show_recording(server, TrackedRecording(tracked))
     page = page_of(server)

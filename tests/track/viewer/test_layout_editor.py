@@ -53,7 +53,7 @@ def test_a_dragged_marker_is_saved_where_it_was_let_go(server, page_of, glove):
     ]
     center = attach_markers(saved, model).points[index] + editor.shift
     start = attach_markers(before, model).points[index] + editor.shift
-    assert center[:2] == pytest.approx(start[:2] + [0.01, 0.008], abs=2e-3), "under the hand that dragged it"
+    assert center[:2] == pytest.approx(start[:2] + [0.01, 0.008], abs=5e-3), "under the hand that dragged it"
     assert abs(center[2] - start[2]) < 5e-3, "and on the skin"
     np.testing.assert_allclose(ball(page), center, atol=1e-5)
     np.testing.assert_allclose(page.places["/move"], center, atol=1e-5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -83,12 +83,27 @@ class FrameView:
             )
             self._hands = self._server.gui.add_checkbox("skin", True, visible=self._recording.has_hands)
             cameras = self._server.gui.add_checkbox("cameras", True, visible=self._recording.rig is not None)
+            center = self._server.gui.add_button("Look at the hands", color="gray", hint="C")
             rays = self._recording.frame(0).rays if self._recording.num_frames else np.empty((0, 2, 3))
             self._sight = self._server.gui.add_checkbox("lines of sight", False, visible=len(rays) > 0)
         for switch in (self._names, self._ghosts, self._filled, self._sight):
             switch.on_update(lambda _: self._refresh())
+        center.on_click(self._look)
+        self._server.gui.add_command("Center the hands", hotkey="C").on_trigger(self._look)
         cameras.on_update(lambda _: setattr(self._cameras_node, "visible", cameras.value))
         self._hands.on_update(lambda _: setattr(self._hands_node, "visible", self._hands.value))
+
+    def _look(self, event: Any) -> None:
+        """Move the eye of the page that asks, so that the hands are in the middle; it keeps its direction."""
+        frame, client = self._frame, event.client
+        if frame is None or client is None:
+            return
+        points = np.concatenate([frame.qpos[:, :3], frame.points[frame.labels >= 0]])
+        points = points[np.isfinite(points).all(axis=1)]
+        points = points if len(points) else frame.points
+        if len(points):
+            camera = client.camera
+            camera.position = camera.position + points.mean(axis=0) - camera.look_at
 
     def _refresh(self) -> None:
         with self._server.atomic():
