@@ -133,7 +133,7 @@ CASES = {
     "an address that is none": ["track", "--live", "localhost:1510", "--out", "out.npz"],
     "a tracked take in another kind of file": ["track", "good.trc", "--out", "out.c3d"],
     "a tracked take in place of the truth": ["track", "good.trc", "--out", "good.truth.npz"],
-    "labels in another kind of file": ["track", "good.trc", "--labeled", "out.csv", "--out", "out.npz"],
+    "labels in another kind of file": ["track", "good.trc", "--labeled", "out.tsv", "--out", "out.npz"],
     "a hand twice": ["track", "good.trc", "--hands", "left", "left", "--out", "out.npz"],
     "an unknown glove to track": ["track", "good.trc", "--glove", "dense91", "--out", "out.npz"],
     "millimeters said to be meters, to track": ["track", "millimeters.trc", "--out", "out.npz"],

@@ -39,7 +39,7 @@ def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     truth = out.with_suffix(SUFFIX)
     with atomic_writes(out, truth) as (capture_file, truth_file):  # a capture without its truth is no use
-        write_capture(capture_file, Capture(names, take.points, take.rate))
+        write_capture(capture_file, Capture(names, take.points, take.rate), title=out.name)
         take.save(truth_file)
     counts = count_gaps(take.markers_present())
     print_line(f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}")

@@ -53,6 +53,11 @@ def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, 
     assert main(["simulate", "--num-frames", "20", "--out", str(tmp_path / "text.trc"), "--seed", "4"]) == 0
     trc, truth = read_capture(tmp_path / "text.trc"), load_take(tmp_path / "text.truth.npz")
     np.testing.assert_allclose(trc.positions, truth.points, atol=1e-6)
+    assert (tmp_path / "text.trc").read_text().startswith("PathFileType\t4\t(X/Y/Z)\ttext.trc\n")
+    assert main(["simulate", "--num-frames", "20", "--out", str(tmp_path / "text.csv"), "--seed", "4"]) == 0
+    motive = read_capture(tmp_path / "text.csv")
+    np.testing.assert_allclose(motive.positions, truth.points, atol=1e-8)
+    assert ",Take Name,text," in (tmp_path / "text.csv").read_text().splitlines()[0]
     present = truth.markers_present()
     assert present.shape == (20, 38) and present.mean() > 0.8
 
