@@ -305,6 +305,8 @@ def unpack_take(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Tracke
         raise ValueError("other statuses")
     if any(arrays[name].dtype != dtype for name, dtype in _TYPES.items() if name in arrays):
         raise ValueError("numbers of another type")
+    if header["schema"] > 1:
+        check_shapes([(arrays[KEYPOINTS], (*arrays["qpos"].shape[:2], NUM_KEYPOINTS, 3))])
     hands = []
     worn = zip(*(arrays[f"attachment_{name}"] for name in _ATTACHMENT), strict=True)
     for record, layout, parts in zip(arrays["hands"], header["layouts"], worn, strict=True):

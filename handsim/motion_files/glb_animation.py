@@ -183,11 +183,14 @@ class _Scene:
             self._channel(node, path, self._seconds, values, "LINEAR")
 
     def _hide(self, node: int, present: NDArray[np.bool_]) -> None:
-        """Scale 0 where there is no pose."""
+        """Scale 0 where there is no pose, from half a frame before to half a frame after."""
         if present.all() or self._seconds is None:
             return
         frames = changes(present)
-        times = self._buffer.add(self._motion.seconds[frames].astype("<f4"), bounds=True)
+        seconds = self._motion.seconds
+        # Halfway: a reader that asks for a frame's time must not meet the other side of a rounded key.
+        halfway = 0.5 * (seconds[frames] + seconds[np.maximum(frames - 1, 0)])
+        times = self._buffer.add(halfway.astype("<f4"), bounds=True)
         self._channel(node, "scale", times, np.repeat(present[frames, None], 3, axis=1), "STEP")
 
     def _channel(self, node: int, path: str, times: int, values: NDArray[Any], interpolation: str) -> None:

@@ -48,7 +48,7 @@ def write_usd(path: Path, motion: HandsInMotion) -> None:
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, motion.up.upper())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    codes = motion.seconds * motion.rate
+    codes = np.round(motion.seconds * motion.rate, 6)  # whole ones at a steady rate
     stage.SetTimeCodesPerSecond(motion.rate)
     stage.SetFramesPerSecond(motion.rate)
     stage.SetStartTimeCode(0.0)

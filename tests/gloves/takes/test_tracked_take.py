@@ -23,6 +23,7 @@ from gloves.takes.tracked_take import (
     load_tracked_take,
 )
 from handsim.errors import ArgumentError, CaptureError
+from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 
@@ -273,3 +274,29 @@ def test_nothing_is_ever_unpickled(take, tmp_path):
     altered(path, qpos=trap)
     assert_refused(path, "not a tracked take")
     assert "test_tracked_take_sprung" not in sys.modules
+
+
+def test_files_hold_the_joint_positions(take, tmp_path):
+    take.save(tmp_path / "take.npz")
+    with np.load(tmp_path / "take.npz") as stored:
+        header, keypoints = json.loads(str(stored["header"])), stored["keypoints"]
+    assert header["schema"] == 2 and tuple(header["keypoint_names"]) == KEYPOINT_NAMES
+    assert keypoints.shape == (FRAMES, 2, 21, 3)
+    for index, hand in enumerate(take.hands):
+        there = take.status[:, index] != LOST
+        expected = hand_keypoints(hand.model, take.qpos[there, index])
+        np.testing.assert_allclose(keypoints[there, index], expected)
+        assert np.isnan(keypoints[~there, index]).all()
+
+
+def test_takes_of_schema_one_still_open(take, tmp_path):
+    """Files from before had no joint positions."""
+    path = tmp_path / "take.npz"
+    take.save(path)
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files if name != "keypoints"}
+    header = json.loads(str(arrays.pop("header")))
+    del header["keypoint_names"]
+    np.savez(path, header=np.array(json.dumps(header | {"schema": 1})), **arrays)
+    np.testing.assert_array_equal(load_tracked_take(path).qpos, take.qpos)
+    np.testing.assert_array_equal(load_tracked_take(path).keypoints(), take.keypoints())

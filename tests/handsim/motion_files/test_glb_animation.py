@@ -1,0 +1,177 @@
+"""A reader of its own reads the .glb: chunks, accessors, samplers, nodes and skins as glTF states them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation, Slerp
+
+from handsim.hand.model import HandModel, join_qpos
+from handsim.motion_files.glb_animation import write_glb
+from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
+
+TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Our axes to glTF's: z up to y up."""
+
+
+class Glb:
+    def __init__(self, path):
+        data = path.read_bytes()
+        magic, version, length = struct.unpack_from("<4sII", data)
+        assert (magic, version, length) == (b"glTF", 2, len(data))
+        size, kind = struct.unpack_from("<I4s", data, 12)
+        assert kind == b"JSON" and size % 4 == 0
+        self.json = json.loads(data[20 : 20 + size])
+        binary, kind = struct.unpack_from("<I4s", data, 20 + size)
+        assert kind == b"BIN\0" and 28 + size + binary == length
+        self.binary = data[28 + size :]
+
+    def array(self, index):
+        accessor = self.json["accessors"][index]
+        view = self.json["bufferViews"][accessor["bufferView"]]
+        width = WIDTHS[accessor["type"]]
+        assert view["byteOffset"] % 4 == 0
+        values = np.frombuffer(
+            self.binary, TYPES[accessor["componentType"]], accessor["count"] * width, view["byteOffset"]
+        ).reshape(-1, width)
+        assert values.nbytes == view["byteLength"]
+        if "min" in accessor:
+            np.testing.assert_array_equal(values.min(axis=0), np.float32(accessor["min"]))
+            np.testing.assert_array_equal(values.max(axis=0), np.float32(accessor["max"]))
+        return values.astype(float) if values.dtype.kind == "f" else values.astype(int)
+
+    def named(self, name):
+        (number,) = (n for n, node in enumerate(self.json["nodes"]) if node["name"] == name)
+        return number
+
+    def locals(self, time):
+        """Local transforms of all nodes at a time [s]."""
+        state = [
+            {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1], **node}
+            for node in self.json["nodes"]
+        ]
+        for animation in self.json.get("animations", []):
+            for channel in animation["channels"]:
+                sampler = animation["samplers"][channel["sampler"]]
+                times, values = self.array(sampler["input"])[:, 0], self.array(sampler["output"])
+                path = channel["target"]["path"]
+                if sampler["interpolation"] == "STEP":
+                    value = values[max(0, np.searchsorted(times, time, side="right") - 1)]
+                elif path == "rotation":
+                    value = Slerp(times, Rotation.from_quat(values))(np.clip(time, *times[[0, -1]])).as_quat()
+                else:
+                    value = [np.interp(time, times, column) for column in values.T]
+                state[channel["target"]["node"]][path] = value
+        matrices = np.tile(np.eye(4), (len(state), 1, 1))
+        for matrix, node in zip(matrices, state, strict=True):
+            matrix[:3, :3] = Rotation.from_quat(node["rotation"]).as_matrix() * node["scale"]
+            matrix[:3, 3] = node["translation"]
+        return matrices
+
+    def worlds(self, time):
+        matrices, worlds = self.locals(time), {}
+
+        def visit(number, above):
+            worlds[number] = above @ matrices[number]
+            for child in self.json["nodes"][number].get("children", []):
+                visit(child, worlds[number])
+
+        for top in self.json["scenes"][0]["nodes"]:
+            visit(top, np.eye(4))
+        assert len(worlds) == len(matrices)
+        return worlds
+
+    def skinned(self, name, time):
+        node = self.json["nodes"][self.named(name)]
+        (primitive,) = self.json["meshes"][node["mesh"]]["primitives"]
+        parts = {key: self.array(index) for key, index in primitive["attributes"].items()}
+        skin, worlds = self.json["skins"][node["skin"]], self.worlds(time)
+        inverse = self.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+        joints = np.stack([worlds[joint] for joint in skin["joints"]]) @ inverse
+        np.testing.assert_allclose(parts["WEIGHTS_0"].sum(axis=1), 1.0, atol=1e-6)
+        blended = np.einsum("vk,vkij->vij", parts["WEIGHTS_0"], joints[parts["JOINTS_0"]])
+        points = np.concatenate([parts["POSITION"], np.ones((len(parts["POSITION"]), 1))], axis=1)
+        return np.einsum("vij,vj->vi", blended, points)[:, :3], parts, self.array(primitive["indices"])
+
+
+@pytest.fixture
+def glb(motion, tmp_path):
+    write_glb(tmp_path / "hands.glb", motion)
+    return Glb(tmp_path / "hands.glb")
+
+
+def test_skins_move_as_ours(glb, motion):
+    for hand in motion.hands:
+        for frame in np.flatnonzero(hand.present):
+            found, _, _ = glb.skinned(f"{hand.side}_hand", motion.seconds[frame])
+            expected = hand.model.skin(hand.qpos[frame : frame + 1])[0] @ UP.T
+            np.testing.assert_allclose(found, expected, atol=2e-6)
+
+
+def test_a_hand_without_a_pose_is_a_point(glb, motion):
+    left = motion.hands[1]
+    for frame in np.flatnonzero(~left.present):
+        found, _, _ = glb.skinned("left_hand", motion.seconds[frame])
+        assert np.ptp(found, axis=0).max() < 1e-6
+    assert np.ptp(glb.skinned("right_hand", motion.seconds[5])[0], axis=0).max() > 0.1
+
+
+def test_things_move_as_ours(glb, motion):
+    for thing in motion.things:
+        for frame in range(motion.num_frames):
+            pose = glb.worlds(motion.seconds[frame])[glb.named(thing.name)]
+            expected = (
+                np.zeros((3, 3)) if not thing.present[frame] else UP @ thing.T_world_thing[frame, :3, :3]
+            )
+            np.testing.assert_allclose(pose[:3, :3], expected, atol=5e-6)
+            if thing.present[frame]:
+                np.testing.assert_allclose(pose[:3, 3], UP @ thing.T_world_thing[frame, :3, 3], atol=5e-6)
+    assert (
+        "mesh" in glb.json["nodes"][glb.named("pen")]
+        and "mesh" not in glb.json["nodes"][glb.named("my wand")]
+    )
+
+
+def test_faces_look_outwards_once_and_normals_are_of_length_one(glb, motion):
+    for hand in motion.hands:
+        _, parts, indices = glb.skinned(f"{hand.side}_hand", 0.0)
+        mesh = trimesh.Trimesh(parts["POSITION"], indices.reshape(-1, 3), process=False)
+        assert mesh.is_watertight and mesh.volume > 0
+        assert len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) == len(mesh.faces)
+        np.testing.assert_allclose(np.linalg.norm(parts["NORMAL"], axis=1), 1.0, atol=1e-6)
+        agreement = (parts["NORMAL"] * mesh.vertex_normals).sum(axis=1)  # theirs are weighted by angles
+        assert (agreement > 0.9).mean() > 0.998 and agreement.min() > 0
+    assert all(material["doubleSided"] is False for material in glb.json["materials"])
+
+
+def test_keys_turn_the_short_way(glb):
+    """Neighboring quaternions have one sign: readers that do not look for the shorter way turn right too."""
+    for sampler in glb.json["animations"][0]["samplers"]:
+        values = glb.array(sampler["output"])
+        if values.shape[1] == 4:
+            assert ((values[1:] * values[:-1]).sum(axis=1) >= 0).all()
+
+
+def test_a_single_frame_is_a_pose_without_an_animation(tmp_path):
+    model = HandModel.named("S", side="left")
+    write_glb(
+        tmp_path / "one.glb",
+        HandsInMotion(1.0, np.zeros(1), (MovingHand(model, join_qpos(np.zeros((1, 20)))),)),
+    )
+    glb = Glb(tmp_path / "one.glb")
+    assert "animations" not in glb.json
+    np.testing.assert_allclose(glb.skinned("left_hand", 0.0)[0], model.surface.vertices @ UP.T, atol=1e-6)
+
+
+def test_a_take_with_y_up_keeps_its_axes(motion, tmp_path):
+    write_glb(tmp_path / "y.glb", dataclasses.replace(motion, up="y"))
+    found, _, _ = Glb(tmp_path / "y.glb").skinned("right_hand", 0.0)
+    np.testing.assert_allclose(found, motion.hands[0].model.skin(motion.hands[0].qpos[:1])[0], atol=2e-6)
+    assert trimesh.load(tmp_path / "y.glb").geometry  # another reader opens it
