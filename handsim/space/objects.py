@@ -113,7 +113,7 @@ def load_object(path: str | Path, *, mass: float = 0.1) -> RigidObject:
     """
     path = Path(path)
     mesh = _read_mesh(path)
-    if not len(mesh.faces) or not len(mesh.vertices):
+    if not len(mesh.faces) or not np.size(mesh.vertices):
         raise ObjectError(f"{path}: the mesh is empty, expected a closed surface of triangles")
     if not np.isfinite(mesh.vertices).all():
         raise ObjectError(f"{path}: the mesh has vertices that are NaN or infinite, expected finite meters")

@@ -14,7 +14,7 @@ from render.formats.writer import FORMATS, open_writer
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+EXAMPLES = [code for code in re.findall(r"```python\n(.*?)```", PAGE, re.S) if '"out/' in code]
 
 
 @pytest.mark.parametrize("code", EXAMPLES, ids=lambda code: code.split("\n")[-2][:24])

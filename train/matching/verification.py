@@ -33,6 +33,9 @@ _WEIGHT: Final = 2.0  # of the prior's density against the scores, chosen on hel
 _GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
 _TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
 _LEAST: Final = 4  # labeled points of a hand
+_LEAST_DENSITY: Final = (
+    2.5  # log-density of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +43,8 @@ class _Candidate:
     """A labeling, what it scores, and the pairs that were taken back for it."""
 
     score: float
+    density: float
+    """Log-density of the labeled points, for each coordinate."""
     labels: NDArray[np.int64]
     without: tuple[tuple[int, int], ...] = ()
 
@@ -95,8 +100,9 @@ def _verify(
     def scored(cost: float, labels: NDArray[np.int64], without: tuple[tuple[int, int], ...]) -> _Candidate:
         known = labels >= 0
         density = prior.log_density(points[known], labels[known], mirrored=mirrored)
-        density += _GHOST * np.count_nonzero(~known)
-        return _Candidate(_WEIGHT * density - cost, labels, without)
+        ghosts = _GHOST * np.count_nonzero(~known)
+        score = _WEIGHT * (density + ghosts) - cost
+        return _Candidate(score, density / max(1, 3 * np.count_nonzero(known)), labels, without)
 
     found = {labels.tobytes(): scored(cost, labels, ())}
     front = list(found.values())
@@ -138,10 +144,14 @@ def _elected(
 ) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
     """The best labeling; a label's probability is the share of the labelings that agree, by their odds.
 
-    Where all agree, it is the network's own, if that is higher than what it was not tried against.
+    Where all agree, it is the network's own. Points that are no hand in any labeling are labeled as the
+    network has it.
     """
     scores = np.array([one.score for one in candidates])
-    labels = candidates[int(scores.argmax())].labels
+    best = candidates[int(scores.argmax())]
+    if best.density < _LEAST_DENSITY:
+        best, candidates, scores = candidates[0], candidates[:1], scores[:1]
+    labels = best.labels
     odds = np.exp(_TEMPERATURE * (scores - scores.max()))
     agree = np.array([one.labels == labels for one in candidates])
     share = (odds / odds.sum()) @ agree
