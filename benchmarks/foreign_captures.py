@@ -18,6 +18,7 @@ import argparse
 import csv
 import io
 import re
+import resource
 import subprocess
 import sys
 import tempfile
@@ -33,6 +34,7 @@ from handsim.errors import CaptureError
 
 METERS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "mete": 1.0, "meters": 1.0, "millimeters": 1e-3}
 MOST_SECONDS: Final = 120.0
+MOST_BYTES: Final = 4 << 30
 KINDS: Final = ("same", "differs", "refused by handsim alone", "refused by all", "read by handsim alone")
 
 
@@ -51,6 +53,9 @@ def with_ezc3d(path: Path) -> np.ndarray | None:
 def _write_ezc3d(path: Path, out: Path) -> None:
     import ezc3d
 
+    resource.setrlimit(
+        resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES)
+    )  # a damaged file makes it take all there is
     content = ezc3d.c3d(str(path))
     units = content["parameters"]["POINT"].get("UNITS", {"value": []})["value"]
     points = np.moveaxis(content["data"]["points"][:3], (0, 1, 2), (2, 1, 0))
@@ -146,12 +151,13 @@ def _vicon(rows: list[list[str]]) -> np.ndarray | None:
 
 def same(ours: np.ndarray, other: np.ndarray) -> bool:
     """Whether two readers found the same positions; empty trajectories at the end may be left out."""
+    if len(ours) != len(other):
+        return False
+    width = max(ours.shape[1], other.shape[1])
     ours, other = (
-        array[:, : max(np.flatnonzero(~np.isnan(array).all(axis=(0, 2))), default=-1) + 1]
+        np.pad(array, ((0, 0), (0, width - array.shape[1]), (0, 0)), constant_values=np.nan)
         for array in (ours, other)
     )
-    if ours.shape != other.shape:
-        return False
     missing = np.isnan(ours[..., 0])
     gone = np.isnan(other).any(axis=-1) | (other == 0.0).all(axis=-1)
     return bool(gone[missing].all() and np.allclose(ours[~missing], other[~missing], rtol=2e-6, atol=1e-6))
