@@ -53,9 +53,8 @@ def with_ezc3d(path: Path) -> np.ndarray | None:
 def _write_ezc3d(path: Path, out: Path) -> None:
     import ezc3d
 
-    resource.setrlimit(
-        resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES)
-    )  # a damaged file makes it take all there is
+    # A damaged file makes it take all the memory there is.
+    resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
     content = ezc3d.c3d(str(path))
     units = content["parameters"]["POINT"].get("UNITS", {"value": []})["value"]
     points = np.moveaxis(content["data"]["points"][:3], (0, 1, 2), (2, 1, 0))
