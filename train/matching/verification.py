@@ -142,9 +142,10 @@ def _without(
 def _elected(
     candidates: list[_Candidate], probabilities: Float[np.ndarray, "N+1 M+1"]
 ) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """The best labeling; a label's probability is the share of the labelings that agree, by their odds.
+    """The best labeling, and the confidence of each of its labels.
 
-    Where all agree, it is the network's own. Points that are no hand in any labeling are labeled as the
+    That is the geometric mean of the network's own and the share of the labelings that agree, by their odds;
+    the network's own where all agree. Points that are no hand in any labeling are labeled as the
     network has it.
     """
     scores = np.array([one.score for one in candidates])
@@ -156,4 +157,4 @@ def _elected(
     agree = np.array([one.labels == labels for one in candidates])
     share = (odds / odds.sum()) @ agree
     own = probabilities[np.arange(len(labels)), labels]
-    return labels, np.where(agree.all(axis=0), own, share)
+    return labels, np.where(agree.all(axis=0), own, np.sqrt(own * share))
