@@ -100,9 +100,9 @@ def _verify(
     def scored(cost: float, labels: NDArray[np.int64], without: tuple[tuple[int, int], ...]) -> _Candidate:
         known = labels >= 0
         density = prior.log_density(points[known], labels[known], mirrored=mirrored)
-        ghosts = _GHOST * np.count_nonzero(~known)
-        score = _WEIGHT * (density + ghosts) - cost
-        return _Candidate(score, density / max(1, 3 * np.count_nonzero(known)), labels, without)
+        count = int(known.sum())
+        score = _WEIGHT * (density + _GHOST * (len(labels) - count)) - cost
+        return _Candidate(score, density / max(1, 3 * count), labels, without)
 
     found = {labels.tobytes(): scored(cost, labels, ())}
     front = list(found.values())
