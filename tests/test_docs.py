@@ -122,7 +122,8 @@ def test_every_module_that_a_page_names_exists():
     missing = []
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]:
         for name in re.findall(
-            r"`((?:handsim|poses|gloves|render|train|track)(?:\.(?!(?:py|json|jpg)\b)\w+)+)", path.read_text()
+            r"`((?:handsim|poses|gloves|render|train|track)(?:\.(?!(?:py|json|jpg|npz)\b)\w+)+)",
+            path.read_text(),
         ):
             if name not in GROUPS and not _exists(name):
                 missing.append(f"{path.name}: {name}")
