@@ -32,7 +32,7 @@ from real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 
 from gloves.layout import load_layout
 from track.calibration.hand_size import fit_size, sample_frames
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
 from train.hands.frame_hands import HandFinder
 from train.hands.labeling import label_hands

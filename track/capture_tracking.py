@@ -21,7 +21,7 @@ from gloves.optics.identities import number_runs
 from gloves.takes.tracked_take import STATUSES, TrackedTake, usual_rate
 from handsim.errors import CaptureError
 from handsim.hand.topology import NUM_QPOS
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler

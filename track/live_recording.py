@@ -28,7 +28,7 @@ from gloves.takes.tracked_take import (
 )
 from handsim.errors import CaptureError
 from track.capture_tracking import frame_values
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 

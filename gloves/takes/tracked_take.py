@@ -129,8 +129,7 @@ class TrackedTake:
     @property
     def label_names(self) -> tuple[str, ...]:
         """Name of each label: `right:ThumbTip`, `pen:Pen1`."""
-        hands = [f"{hand.side}:{name}" for hand in self.hands for name in hand.layout.names]
-        return (*hands, *(f"{body.name}:{name}" for body in self.bodies for name in body.marker_names))
+        return label_names(self.hands, self.bodies)
 
     def hand(self, side: Side) -> int:
         """The index of a hand among the hands.
@@ -180,6 +179,12 @@ class TrackedTake:
         arrays |= {KEYPOINTS: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)
         write_archive(path, KIND, SCHEMA, header, arrays)
+
+
+def label_names(hands: Sequence[GloveFit], bodies: Sequence[MarkedBody]) -> tuple[str, ...]:
+    """Name of each label of these hands and bodies: `right:ThumbTip`, `pen:Pen1`."""
+    worn = [f"{hand.side}:{name}" for hand in hands for name in hand.layout.names]
+    return (*worn, *(f"{body.name}:{name}" for body in bodies for name in body.marker_names))
 
 
 def take_header(

@@ -12,7 +12,7 @@ from gloves.captures.plausibility import check_unit
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate, template_fault
 from track.calibration.frames import CalibrationError
 from track.capture_tracking import capture_frames
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

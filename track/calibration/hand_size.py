@@ -19,7 +19,7 @@ from handsim.hand.shape import SIZES, shape_from_measures
 from handsim.hand.topology import Side
 from track.calibration.hand_proportions import fit_proportions
 from track.kinematics.pose_solver import PoseSolver
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler

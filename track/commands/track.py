@@ -32,7 +32,7 @@ from track.capture_tracking import capture_frames, track_capture, warm_up
 from track.commands.live import TrackedSource, track_live
 from track.commands.user_options import USUAL_SIZE, Size, measured_users, users_of
 from track.evaluation.take_summary import summarize, suspicions
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler

@@ -11,7 +11,7 @@ from gloves.layout import load_layout
 from handsim.errors import ArgumentError, choices
 from handsim.hand.topology import Side
 from track.calibration.hand_size import fit_size
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.user import load_user
 from train.labelers.protocol import Labeler
 

@@ -17,7 +17,7 @@ from handsim.hand.shape import SIZES
 from handsim.hand.topology import NUM_QPOS
 from track.baselines.plain_hand import MOST_RMS
 from track.calibration.hand_size import fit_size, sample_frames
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from train.labelers.protocol import Labeler
 

@@ -31,7 +31,8 @@ _GAP_WAIT: Final = 0.1  # [s], the most of it
 _SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
 _MOST_CHANGE: Final = 2.0  # factor by which an interval differs from the usual one, at most, as it counts
 _MOST_DOUBTFUL: Final = 4  # frames that are held at once
-_LATEST: Final = 1e11  # [s]: beyond it a clock of doubles does not move on by a frame
+LATEST: Final = 1e11
+"""A time [s] beyond which a clock of doubles does not move on by a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,14 +79,14 @@ class FrameOrder:
             frame: The frame.
             at: Monotonic time [s].
         """
-        if abs(frame.time) < _LATEST:
+        if abs(frame.time) < LATEST:
             yield from self._add(Arrival(frame, at))
         else:
             self.wild += 1
 
     def expire(self, now: float) -> Iterator[Arrival]:
         """The held frame, if its time is up: nothing came that it could wait for."""
-        if not self.deadline <= min(now, _LATEST):
+        if not self.deadline <= min(now, LATEST):
             return
         if self._after_gap is not None:
             yield self._pass_after_gap(self._after_gap)

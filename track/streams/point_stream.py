@@ -10,9 +10,8 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -20,37 +19,15 @@ import numpy as np
 from handsim.errors import CaptureError
 from track.streams import natnet
 from track.streams.frame_order import Arrival, FrameOrder
+from track.streams.frame_source import SILENCE, StreamedFrame
 from track.streams.natnet import COMMAND_PORT, DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-
-SILENCE: Final = 2.0
-"""Time without a frame [s] after which a stream yields a silent frame."""
 _PATIENCE: Final = 3.0  # [s] to wait for a server
 _RETRY: Final = 0.5  # [s] between requests to a server that does not answer
 _KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
 _DRAIN: Final = 1.0  # [s] for which packets that have arrived are read at the end, at most
 _STOP: Final = 0.2  # [s] between two looks at whether the stream shall end
 _BUFFER: Final = 1 << 20  # bytes of frames that may wait for the reader
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StreamedFrame:
-    """The points of one frame."""
-
-    number: int
-    """The server's number of the frame."""
-    time: float
-    """The server's time [s]."""
-    points: Float[np.ndarray, "N 3"]
-    """[m], in the server's axes."""
-    ids: Int[np.ndarray, "N"]
-    """The server's ID of each point, -1 where it gives none."""
-    silent: bool = False
-    """No frame arrived for a while: there are no points, and number and time are those of the last frame."""
-    restarted: bool = False
-    """The server's time began anew: it does not continue that of the frame before."""
 
 
 def open_stream(
@@ -123,6 +100,19 @@ class PointStream(Iterator[StreamedFrame]):
     def late(self) -> int:
         """Number of frames that came twice or after newer ones, which were left out."""
         return self.order.late
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What became of the frames so far, as a take records it."""
+        order = self.order
+        return {
+            "missing_frames": order.missed,
+            "late_frames": order.late,
+            "frames_with_wild_times": order.wild,
+            "restarts": order.restarts,
+            "damaged_packets": self.damaged,
+            "foreign_packets": self.foreign,
+        }
 
     def __next__(self) -> StreamedFrame:
         """Wait for the next frame; after each period of silence a silent frame."""

@@ -11,7 +11,7 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
 from poses.motion.motions import sample_motion
 from track.calibration.hand_size import fit_size, sample_frames, usual_breadth
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from train.labelers.storage import load_labeler
 
 RATE = 120.0

@@ -1,0 +1,115 @@
+"""Messages as documents: JSON, or the same objects as MessagePack. docs/live_output.md describes them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from handsim import __version__
+from handsim.errors import ArgumentError
+from track.sinks.message import SCHEMA, LiveBody, LiveHand, LiveHeader, LiveMessage
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+Encode = Callable[[dict[str, Any]], bytes]
+FORMATS: Final = ("json", "msgpack")
+_DECIMALS: Final = 6  # micrometers and microradians
+
+
+def header_document(header: LiveHeader) -> dict[str, Any]:
+    """The header: names and units of everything that the frames hold."""
+    return {
+        "type": "header",
+        "schema": SCHEMA,
+        "source": f"handsim {__version__}",
+        "units": {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"},
+        "sides": list(header.sides),
+        "angles": list(header.angles),
+        "positions": list(header.positions),
+        "bodies": list(header.bodies),
+        "markers": list(header.markers),
+    }
+
+
+def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, Any]:
+    """A frame: what is NaN in the message is null here.
+
+    Args:
+        message: The message.
+        points: Whether all points and their labels are in it.
+    """
+    document = {
+        "type": "frame",
+        "schema": SCHEMA,
+        "number": int(message.number),
+        "time": float(message.time),
+        "silent": message.silent,
+        "hands": [_hand(hand) for hand in message.hands],
+        "bodies": [_body(body) for body in message.bodies],
+    }
+    if points:
+        document["points"] = np.round(message.points, _DECIMALS).tolist()
+        document["labels"] = message.labels.tolist()
+    return document
+
+
+def encoder_of(name: str) -> Encode:
+    """The function that makes bytes of a document.
+
+    Args:
+        name: One of `FORMATS`.
+
+    Raises:
+        ArgumentError: The format needs a package that is not installed.
+    """
+    if name == "json":
+        return _encode_json
+    packer: Callable[[], Any] = import_extra("msgpack", f"format={name}").Packer
+    pack: Encode = packer().pack
+    return pack
+
+
+def import_extra(module: str, what: str) -> Any:
+    """A module of the optional packages for live output.
+
+    Raises:
+        ArgumentError: It is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library
+        raise ArgumentError(
+            f"{what} needs the package {module} ({' '.join(str(error).split())}); run `pip install 'handsim[send]'`"
+        ) from error
+
+
+def _encode_json(document: dict[str, Any]) -> bytes:
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _hand(hand: LiveHand) -> dict[str, Any]:
+    there = hand.has_pose
+    return {
+        "side": hand.side,
+        "status": hand.status.value,
+        "wrist": _pose(hand.position, hand.quaternion) if there else None,
+        "angles": np.round(hand.angles, _DECIMALS).tolist() if there else None,
+        "positions": np.round(hand.positions, _DECIMALS).tolist() if there else None,
+    }
+
+
+def _body(body: LiveBody) -> dict[str, Any]:
+    pose = _pose(body.position, body.quaternion) if body.has_pose else None
+    return {"name": body.name, "status": body.status.value, "pose": pose}
+
+
+def _pose(position: Float[np.ndarray, "3"], quaternion: Float[np.ndarray, "4"]) -> dict[str, list[float]]:
+    return {
+        "position": np.round(position, _DECIMALS).tolist(),
+        "quaternion": np.round(quaternion, _DECIMALS).tolist(),
+    }
