@@ -31,7 +31,6 @@ from gloves.takes.growing import GrownArchive
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import load_tracked_take
 from track.capture_tracking import track_stream
-from track.commands.live import stream_counts
 from track.evaluation.take_evaluation import true_users
 from track.live_recording import LiveRecorder
 from track.streams import natnet
@@ -205,14 +204,14 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
             seconds, size = time.perf_counter() - start, recorder.part.stat().st_size
             print(f"{frames} frames in {seconds:.0f} s, {frames / RATE / seconds:.1f} times their own pace")
             print(f"lost on the way: {server.lost}; arrived undamaged: {server.good.sum()}")
-            print(f"recorded: {recorder.num_frames}; {stream_counts(stream)}")
+            print(f"recorded: {recorder.num_frames}; {stream.counts}")
             print(f"frames lost beyond those dropped: {(server.good & ~there).sum()}")
             recorded = recorder.num_frames
             before = [resident for told, resident in memory if told <= WARM] or [memory[0][1]]
             print(f"memory growth after {WARM:.0f} s: {(memory[-1][1] - before[-1]) / 1e6:+.1f} MB")
             print(f"on disk while recording: {size / recorded / 1e3:.2f} kB a frame")
             at = time.perf_counter()
-            recorder.finish(stream_counts(stream))
+            recorder.finish(stream.counts)
     print(f"written as .npz in {time.perf_counter() - at:.0f} s; {_resident() / 1e6:.0f} MB resident")
     if recorded < 200_000:
         loaded = load_tracked_take(out)

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import parse_qsl
 
 from handsim.errors import ArgumentError, HandSimError, choices
 
@@ -42,6 +43,34 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
     Raises:
         ArgumentError: There is nothing of that name, or its module cannot be imported.
     """
+    found = _find(name, group, noun)
+    try:
+        return found() if inspect.isclass(found) else found
+    except Exception as error:
+        raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_told(error)}") from error
+
+
+def make_plugin(address: str, *, group: str, noun: str) -> Any:
+    """What a name stands for, called anew with the options that follow it, which are strings.
+
+    Args:
+        address: `module:name` or the name of an entry point, of a class or a function; perhaps followed by
+            `?option=value&option=value`.
+        group: The group of entry points, such as `handsim.sinks`.
+        noun: What it is, for messages.
+
+    Raises:
+        ArgumentError: There is nothing of that name, its module cannot be imported, or it does not take the
+            options.
+        HandSimError: It raised an error; the sentence has its line.
+    """
+    name, _, options = address.partition("?")
+    given = dict(parse_qsl(options, keep_blank_values=True))
+    return call_plugin(_find(name, group, noun), name, noun, **given)
+
+
+def _find(name: str, group: str, noun: str) -> Any:
+    """What a name stands for, see `load_plugin`."""
     target = name
     if not is_plugin(name):
         points = {point.name: point.value for point in metadata.entry_points(group=group)}
@@ -59,13 +88,13 @@ def load_plugin(name: str, *, group: str, noun: str) -> Any:
         found: Any = importlib.import_module(module)
         for part in attribute.split("."):
             found = getattr(found, part)
-        return found() if inspect.isclass(found) else found
     except ModuleNotFoundError as error:
         raise ArgumentError(f"{noun} '{name}': {error}; it is looked for in {here} too") from error
     except AttributeError as error:
         raise ArgumentError(f"{noun} '{name}': {error}") from error
     except Exception as error:
         raise ArgumentError(f"{noun} '{name}' cannot be loaded: {_told(error)}") from error
+    return found
 
 
 def call_plugin(function: Callable[..., Any], name: str, noun: str, /, *args: Any, **options: Any) -> Any:

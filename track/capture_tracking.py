@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Progress = Callable[[int, int], None]
+    Taken = Callable[[StreamedFrame, TrackedFrame], None]
 
 _LOOP_GAP: Final = 0.01
 """Time between the last frame of a recording and its first, when it starts again [s]."""
@@ -40,13 +41,16 @@ _MISSING: Final = {"points": np.nan, "ids": -1, "labels": -1, "confidence": np.n
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
-def track_capture(capture: Capture, tracker: Tracker, *, progress: Progress | None = None) -> TrackedTake:
+def track_capture(
+    capture: Capture, tracker: Tracker, *, progress: Progress | None = None, taken: Taken | None = None
+) -> TrackedTake:
     """Track a capture.
 
     Args:
         capture: Positions (T, N, 3) [m]; marker names are not used.
         tracker: A tracker that has not seen a frame.
         progress: Called after each frame with the number of tracked frames and of all frames.
+        taken: Called with each frame, its time in [s], and what the tracker made of it.
 
     Returns:
         Poses (T, H, 27) [m, rad], labels (T, N) and status of every frame.
@@ -60,6 +64,8 @@ def track_capture(capture: Capture, tracker: Tracker, *, progress: Progress | No
     check_place(capture, tracker.config.intake.farthest)
     recorder = TakeRecorder(tracker)
     for frame, tracked in track_stream(frames, tracker):
+        if taken is not None:
+            taken(frame, tracked)
         recorder.add(frame, tracked)
         if progress is not None:
             progress(recorder.num_frames, len(frames))

@@ -12,6 +12,5 @@
 - interrupts: signals to end, as a flag that a loop reads or as an exception
 - workers: numbered jobs in worker processes, which end with their parent
 - system_packages: names of system packages that pip cannot install
-- user_code: classes and functions of a user's own modules, named on the command line
 - page: one HTML page of pictures and figures
 """

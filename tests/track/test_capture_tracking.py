@@ -25,8 +25,8 @@ from handsim.space.transforms import quaternion_matrix
 from track.bodies.rigid_body import RigidTemplate
 from track.capture_tracking import TakeRecorder, capture_frames, track_capture, track_stream
 from track.config import TrackerConfig
-from track.streams.natnet_server import ReplayServer
 from track.streams.frame_source import StreamedFrame
+from track.streams.natnet_server import ReplayServer
 from track.streams.point_stream import open_stream
 from track.tracked_frame import Status
 from track.tracker import Tracker

@@ -7,7 +7,7 @@ import warnings
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from time import perf_counter
+from time import monotonic, perf_counter, sleep
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
@@ -32,6 +32,8 @@ from track.capture_tracking import capture_frames, track_capture, warm_up
 from track.commands.live import TrackedSource, track_live
 from track.commands.user_options import USUAL_SIZE, Size, measured_users, users_of
 from track.evaluation.take_summary import summarize, suspicions
+from track.sinks.addresses import open_sinks
+from track.sinks.sink_group import SinkGroup
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
@@ -52,6 +54,7 @@ def track(
     out: Path,
     live: str | None = None,
     seconds: float | None = None,
+    send: tuple[str, ...] = (),
     glove: str = "dense19",
     size: Size | None = None,
     shape: Path | None = None,
@@ -66,9 +69,13 @@ def track(
         capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not
             used.
         out: The tracked take, a .npz file.
-        live: Address of a NatNet server instead of a capture: natnet://host or natnet://host:port. Ctrl-C
-            or the end of the terminal ends it. Frames are written as they come, to OUT.part until then.
+        live: A stream instead of a capture: natnet://host or natnet://host:port (OptiTrack), qtm://host
+            (Qualisys), or module:name, a frame source of your own. Ctrl-C or the end of the terminal ends it.
+            Frames are written as they come, to OUT.part until then.
         seconds: How long to record a live stream [s].
+        send: Where hands are sent as they are tracked, one or several of osc://host:port, udp://host:port,
+            ws://host:port, which is a server, lsl:NAME, and module:name, a sink of your own. Without a host
+            it is this machine. A capture is then played at its own rate.
         glove: Marker layout: a shipped name or the path of a .toml file; its labeler is used.
         size: Size of the hands; auto, which is the default, measures it in the capture or in the first second
             of a stream.
@@ -93,14 +100,15 @@ def track(
         user=size or "auto" if shape is None else shape.name,
         labeler=labeler or glove,
     )
-    with Console(stderr=True).status("getting ready"):
-        warm_up(user, start.labeler)
     measures = shape is None and size in (None, "auto")
-    if source is None:
-        fewest = SHOWN * user[0].layout.num_markers if measures else None
-        tracked = track_live(str(live), seconds, start, out, fewest_points=fewest)
-    else:
-        tracked = _track_file(source, start, out, measures=measures)
+    with open_sinks(send) as sinks:
+        with Console(stderr=True).status("getting ready"):
+            warm_up(user, start.labeler)
+        if source is None:
+            fewest = SHOWN * user[0].layout.num_markers if measures else None
+            tracked = track_live(str(live), seconds, start, out, fewest_points=fewest, sinks=sinks)
+        else:
+            tracked = _track_file(source, start, out, sinks, measures=measures)
     if labeled is not None:
         write_capture(labeled, labeled_points(tracked.take if tracked.whole else load_tracked_take(out)))
     rate, frames = tracked.take.rate, tracked.num_frames
@@ -206,16 +214,26 @@ def _check_options(
         check_suffix(labeled, WRITABLE)
 
 
-def _track_file(source: Capture, start: TrackerStart, out: Path, *, measures: bool) -> TrackedSource:
-    """Track a capture and write the take."""
+def _track_file(
+    source: Capture, start: TrackerStart, out: Path, sinks: SinkGroup, *, measures: bool
+) -> TrackedSource:
+    """Track a capture and write the take; where it is sent on, at the capture's own rate."""
     with Console(stderr=True).status("measuring the hands"):
         tracker = start(sample_frames(list(capture_frames(source))) if measures else ())
+    sinks.start(tracker.hands, tracker.bodies)
+    began = monotonic()
+
+    def send(frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        sleep(max(0.0, began + frame.time - monotonic()))
+        sinks.send(frame, tracked)
+
     with progress_bar("frames") as (bar, task):
         take = track_capture(
             source,
             tracker,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
+            taken=send if sinks else None,
         )
     take = dataclasses.replace(take, settings={**take.settings, **start.settings})
     take.save(out)
-    return TrackedSource(take, take.num_frames)
+    return TrackedSource(take, take.num_frames, sinks.notes())

@@ -20,7 +20,7 @@ from track.capture_tracking import track_stream, warm_up
 from track.commands.live import first_frames
 from track.commands.track import SHOWN, TrackerStart
 from track.commands.user_options import USUAL_SIZE, Size, users_of
-from track.streams.point_stream import open_stream
+from track.streams.addresses import open_source
 from track.viewer.contents import open_content
 from track.viewer.live_view import LiveView
 from track.viewer.server import LOOPBACK, address_of, opened_server
@@ -51,7 +51,7 @@ def view(
         port: Port to serve the page at; the first free one from 8080 on when not given.
         out: File for a layout that was changed; a new name beside the layout when not given.
         rig: Cameras to show with a capture, a take or a stream: a shipped name or the path of a .toml file.
-        live: Address of a NatNet server to track instead of a file: natnet://host or natnet://host:port.
+        live: Stream to track instead of a file: natnet://host, qtm://host or module:name.
         glove: Marker layout of a live tracker.
         size: Size of a live tracker's hands, measured in the first second when not given; or of the hand that
             wears a layout, M when not given.
@@ -91,7 +91,7 @@ def _view_live(
     with (
         interrupt_flag() as ended,
         opened_server(host, port, "handsim view") as server,
-        closing(open_stream(url, ended=ended)) as stream,
+        closing(open_source(url, ended=ended)) as stream,
     ):
         print_line(f"{url}: {address_of(server)} ; Ctrl-C ends it")
         with LiveStatus() as status:

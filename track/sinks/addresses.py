@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, Final
 
-from handsim.app.user_code import call_user_code, names_user_code
+from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError
 from track.network_address import split_address
 from track.sinks.datagrams import document_sink, osc_sink
@@ -24,6 +24,8 @@ VALID: Final = (
     "module:name",
 )
 """What an address may be."""
+GROUP: Final = "handsim.sinks"
+"""Entry points of packages that bring sinks."""
 _DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}
 
 
@@ -54,14 +56,15 @@ def open_sink(address: str) -> LiveSink:
     Raises:
         ArgumentError: The address is invalid, a package is missing, or a port is taken.
     """
-    scheme, separator, name = address.partition(":")
-    if scheme in _NETWORK and name.startswith("//"):
+    scheme, _, rest = address.partition(":")
+    if scheme in _NETWORK and rest.startswith("//"):
         return _NETWORK[scheme](address)
-    if scheme == "lsl" and name and not name.startswith("//"):
-        return LabStreamingSink(name)
-    if not separator or name.startswith("//") or not names_user_code(address):
+    if scheme == "lsl" and rest and not rest.startswith("//"):
+        return LabStreamingSink(rest)
+    name = address.partition("?")[0]
+    if not (is_plugin(name) or name in list_plugins(GROUP)):
         raise ArgumentError(f"'{address}' is not an address to send to, expected {', '.join(VALID)}")
-    sink: Any = call_user_code(address)
+    sink: Any = make_plugin(address, group=GROUP, noun="sink")
     for method in ("send", "close"):
         if not callable(getattr(sink, method, None)):
             raise ArgumentError(

@@ -36,12 +36,12 @@ class DatagramSink:
         frame: Callable[[LiveMessage], bytes],
     ) -> None:
         try:
-            family, kind, _, _, self._address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
             self._socket = socket.socket(family, kind)
         except OSError as error:
             raise ArgumentError(f"host '{host}' cannot be sent to ({error.strerror or error})") from error
         self._socket.setblocking(False)
-        self._header, self._frame = header, frame
+        self._address, self._header, self._frame = address, header, frame
         self._due = 0.0
         self.dropped = 0
         """Number of datagrams that were not sent."""

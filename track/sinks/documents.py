@@ -84,7 +84,8 @@ def import_extra(module: str, what: str) -> Any:
         return importlib.import_module(module)
     except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library
         raise ArgumentError(
-            f"{what} needs the package {module} ({' '.join(str(error).split())}); run `pip install 'handsim[send]'`"
+            f"{what} needs the package {module.partition('.')[0]}, which cannot be imported "
+            f"({' '.join(str(error).split())}); run `pip install 'handsim[send]'`"
         ) from error
 
 

@@ -28,6 +28,10 @@ class SinkGroup:
         self._encoder: MessageEncoder | None = None
         self._sent = 0
 
+    def __bool__(self) -> bool:
+        """Whether there are any."""
+        return bool(self._sinks)
+
     def start(self, hands: Sequence[GloveFit], bodies: Sequence[RigidTemplate]) -> None:
         """Take on a tracker's hands and bodies."""
         self._encoder = MessageEncoder(hands, bodies)

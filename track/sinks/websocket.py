@@ -192,8 +192,8 @@ def _listen(host: str, port: int) -> socket.socket:
         one = socket.create_server(address[:2], family=family)
     except OSError as error:
         raise ArgumentError(
-            f"port {port} of {host} cannot be listened at ({error.strerror or error}), expected a free port of "
-            "this machine"
+            f"port {port} of {host} cannot be listened at ({error.strerror or error}), expected a free port "
+            "of this machine"
         ) from error
     one.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)  # of its connections too
     return one

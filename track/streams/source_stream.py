@@ -48,7 +48,7 @@ class SourceStream(Iterator[StreamedFrame]):
         for method in ("__iter__", "close"):
             if not callable(getattr(source, method, None)):
                 raise ArgumentError(
-                    f"{name} has no method {method}, expected the methods __iter__ and close of a frame source"
+                    f"{name} has no method {method}, expected __iter__ and close of a frame source"
                 )
         self._source, self._name, self._silence, self._ended = source, name, silence, ended
         self._missed = 0

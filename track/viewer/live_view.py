@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.hand.topology import NUM_QPOS
-from track.streams.point_stream import StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from track.viewer.recordings.recording import Recording, ShownFrame

@@ -29,8 +29,8 @@ from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from track.bodies.body_file import load_body
 from track.evaluation.hand_errors import hand_errors
+from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
-from track.streams.point_stream import open_stream
 from track.user import load_user
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
@@ -262,7 +262,7 @@ def test_a_kill_leaves_all_but_the_last_second(capture, tmp_path):
 
 
 def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("track.commands.live.open_stream", functools.partial(open_stream, silence=0.2))
+    monkeypatch.setattr("track.commands.live.open_source", functools.partial(open_source, silence=0.2))
     take = load_take(capture.with_suffix(".truth.npz"))
     with ReplayServer(take.points[:1], take.ids[:1], 120.0) as server:
         arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]
