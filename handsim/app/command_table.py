@@ -28,6 +28,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "simulate": ("train.commands.simulate:simulate", "Simulate a capture of hands, with its truth."),
     "calibrate": ("track.commands.calibrate:calibrate", "Fit hands and gloves to a user, from a capture."),
     "track": ("track.commands.track:track", "Follow hands through a marker capture or a live stream."),
+    "replay": ("track.commands.replay:replay", "Play a capture as a NatNet server, to try a live set-up."),
     "view": ("track.commands.view:view", "Show a file or a live tracker in the browser."),
     "body": ("track.commands.body:body", "Write a rigid body's markers as a file, to track it with."),
     "render": ("render.commands.render:render", "Draw the hands of a take, with the truth of each picture."),

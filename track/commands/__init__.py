@@ -7,6 +7,7 @@
 `calibrate`: `handsim calibrate`, the user's hands and gloves from a capture.
 `track`: `handsim track`, a tracked take from a capture or a live stream.
 `live`: its live part.
+`replay`: `handsim replay`, a NatNet server that plays a capture.
 `view`: `handsim view`, files and live trackers in the browser.
 `reproduce`: `handsim reproduce`, the paper's tables.
 `demo`: the step of `handsim demo` that tracks.

@@ -117,32 +117,49 @@ class WebSocketSink:
         server.close()
         await server.wait_closed()
 
+    async def _flush(self) -> None:
+        """Let clients take what waits; those that do not are cut off: a farewell would wait for them too."""
+        waiting = {asyncio.ensure_future(client.emptied()): client for client in self._clients}
+        if waiting:
+            _, late = await asyncio.wait(waiting, timeout=_FLUSH)
+            for one in late:
+                one.cancel()
+                waiting[one].connection.transport.abort()
+
     async def _talk(self, connection: ServerConnection) -> None:
         """Send a client everything until it leaves."""
-        client = _Client()
+        client = _Client(connection)
         self._clients.add(client)
-        listening = asyncio.ensure_future(_ignore(connection, self._closed_error))
-        greeted = False
+        sending = asyncio.ensure_future(self._deliver(client))
         try:
             while True:
-                frame = await client.next()
-                if not greeted and self._header is not None:
-                    await connection.send(self._header, text=self._text)
-                    greeted = True
-                await connection.send(frame, text=self._text)
-                client.sent()
+                await connection.recv()  # and ignore it: so pongs and the leave are noticed
         except self._closed_error:
             pass
         finally:
             self._clients.discard(client)
             client.leave()
-            listening.cancel()
+            sending.cancel()
+
+    async def _deliver(self, client: _Client) -> None:
+        """Send a client the header, and each frame when the one before is on its way."""
+        connection = client.connection
+        try:
+            frame = await client.next()
+            await connection.send(self._header or b"", text=self._text)
+            while True:
+                await connection.send(frame, text=self._text)
+                client.sent()
+                frame = await client.next()
+        except self._closed_error:
+            pass
 
 
 class _Client:
     """The frames that wait for a client; the oldest is dropped for a new one."""
 
-    def __init__(self) -> None:
+    def __init__(self, connection: ServerConnection) -> None:
+        self.connection = connection
         self._frames: deque[bytes] = deque(maxlen=_WAITING)
         self._came, self._empty = asyncio.Event(), asyncio.Event()
         self._empty.set()
@@ -175,15 +192,6 @@ class _Client:
     async def emptied(self) -> None:
         """Wait until nothing waits."""
         await self._empty.wait()
-
-
-async def _ignore(connection: ServerConnection, closed: type[Exception]) -> None:
-    """Read what a client says, so that its pongs and its leave are noticed."""
-    try:
-        while True:
-            await connection.recv()
-    except closed:
-        pass
 
 
 def _listen(host: str, port: int) -> socket.socket:

@@ -1,4 +1,4 @@
-"""A NatNet server that replays a capture or a take on this machine, to try a live set-up without cameras."""
+"""A NatNet server that replays a capture or a take, to try a live set-up without cameras."""
 
 from __future__ import annotations
 
@@ -26,23 +26,27 @@ VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
 _MOST_POINTS: Final = 1500  # in a datagram
 _MOST_CLIENTS: Final = 8
 _CLIENT_TIMEOUT: Final = 10.0  # [s] without a packet from a client
+_NUMBERS: Final = 1 << 31  # of frames and of IDs in a packet
 
 
 class ReplayServer:
     """Streams frames at their rate over NatNet, while there is a client.
 
-    It listens on this machine only. The end of a `with` block or `close` ends it.
+    Without a client it waits. The end of a `with` block or `close` ends it.
 
     Args:
         points: Points of all frames [m]; NaN where there is no point.
         ids: ID of each point, -1 where it has none.
         rate: Frames per second [Hz].
         version: NatNet version of the packets.
+        host: Address to listen at; only this machine reaches the default.
         port: UDP port to listen at; a free one when not given.
+        loop: Whether the first frame follows the last one, with later number and time, and as new points: no
+            ID goes on.
 
     Raises:
-        CaptureError: The arrays do not fit together, there are too many points, the version is unknown, or
-            the port is taken.
+        CaptureError: The arrays do not fit together, there are no frames or too many points, the version is
+            unknown, or the port is taken.
     """
 
     def __init__(
@@ -52,27 +56,29 @@ class ReplayServer:
         rate: float,
         *,
         version: Version = natnet.NEWEST,
+        host: str = LOOPBACK,
         port: int = 0,
+        loop: bool = False,
     ) -> None:
         if points.ndim != 3 or points.shape != (*ids.shape, 3):
             raise CaptureError(
                 f"points have shape {points.shape} and IDs {ids.shape}, expected (T, N, 3) and (T, N)"
             )
-        if ids.shape[1] > _MOST_POINTS:
-            raise CaptureError(f"{ids.shape[1]} points per frame, expected at most {_MOST_POINTS}")
+        most = int(np.isfinite(points[..., 0]).sum(axis=1).max(initial=0))
+        if most > _MOST_POINTS:
+            raise CaptureError(f"{most} points in a frame, expected at most {_MOST_POINTS}")
+        if not len(points):
+            raise CaptureError("there are no frames to replay")
         if version not in VERSIONS:
             known = [f"{major}.{minor}" for major, minor in VERSIONS]
             raise CaptureError(choices(".".join(map(str, version)), known, noun="NatNet version"))
         if not 0.0 < rate < np.inf:
             raise CaptureError(f"the rate is {rate:g} Hz, expected a positive number")
-        self._points, self._ids, self._rate, self._version = points, ids, rate, version
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.bind((LOOPBACK, port))
-        except (OSError, OverflowError) as error:
-            self._socket.close()
-            raise CaptureError(f"port {port} cannot be listened at ({error})") from error
-        self._socket.setblocking(False)
+        self._points, self._ids, self._version, self._loop = points, ids, version, loop
+        self.rate = rate
+        """Frames per second [Hz]."""
+        self._ids_of_round = int(ids.max(initial=-1)) + 1
+        self._host, self._socket = host, _listen(host, port)
         self._port: int = self._socket.getsockname()[1]
         self._clients: dict[tuple[str, int], float] = {}  # and the time of their last packets
         self.sent = 0
@@ -82,20 +88,67 @@ class ReplayServer:
         self._thread.start()
 
     @classmethod
-    def of_capture(cls, capture: Capture, *, version: Version = natnet.NEWEST, port: int = 0) -> ReplayServer:
-        """Replay a marker file; names are not sent, an ID lasts until its marker is lost."""
+    def of_capture(
+        cls,
+        capture: Capture,
+        *,
+        rate: float | None = None,
+        version: Version = natnet.NEWEST,
+        host: str = LOOPBACK,
+        port: int = 0,
+        loop: bool = False,
+    ) -> ReplayServer:
+        """Replay a marker file; names are not sent, an ID lasts until its marker is lost.
+
+        Args:
+            capture: Positions (T, N, 3) [m].
+            rate: Frames per second [Hz]; the capture's own when not given.
+            version: NatNet version of the packets.
+            host: Address to listen at.
+            port: UDP port to listen at.
+            loop: Whether it starts again at its end.
+
+        Raises:
+            CaptureError: As for the class.
+        """
         ids = number_runs(np.isfinite(capture.positions[..., 0]))
-        return cls(capture.positions, ids, capture.rate, version=version, port=port)
+        rate = capture.rate if rate is None else rate
+        return cls(capture.positions, ids, rate, version=version, host=host, port=port, loop=loop)
 
     @classmethod
-    def of_take(cls, take: Take, *, version: Version = natnet.NEWEST, port: int = 0) -> ReplayServer:
-        """Replay the points of a take with their IDs; its truth is not sent."""
-        return cls(take.points, take.ids, take.rate, version=version, port=port)
+    def of_take(
+        cls,
+        take: Take,
+        *,
+        rate: float | None = None,
+        version: Version = natnet.NEWEST,
+        host: str = LOOPBACK,
+        port: int = 0,
+        loop: bool = False,
+    ) -> ReplayServer:
+        """Replay the points of a take with their IDs; its truth is not sent. See `of_capture`."""
+        rate = take.rate if rate is None else rate
+        return cls(take.points, take.ids, rate, version=version, host=host, port=port, loop=loop)
 
     @property
     def url(self) -> str:
         """Address for `open_stream`."""
-        return f"natnet://{LOOPBACK}:{self._port}"
+        return f"natnet://{self._host}:{self._port}"
+
+    @property
+    def num_clients(self) -> int:
+        """Number of clients at this moment."""
+        return len(self._clients)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames of a round."""
+        return len(self._points)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last frame was sent; never in a loop."""
+        return not self._loop and self.sent >= len(self._points)
 
     def close(self) -> None:
         """End the stream."""
@@ -116,17 +169,19 @@ class ReplayServer:
         while not self._ended.is_set():
             number = self.sent
             if not self._clients:
-                start = time.monotonic() - number / self._rate  # continue at this frame
-            due = start + number / self._rate if number < len(self._points) else np.inf
+                start = time.monotonic() - number / self.rate  # continue at this frame
+            due = np.inf if self.finished else start + number / self.rate
             self._answer(min(0.05, max(0.0, due - time.monotonic())))
             if self._clients and time.monotonic() >= due:
                 self._send_all(natnet.pack_frame(self._frame(number), self._version))
                 self.sent += 1
 
     def _frame(self, number: int) -> MarkerFrame:
-        there = np.isfinite(self._points[number]).all(axis=1)
-        points, ids = self._points[number, there], self._ids[number, there]
-        return MarkerFrame(number, number / self._rate, points, ids)
+        played, row = divmod(number, len(self._points))
+        there = np.isfinite(self._points[row]).all(axis=1)
+        ids = self._ids[row, there].astype(np.int64)
+        ids[ids >= 0] = (ids[ids >= 0] + played * self._ids_of_round) % _NUMBERS
+        return MarkerFrame(number % _NUMBERS, number / self.rate, self._points[row, there], ids)
 
     def _answer(self, seconds: float) -> None:
         """Wait for a client's packet and answer it."""
@@ -160,3 +215,17 @@ class ReplayServer:
             self._socket.sendto(packet, client)
         except OSError:
             pass  # the client is gone, or its buffer is full
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    one = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        one.bind((host, port))
+    except (OSError, OverflowError) as error:
+        one.close()
+        what = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise CaptureError(
+            f"port {port} cannot be listened at on {host} ({what}), expected a free port of this machine"
+        ) from error
+    one.setblocking(False)
+    return one

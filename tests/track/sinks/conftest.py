@@ -1,0 +1,49 @@
+"""Messages of two hands and a body, without a tracker."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from handsim.hand.topology import NUM_QPOS
+from handsim.space.objects import named_object
+from track.bodies.rigid_body import RigidTemplate
+from track.sinks.message import LiveMessage, MessageEncoder
+from track.streams.frame_source import StreamedFrame
+from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+
+
+@functools.cache
+def encoder() -> MessageEncoder:
+    hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
+    return MessageEncoder(hands, [RigidTemplate.of(named_object("mug"))])
+
+
+def tracked_hand(side, rng, *, lost: bool = False) -> TrackedHand:
+    qpos = rng.normal(0.0, 0.3, NUM_QPOS)
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    if lost:
+        qpos[:] = np.nan
+    status = Status.LOST if lost else Status.TRACKED
+    return TrackedHand(side, status, qpos, 0.001, np.zeros((19, 3)), np.zeros(0, dtype=int))
+
+
+def make_message(number: int = 0, *, lost: bool = False, seed: int = 0, points: int = 5) -> LiveMessage:
+    """Message of a frame; if `lost`, the left hand and the body are."""
+    rng = np.random.default_rng(seed)
+    hands = (tracked_hand("right", rng), tracked_hand("left", rng, lost=lost))
+    place = np.full(7, np.nan) if lost else np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
+    mug = TrackedBody("mug", Status.LOST if lost else Status.TRACKED, place[:3], place[3:], 0.001)
+    frame = StreamedFrame(number, number / 120.0, rng.normal(size=(points, 3)), np.arange(points))
+    labels = np.arange(points) - 1
+    return encoder().encode(frame, TrackedFrame(frame.time, hands, labels, np.ones(points), (mug,)))
+
+
+@pytest.fixture
+def message():
+    """Makes messages, see `make_message`."""
+    return make_message

@@ -1,0 +1,116 @@
+"""Addresses of sinks: what they open, and what is told of those that are none."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from handsim.errors import ArgumentError, HandSimError
+from track.sinks import addresses
+from track.sinks.addresses import VALID, open_sink, open_sinks
+
+SOURCE = """
+class Counter:
+    sent, closed = [], False
+    def __init__(self, step="1"):
+        self.step = int(step)
+    def send(self, message):
+        Counter.sent.append(message.number * self.step)
+    def close(self):
+        Counter.closed = True
+
+class NoSink:
+    pass
+
+class Failing(Counter):
+    def send(self, message):
+        raise ValueError("not today")
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    (tmp_path / "own_sinks.py").write_text(SOURCE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield
+    sys.modules.pop("own_sinks", None)
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["", "osc", "http://localhost:80", "wss://localhost:1", "lsl:", "lsl://name", "localhost:9000", "a b:c",
+     "ws:8765", "9module:name"],
+)  # fmt: skip
+def test_what_is_no_address_is_told_with_the_valid_ones(address):
+    with pytest.raises(ArgumentError) as caught:
+        open_sink(address)
+    assert str(caught.value) == f"'{address}' is not an address to send to, expected {', '.join(VALID)}"
+
+
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("osc://localhost", "expected osc://host:port"),
+        ("osc://localhost:0", "expected a port from 1 to 65535"),
+        ("ws://localhost:99999", "expected ws://host:port"),
+        ("udp://localhost:9000/path", "expected udp://host:port"),
+        ("udp://user@localhost:9000", "expected udp://host:port"),
+        ("udp://localhost:9000?format", "expected udp://host:port"),
+        ("ws://:1?format=xml", "unknown format 'xml'; valid names: json, msgpack"),
+        ("ws://:1?point=yes", "unknown option 'point' (did you mean 'points'?); valid names: format, points"),
+        ("osc://:1?format=json", "osc://:1?format=json: unknown option 'format', there are none"),
+    ],
+)
+def test_wrong_parts_are_told(address, words):
+    with pytest.raises(ArgumentError) as caught:
+        open_sink(address)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(("address", "package"), [("ws://:0", "websockets"), ("lsl:hands", "pylsl")])
+def test_a_missing_package_is_told(address, package, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == package]:
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ArgumentError) as caught:
+        open_sink(address)
+    assert f"needs the package {package}" in str(caught.value)
+    assert "run `pip install 'handsim[send]'`" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_sink_of_the_user_s_own(own, message):
+    with open_sinks(["own_sinks:Counter?step=3"]) as sinks:
+        import own_sinks
+
+        (sink,) = sinks._sinks.values()
+        for number in range(3):
+            sink.send(message(number))
+    assert own_sinks.Counter.sent == [0, 3, 6] and own_sinks.Counter.closed
+
+
+def test_what_is_no_sink_is_told(own):
+    with pytest.raises(ArgumentError, match="own_sinks:NoSink has no method send, expected the methods"):
+        open_sink("own_sinks:NoSink")
+    with pytest.raises(ArgumentError, match=r"does not take the arguments \(, stop=...\)|unexpected keyword"):
+        open_sink("own_sinks:Counter?stop=1")
+    with pytest.raises(HandSimError, match="ValueError: invalid literal"):
+        open_sink("own_sinks:Counter?step=x")
+    with pytest.raises(ArgumentError, match="No module named 'no_such_module'"):
+        open_sink("no_such_module:Sink")
+
+
+def test_an_address_twice_and_a_bad_one_leave_nothing_open():
+    with pytest.raises(ArgumentError, match="osc://:9000 is given twice"):
+        open_sinks(["osc://:9000", "osc://:9000"])
+    first = open_sink("ws://:0")
+    port = first.port
+    first.close()
+    with pytest.raises(ArgumentError):
+        open_sinks([f"ws://:{port}", "nonsense"])
+    open_sink(f"ws://:{port}").close()  # the port is free again
+
+
+def test_a_port_of_every_kind_of_sink_is_documented():
+    assert {one.partition(":")[0] for one in VALID} == {*addresses._NETWORK, "lsl", "module"}

@@ -1,0 +1,90 @@
+"""Datagrams over real sockets: OSC to python-osc's server, documents to a socket."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+
+import msgpack
+import pytest
+from pythonosc.dispatcher import Dispatcher
+from pythonosc.osc_server import BlockingOSCUDPServer
+
+from handsim.errors import ArgumentError
+from track.sinks import datagrams
+from track.sinks.addresses import open_sink
+
+
+@pytest.fixture
+def receiver():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        one.settimeout(2.0)
+        yield one
+
+
+def test_frames_reach_an_osc_server(message):
+    heard, dispatcher = [], Dispatcher()
+    dispatcher.set_default_handler(lambda address, *values: heard.append((address, values)))
+    with BlockingOSCUDPServer(("127.0.0.1", 0), dispatcher) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        sink = open_sink(f"osc://localhost:{server.server_address[1]}")
+        for number in range(20):
+            sink.send(message(number))
+        sink.close()
+        until = time.monotonic() + 2.0
+        while sum(address == "/handsim/frame" for address, _ in heard) < 20 and time.monotonic() < until:
+            time.sleep(0.01)
+        server.shutdown()
+    frames = [values[0] for address, values in heard if address == "/handsim/frame"]
+    assert frames == list(range(20)) and heard[0] == ("/handsim/schema", (1,))
+    assert len(next(values for address, values in heard if address == "/handsim/left/angles")) == 20
+
+
+@pytest.mark.parametrize(("query", "decode"), [("", json.loads), ("?format=msgpack", msgpack.unpackb)])
+def test_documents_reach_a_socket(query, decode, receiver, message):
+    sink = open_sink(f"udp://:{receiver.getsockname()[1]}{query}")
+    for number in range(3):
+        sink.send(message(number))
+    got = [decode(receiver.recv(65536)) for _ in range(4)]
+    assert got[0]["type"] == "header" and [one["number"] for one in got[1:]] == [0, 1, 2]
+    assert "points" not in got[1]
+    sink.close()
+
+
+def test_who_listens_later_hears_the_header_too(receiver, message, monkeypatch):
+    monkeypatch.setattr(datagrams, "_HEADERS", 0.2)
+    sink = open_sink(f"udp://127.0.0.1:{receiver.getsockname()[1]}?points=yes")
+    kinds = []
+    for number in range(8):
+        sink.send(message(number))
+        time.sleep(0.05)
+    receiver.settimeout(0.05)
+    try:
+        while True:
+            kinds.append(json.loads(receiver.recv(65536)))
+    except TimeoutError:
+        pass
+    assert 2 <= [one["type"] for one in kinds].count("header") <= 4
+    assert len(kinds[1]["points"]) == len(kinds[1]["labels"]) == 5
+    sink.close()
+
+
+def test_nobody_listening_is_no_error_and_too_much_is_counted(receiver, message):
+    port = receiver.getsockname()[1]
+    receiver.close()
+    sink = open_sink(f"udp://127.0.0.1:{port}?points=yes")
+    for number in range(5):
+        sink.send(message(number))
+    assert sink.dropped == 0
+    sink.send(message(5, points=5000))  # no datagram holds it
+    assert sink.dropped == 1
+    sink.close()
+
+
+def test_an_unknown_host_is_told():
+    with pytest.raises(ArgumentError, match=r"host 'no-such-host\.invalid' cannot be sent to"):
+        open_sink("osc://no-such-host.invalid:9000")

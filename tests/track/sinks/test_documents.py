@@ -1,0 +1,73 @@
+"""Documents: what is in a message, as JSON and as MessagePack."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from handsim.errors import ArgumentError
+from track.sinks.documents import FORMATS, encoder_of, frame_document, header_document
+
+DECODE = {"json": json.loads, "msgpack": msgpack.unpackb}
+
+
+@pytest.mark.parametrize("name", FORMATS)
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    number=st.integers(0, 2**40),
+    seed=st.integers(0, 99),
+    lost=st.booleans(),
+    points=st.integers(0, 9),
+)
+def test_a_frame_comes_back(name, message, number, seed, lost, points):
+    one = message(number, seed=seed, lost=lost, points=points)
+    document = frame_document(one, points=True)
+    there = DECODE[name](encoder_of(name)(document))
+    assert there == document
+    assert (there["type"], there["schema"], there["number"]) == ("frame", 1, number)
+    assert there["time"] == one.time and there["silent"] is False
+    for hand, sent in zip(there["hands"], one.hands, strict=True):
+        assert (hand["side"], hand["status"]) == (sent.side, sent.status.value)
+        if sent.has_pose:
+            np.testing.assert_allclose(hand["wrist"]["position"], sent.position, atol=6e-7)
+            np.testing.assert_allclose(hand["wrist"]["quaternion"], sent.quaternion, atol=6e-7)
+            np.testing.assert_allclose(hand["angles"], sent.angles, atol=6e-7)
+            np.testing.assert_allclose(hand["positions"], sent.positions, atol=6e-7)
+        else:
+            assert hand["wrist"] is hand["angles"] is hand["positions"] is None
+    assert (there["bodies"][0]["pose"] is None) == lost
+    np.testing.assert_allclose(np.reshape(there["points"], (-1, 3)), one.points, atol=6e-7)
+    assert there["labels"] == one.labels.tolist()
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_header_names_everything(name, message):
+    header = message().header
+    document = DECODE[name](encoder_of(name)(header_document(header)))
+    assert (document["type"], document["schema"]) == ("header", 1)
+    assert document["units"] == {"length": "m", "angle": "rad", "time": "s", "quaternion": "wxyz"}
+    for key in ("sides", "angles", "positions", "bodies", "markers"):
+        assert document[key] == list(getattr(header, key))
+
+
+def test_points_are_left_out_unless_asked_for(message):
+    assert not {"points", "labels"} & set(frame_document(message()))
+
+
+def test_a_frame_of_two_hands_takes_two_kilobytes(message):
+    assert len(encoder_of("msgpack")(frame_document(message()))) < 2100
+    assert len(encoder_of("json")(frame_document(message()))) < 2500
+
+
+def test_a_missing_package_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "msgpack", None)
+    with pytest.raises(
+        ArgumentError, match=r"format=msgpack needs the package msgpack.*pip install 'handsim\[send\]'"
+    ):
+        encoder_of("msgpack")

@@ -1,0 +1,71 @@
+"""The command `handsim replay`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+import tyro
+
+from gloves.captures.formats import READABLE, check_suffix, read_capture
+from gloves.takes.take import SUFFIX, load_take
+from handsim.app.interrupts import interrupt_flag
+from handsim.app.live_status import LiveStatus
+from handsim.app.messages import print_line
+from handsim.errors import ArgumentError
+from track.streams.natnet import COMMAND_PORT
+from track.streams.natnet_server import LOOPBACK, ReplayServer
+
+_LOOK: Final = 0.1  # [s] between two looks at whether it shall end
+_MOST_PORT: Final = 65535
+
+
+def replay(
+    capture: Annotated[Path, tyro.conf.Positional],
+    *,
+    loop: bool = False,
+    rate: float | None = None,
+    host: str = LOOPBACK,
+    port: int = COMMAND_PORT,
+) -> None:
+    """Play a capture as a NatNet server, for handsim track --live; Ctrl-C ends it.
+
+    It plays while a client listens, and waits without one. After the last frame it ends.
+
+    Args:
+        capture: A .trc, .c3d, .csv or .tsv file, whose names are not sent, or the .truth.npz of a simulated
+            capture, whose truth is not sent.
+        loop: Start again at the end.
+        rate: Frames per second [Hz]; the capture's own when not given.
+        host: Address of this machine to listen at; other machines do not reach the default.
+        port: Port to listen at; 0 takes a free one.
+    """
+    if rate is not None and not 0.0 < rate < np.inf:
+        raise ArgumentError(f"--rate is {rate:g}, expected a positive number")
+    if not 0 <= port <= _MOST_PORT:
+        raise ArgumentError(f"--port is {port}, expected 0 to {_MOST_PORT}")
+    with interrupt_flag() as ended, _server(capture, loop=loop, rate=rate, host=host, port=port) as server:
+        print_line(f"{capture}: {server.num_frames} frames at {server.rate:g} Hz on {server.url}")
+        with LiveStatus() as status:
+            while not (ended() or server.finished):
+                status.show(_status_line(server))
+                time.sleep(_LOOK)
+        print_line(f"{server.sent} frames played")
+
+
+def _server(path: Path, *, loop: bool, rate: float | None, host: str, port: int) -> ReplayServer:
+    if path.name.endswith(SUFFIX):
+        return ReplayServer.of_take(load_take(path), rate=rate, host=host, port=port, loop=loop)
+    check_suffix(path, (*READABLE, SUFFIX))
+    return ReplayServer.of_capture(read_capture(path), rate=rate, host=host, port=port, loop=loop)
+
+
+def _status_line(server: ReplayServer) -> str:
+    if not server.num_clients:
+        return f"waiting for a client at frame {server.sent}; Ctrl-C ends it"
+    played, frame = divmod(server.sent, server.num_frames)
+    word = "client" if server.num_clients == 1 else "clients"
+    again = f", round {played + 1}" if played else ""
+    return f"frame {frame} of {server.num_frames}{again}, {server.num_clients} {word}; Ctrl-C ends it"
