@@ -1,8 +1,9 @@
 """From unlabeled points to hand motion, online.
 
 A `Tracker` takes one frame of points at a time and gives a `TrackedFrame`; `track_capture` runs it over a
-capture and returns a `TrackedTake`. `calibrate` fits hand and glove to their user. `solve_pose` is the
-inverse kinematics alone: poses from labeled markers.
+capture and returns a `TrackedTake`, `track_stream` over a live stream from `open_source`; `open_sinks` takes
+the hands to other programs. `calibrate` fits hand and glove to their user. `solve_pose` is the inverse
+kinematics alone: poses from labeled markers.
 """
 
 from typing import TYPE_CHECKING
@@ -13,9 +14,13 @@ from handsim._lazy import lazy_exports
 if TYPE_CHECKING:
     from gloves.takes.tracked_take import TrackedTake, load_tracked_take
     from track.calibration.user_calibration import calibrate
-    from track.capture_tracking import track_capture
+    from track.capture_tracking import track_capture, track_stream
     from track.config import TrackerConfig
     from track.kinematics.pose_solver import solve_pose
+    from track.sinks.addresses import open_sinks
+    from track.sinks.message import LiveMessage
+    from track.streams.addresses import open_source
+    from track.streams.frame_source import StreamedFrame
     from track.tracked_frame import TrackedFrame
     from track.tracker import Tracker
     from track.user import load_user
@@ -23,6 +28,8 @@ if TYPE_CHECKING:
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "LiveMessage": "track.sinks.message",
+        "StreamedFrame": "track.streams.frame_source",
         "TrackedFrame": "track.tracked_frame",
         "TrackedTake": "gloves.takes.tracked_take",
         "Tracker": "track.tracker",
@@ -30,12 +37,17 @@ __getattr__, __dir__ = lazy_exports(
         "calibrate": "track.calibration.user_calibration",
         "load_tracked_take": "gloves.takes.tracked_take",
         "load_user": "track.user",
+        "open_sinks": "track.sinks.addresses",
+        "open_source": "track.streams.addresses",
         "solve_pose": "track.kinematics.pose_solver",
         "track_capture": "track.capture_tracking",
+        "track_stream": "track.capture_tracking",
     },
 )
 
 __all__ = [
+    "LiveMessage",
+    "StreamedFrame",
     "TrackedFrame",
     "TrackedTake",
     "Tracker",
@@ -44,6 +56,9 @@ __all__ = [
     "calibrate",
     "load_tracked_take",
     "load_user",
+    "open_sinks",
+    "open_source",
     "solve_pose",
     "track_capture",
+    "track_stream",
 ]

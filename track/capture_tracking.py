@@ -89,11 +89,11 @@ def track_stream(
     the stream's time begins anew, as in a recording that starts again, the tracker's time continues.
 
     Args:
-        frames: Frames in order of arrival.
+        frames: Frames in order of arrival, points in [m].
         tracker: The tracker.
 
     Yields:
-        Each frame with the tracker's time, and the tracked frame.
+        Each frame with the tracker's time [s], and the tracked frame.
     """
     ahead, last = 0.0, -np.inf
     heard = time.monotonic()

@@ -30,7 +30,7 @@ _DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}
 
 
 def open_sinks(addresses: Sequence[str]) -> SinkGroup:
-    """Open a sink for each address.
+    """Open a sink for each address, which gets positions in [m] and angles in [rad].
 
     Args:
         addresses: Each as in `VALID`; `udp://` and `ws://` take `?format=json`, `?format=msgpack` and

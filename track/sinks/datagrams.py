@@ -10,7 +10,7 @@ from typing import Final
 from handsim.errors import ArgumentError
 from track.sinks.documents import Encode, frame_document, header_document
 from track.sinks.message import LiveHeader, LiveMessage
-from track.sinks.osc_bundles import frame_bundle, header_bundle
+from track.sinks.osc_bundles import OscEncoder
 
 _HEADERS: Final = 1.0  # [s] between two headers: whoever listens later has not heard the first one
 
@@ -69,9 +69,10 @@ def osc_sink(host: str, port: int) -> DatagramSink:
     """A sink of OSC bundles.
 
     Raises:
-        ArgumentError: The host is unknown.
+        ArgumentError: The host is unknown, or the package python-osc is missing.
     """
-    return DatagramSink(host, port, header_bundle, frame_bundle)
+    encoder = OscEncoder()
+    return DatagramSink(host, port, encoder.header, encoder.frame)
 
 
 def document_sink(host: str, port: int, encode: Encode, *, points: bool) -> DatagramSink:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from handsim import __version__
-from handsim.errors import ArgumentError
+from handsim._extras import import_extra
 from track.sinks.message import SCHEMA, LiveBody, LiveHand, LiveHeader, LiveMessage
 
 if TYPE_CHECKING:
@@ -69,24 +68,9 @@ def encoder_of(name: str) -> Encode:
     """
     if name == "json":
         return _encode_json
-    packer: Callable[[], Any] = import_extra("msgpack", f"format={name}").Packer
+    packer: Callable[[], Any] = import_extra("msgpack", f"format={name}", "send").Packer
     pack: Encode = packer().pack
     return pack
-
-
-def import_extra(module: str, what: str) -> Any:
-    """A module of the optional packages for live output.
-
-    Raises:
-        ArgumentError: It is not installed.
-    """
-    try:
-        return importlib.import_module(module)
-    except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library
-        raise ArgumentError(
-            f"{what} needs the package {module.partition('.')[0]}, which cannot be imported "
-            f"({' '.join(str(error).split())}); run `pip install 'handsim[send]'`"
-        ) from error
 
 
 def _encode_json(document: dict[str, Any]) -> bytes:

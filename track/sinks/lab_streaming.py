@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from track.sinks.documents import import_extra
+from handsim._extras import import_extra
 from track.sinks.message import SCHEMA, LiveHeader, LiveMessage
 from track.tracked_frame import Status
 
@@ -36,7 +36,7 @@ class LabStreamingSink:
     """
 
     def __init__(self, name: str) -> None:
-        self._lsl: Any = import_extra("pylsl", "lsl:")
+        self._lsl: Any = import_extra("pylsl", "lsl:", "send")
         self._name = name
         self._outlet: Any = None
 

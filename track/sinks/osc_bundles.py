@@ -1,55 +1,72 @@
-"""Messages as bundles of Open Sound Control 1.0. docs/live_output.md lists the addresses."""
+"""Messages as bundles of Open Sound Control 1.0, by python-osc. docs/live_output.md lists the addresses."""
 
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Any, Final
 
 import numpy as np
 
+from handsim._extras import import_extra
 from track.sinks.message import SCHEMA, LiveHeader, LiveMessage
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
-
-_AT_ONCE: Final = 1  # the time tag of what holds when it arrives
 _RESERVED: Final = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # not allowed in a part of an address
 _MOST_NUMBER: Final = 0x7FFFFFFF
 
-
-def header_bundle(header: LiveHeader) -> bytes:
-    """The names in the order of the numbers."""
-    return _bundle(
-        [
-            _packed("/handsim/schema", "i", struct.pack(">i", SCHEMA)),
-            _strings("/handsim/sides", header.sides),
-            _strings("/handsim/angles", header.angles),
-            _strings("/handsim/positions", header.positions),
-            _strings("/handsim/bodies", [_part(name) for name in header.bodies]),
-        ]
-    )
+_Content = tuple[str, str, Sequence[Any]]
+"""Address, types and values of an OSC message."""
 
 
-def frame_bundle(message: LiveMessage) -> bytes:
-    """A frame; of a hand or a body without a pose only the status."""
-    number = message.number & _MOST_NUMBER
-    frame = struct.pack(">idi", number, message.time, message.silent)
-    packets = [_packed("/handsim/frame", "idi", frame)]
-    for hand in message.hands:
-        packets.append(_strings(f"/handsim/{hand.side}/status", [hand.status.value]))
-        if hand.has_pose:
-            wrist = np.concatenate([hand.position, hand.quaternion])
-            packets.append(_floats(f"/handsim/{hand.side}/wrist", wrist))
-            packets.append(_floats(f"/handsim/{hand.side}/angles", hand.angles))
-            packets.append(_floats(f"/handsim/{hand.side}/positions", hand.positions.ravel()))
-    for body in message.bodies:
-        address = f"/handsim/body/{_part(body.name)}"
-        packets.append(_strings(f"{address}/status", [body.status.value]))
-        if body.has_pose:
-            packets.append(_floats(f"{address}/pose", np.concatenate([body.position, body.quaternion])))
-    return _bundle(packets)
+class OscEncoder:
+    """Makes bundles of messages.
+
+    Raises:
+        ArgumentError: The package python-osc is missing.
+    """
+
+    def __init__(self) -> None:
+        self._messages: Any = import_extra("pythonosc.osc_message_builder", "osc://", "send")
+        self._bundles: Any = import_extra("pythonosc.osc_bundle_builder", "osc://", "send")
+
+    def header(self, header: LiveHeader) -> bytes:
+        """The names in the order of the numbers."""
+        names = {
+            "sides": header.sides,
+            "angles": header.angles,
+            "positions": header.positions,
+            "bodies": [_part(name) for name in header.bodies],
+        }
+        contents = [_strings(f"/handsim/{name}", values) for name, values in names.items()]
+        return self._bundle([("/handsim/schema", "i", [SCHEMA]), *contents])
+
+    def frame(self, message: LiveMessage) -> bytes:
+        """A frame; of a hand or a body without a pose only the status."""
+        number = message.number & _MOST_NUMBER
+        contents: list[_Content] = [("/handsim/frame", "idi", [number, message.time, int(message.silent)])]
+        for hand in message.hands:
+            address = f"/handsim/{hand.side}"
+            contents.append(_strings(f"{address}/status", [hand.status.value]))
+            if hand.has_pose:
+                contents.append(_floats(f"{address}/wrist", hand.position, hand.quaternion))
+                contents.append(_floats(f"{address}/angles", hand.angles))
+                contents.append(_floats(f"{address}/positions", hand.positions.ravel()))
+        for body in message.bodies:
+            address = f"/handsim/body/{_part(body.name)}"
+            contents.append(_strings(f"{address}/status", [body.status.value]))
+            if body.has_pose:
+                contents.append(_floats(f"{address}/pose", body.position, body.quaternion))
+        return self._bundle(contents)
+
+    def _bundle(self, contents: Iterable[_Content]) -> bytes:
+        bundle = self._bundles.OscBundleBuilder(self._bundles.IMMEDIATELY)
+        for address, types, values in contents:
+            message = self._messages.OscMessageBuilder(address)
+            for kind, value in zip(types, values, strict=True):
+                message.add_arg(value, kind)
+            bundle.add_content(message.build())
+        datagram: bytes = bundle.build().dgram
+        return datagram
 
 
 def _part(name: str) -> str:
@@ -57,24 +74,10 @@ def _part(name: str) -> str:
     return _RESERVED.sub("_", name)
 
 
-def _bundle(packets: Iterable[bytes]) -> bytes:
-    sized = b"".join(struct.pack(">i", len(packet)) + packet for packet in packets)
-    return b"#bundle\0" + struct.pack(">Q", _AT_ONCE) + sized
+def _floats(address: str, *values: np.ndarray) -> _Content:
+    numbers = np.concatenate(values).tolist()
+    return address, "f" * len(numbers), numbers
 
 
-def _packed(address: str, types: str, content: bytes) -> bytes:
-    return _string(address) + _string("," + types) + content
-
-
-def _floats(address: str, values: Float[np.ndarray, "N"]) -> bytes:
-    return _packed(address, "f" * len(values), values.astype(">f4").tobytes())
-
-
-def _strings(address: str, values: Sequence[str]) -> bytes:
-    return _packed(address, "s" * len(values), b"".join(map(_string, values)))
-
-
-def _string(text: str) -> bytes:
-    """A text, ended and filled up to four bytes by zeros."""
-    encoded = text.encode("ascii", "replace")
-    return encoded + bytes(4 - len(encoded) % 4)
+def _strings(address: str, values: Sequence[str]) -> _Content:
+    return address, "s" * len(values), values

@@ -11,17 +11,16 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final
 
+from handsim._extras import import_extra
 from handsim.errors import ArgumentError
-from track.sinks.documents import Encode, frame_document, header_document, import_extra
+from track.sinks.documents import Encode, frame_document, header_document
 from track.sinks.message import LiveMessage
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
 _WAITING: Final = 256  # frames that may wait for a client
-_SEND_BUFFER: Final = (
-    1 << 17
-)  # bytes that the system holds for a client, which are older than those that wait
+_SEND_BUFFER: Final = 1 << 17  # bytes that the system holds for a client, older than those that wait
 _LARGEST: Final = 1 << 10  # bytes of a message of a client, which is not read
 _FLUSH: Final = 1.0  # [s] for clients to take what waits at the end
 _OWN_PAGES: Final = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
@@ -46,8 +45,8 @@ class WebSocketSink:
     """
 
     def __init__(self, host: str, port: int, encode: Encode, *, text: bool, points: bool) -> None:
-        self._serve: Any = import_extra("websockets.asyncio.server", "ws://").serve
-        self._closed_error: Any = import_extra("websockets.exceptions", "ws://").ConnectionClosed
+        self._serve: Any = import_extra("websockets.asyncio.server", "ws://", "send").serve
+        self._closed_error: Any = import_extra("websockets.exceptions", "ws://", "send").ConnectionClosed
         self._encode, self._text, self._points = encode, text, points
         self._socket = _listen(host, port)
         address = self._socket.getsockname()
@@ -110,10 +109,7 @@ class WebSocketSink:
         )
         self._ready.set()
         await self._ending.wait()
-        if self._clients:
-            await asyncio.wait(
-                [asyncio.ensure_future(one.emptied()) for one in self._clients], timeout=_FLUSH
-            )
+        await self._flush()
         server.close()
         await server.wait_closed()
 

@@ -54,14 +54,14 @@ def open_source(
         ArgumentError: The address is invalid, or there is no such source.
         CaptureError: No server answers.
     """
-    scheme, _, rest = address.partition("://")
+    scheme = address.partition("://")[0] if "://" in address else ""
     if scheme == "natnet":
         return open_stream(address, silence=silence, ended=ended)
     if scheme == "qtm":
         parts = split_address(address, options={}, port=PORT)
         return _read(QualisysSource(parts.host, parts.port), address, silence, ended)
     name = address.partition("?")[0]
-    if rest or not (is_plugin(name) or name in list_plugins(GROUP)):
+    if scheme or not (is_plugin(name) or name in list_plugins(GROUP)):
         raise ArgumentError(f"'{address}' is not an address of a stream, expected {', '.join(VALID)}")
     return _read(make_plugin(address, group=GROUP, noun="frame source"), name, silence, ended)
 

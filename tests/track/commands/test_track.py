@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -268,4 +270,37 @@ def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch)
         arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]
         assert main(arguments) == 1
     assert "1 frames came, expected two or more" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys):
+    """A capture is played at its own rate; every frame reaches a UDP listener."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        one.bind(("127.0.0.1", 0))
+        address = f"udp://127.0.0.1:{one.getsockname()[1]}"
+        out, start = tmp_path / "take.npz", time.monotonic()
+        assert main(["track", str(capture), "--out", str(out), "--size", "M", "--send", address]) == 0
+        assert time.monotonic() - start > (FRAMES - 1) / 120
+        one.setblocking(False)
+        heard = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                heard.append(json.loads(one.recv(1 << 16)))
+    take = load_tracked_take(out)
+    header, frames = heard[0], [one for one in heard if one["type"] == "frame"]
+    assert header["type"] == "header" and header["sides"] == ["right", "left"]
+    assert [one["number"] for one in frames] == list(range(FRAMES))
+    for one, qpos in zip(frames, take.qpos, strict=True):
+        for hand, pose in zip(one["hands"], qpos, strict=True):
+            if hand["wrist"] is not None and np.isfinite(pose).all():
+                np.testing.assert_allclose(hand["wrist"]["position"], pose[:3], atol=2e-6)
+                np.testing.assert_allclose(hand["angles"], pose[7:], atol=2e-6)
+    assert f"{FRAMES} frames sent to {address}" in capsys.readouterr().out
+
+
+def test_an_address_that_is_none_is_told_before_anything_is_done(capture, tmp_path, capsys):
+    arguments = ["track", str(capture), "--out", str(tmp_path / "take.npz"), "--send", "http://localhost:1"]
+    assert main(arguments) == 1
+    assert "'http://localhost:1' is not an address to send to, expected osc://" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())

@@ -7,7 +7,9 @@ import dataclasses
 import numpy as np
 from pythonosc.osc_bundle import OscBundle
 
-from track.sinks.osc_bundles import frame_bundle, header_bundle
+from track.sinks.osc_bundles import OscEncoder
+
+ENCODER = OscEncoder()
 
 
 def read(datagram: bytes) -> dict[str, list]:
@@ -17,7 +19,7 @@ def read(datagram: bytes) -> dict[str, list]:
 
 def test_a_frame(message):
     one = message(7)
-    got = read(frame_bundle(one))
+    got = read(ENCODER.frame(one))
     assert got.pop("/handsim/frame") == [7, one.time, 0]
     for hand in one.hands:
         assert got.pop(f"/handsim/{hand.side}/status") == ["tracked"]
@@ -32,7 +34,7 @@ def test_a_frame(message):
 
 
 def test_of_a_lost_hand_only_the_status_is_sent(message):
-    got = read(frame_bundle(message(lost=True)))
+    got = read(ENCODER.frame(message(lost=True)))
     assert got["/handsim/left/status"] == got["/handsim/body/mug/status"] == ["lost"]
     assert [address for address in got if "left" in address or "mug" in address] == [
         "/handsim/left/status",
@@ -42,7 +44,7 @@ def test_of_a_lost_hand_only_the_status_is_sent(message):
 
 def test_the_names(message):
     header = message().header
-    got = read(header_bundle(header))
+    got = read(ENCODER.header(header))
     assert got["/handsim/schema"] == [1] and got["/handsim/sides"] == ["right", "left"]
     assert got["/handsim/angles"] == list(header.angles)
     assert got["/handsim/positions"] == list(header.positions)
@@ -52,13 +54,13 @@ def test_the_names(message):
 def test_names_of_bodies_become_parts_of_addresses(message):
     one = message()
     odd = dataclasses.replace(one.bodies[0], name="my pen #2/ä")
-    got = read(frame_bundle(dataclasses.replace(one, bodies=(odd,))))
+    got = read(ENCODER.frame(dataclasses.replace(one, bodies=(odd,))))
     assert "/handsim/body/my_pen__2__/status" in got
 
 
 def test_a_late_number_is_one_of_osc_s(message):
-    assert read(frame_bundle(message(2**31 + 5)))["/handsim/frame"][0] == 5
+    assert read(ENCODER.frame(message(2**31 + 5)))["/handsim/frame"][0] == 5
 
 
 def test_two_hands_fit_into_one_packet_of_ethernet(message):
-    assert len(frame_bundle(message())) < 1472
+    assert len(ENCODER.frame(message())) < 1472

@@ -1,0 +1,28 @@
+"""Packages that `pip install handsim` leaves out, imported when something needs them."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from handsim.errors import ArgumentError
+
+
+def import_extra(module: str, what: str, extra: str) -> Any:
+    """A module of an optional package.
+
+    Args:
+        module: Its name.
+        what: What needs it, for the message.
+        extra: The extra of handsim that brings it.
+
+    Raises:
+        ArgumentError: It is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except (ImportError, RuntimeError) as error:  # pylsl raises the latter without its library
+        raise ArgumentError(
+            f"{what} needs the package {module.partition('.')[0]}, which cannot be imported "
+            f"({' '.join(str(error).split())}); run `pip install 'handsim[{extra}]'`"
+        ) from error
