@@ -18,6 +18,8 @@ from typing import NamedTuple
 import pytest
 
 from poses.shapes.sampling import SAMPLERS
+from track.sinks.addresses import GROUP as SINKS
+from track.streams.addresses import GROUP as SOURCES
 from train.data.own_corruption import CORRUPTIONS
 from train.labelers.protocol import LABELERS
 
@@ -115,7 +117,7 @@ def test_a_block_that_fails_is_named(tmp_path):
         run_blocks([hidden, shown], tmp_path)
 
 
-GROUPS = {CORRUPTIONS, LABELERS, SAMPLERS}  # of entry points
+GROUPS = {CORRUPTIONS, LABELERS, SAMPLERS, SINKS, SOURCES}  # of entry points
 
 
 def test_every_module_that_a_page_names_exists():
