@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.layout import MarkerLayout
+from handsim.hand.topology import Side
 from train.hands.links import clusters
 from train.hands.measures import HandMeasures
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
+from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
@@ -34,6 +36,8 @@ _SMALLEST: Final = 0.03  # extent of a hand's points [m]
 _MOST: Final = 120  # points of a cluster; larger ones are not hands
 _SHORTER_LINKS: Final = (0.8, 0.65, 0.5)  # at which hands that are close to each other come apart
 _MISSED: Final = 0.02  # share of simulated hands below each criterion for a weak labeler
+_SURE: Final = 0.9  # mean confidence from which on labels need no other witness
+_LEAST_DENSITY: Final = 1.0  # log-density of a hand's points for each coordinate, with one or two wrong ones
 _CUTS: Final = 12
 _TRIED: Final = 3  # parts whose rest is labeled
 
@@ -83,6 +87,7 @@ class HandFinder:
     def __init__(self, labeler: Labeler, layout: MarkerLayout, *, rng: np.random.Generator) -> None:
         self.measures = HandMeasures(layout, rng=rng)
         self._labeler = labeler
+        self._prior: PosePrior | None = getattr(labeler, "prior", None)
         self._classifier = SideClassifier(layout, rng=rng)
         self.num_markers = layout.num_markers
         self.certain = self._certain(rng)
@@ -192,7 +197,16 @@ class HandFinder:
         side, clearness = self._classifier.classify(points[here], names)
         if clearness < criteria.clearness:
             return None
+        if sure.mean() < _SURE and not self._is_likely(points[here], names, side):
+            return None
         return FoundHand(here, names, sure, clearness if side == "right" else -clearness)
+
+    def _is_likely(self, points: NDArray[np.float64], labels: NDArray[np.int64], side: Side) -> bool:
+        """Whether labeled points lie as a hand's markers do, as far as the labeler knows hands as wholes."""
+        if self._prior is None:
+            return True
+        density = self._prior.log_density(points, labels, mirrored=side == "left")
+        return density >= _LEAST_DENSITY * points.size
 
     def _groups(self, points: NDArray[np.float64]) -> list[Group]:
         groups = clusters(points, self.measures.link_distance)

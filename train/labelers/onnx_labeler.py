@@ -68,7 +68,7 @@ class OnnxLabeler:
             self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
             metadata = self._session.get_modelmeta().custom_metadata_map
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
-            self._prior = _unpacked(metadata[_PRIOR]) if _PRIOR in metadata else None
+            self.prior = _unpacked(metadata[_PRIOR]) if _PRIOR in metadata else None
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
             self._try(_IMAGES if _CNN in metadata else _INPUTS[0])
         except Exception as error:  # onnxruntime's errors have no common class of their own
@@ -99,7 +99,7 @@ class OnnxLabeler:
         """The set labeler."""
         given = dict(zip(_INPUTS, pad_clouds(clouds), strict=True))
         by_point, by_label = self._session.run(_OUTPUTS, given)
-        return label_by_scores(clouds, by_point, by_label, self._prior)
+        return label_by_scores(clouds, by_point, by_label, self.prior)
 
     def _label_by_images(self, settings: str) -> Callable[[list[NDArray[np.float64]]], list[Labeling]]:
         """The paper's network, with what its metadata tells of its use."""

@@ -11,6 +11,7 @@ from train.data.batches import Batch
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
 from train.labelers.set_inference import CloudScorer
 from train.labelers.set_network import SetLabeler, labeling_loss
+from train.matching.pose_prior import PosePrior
 from train.threads import labeling_threads
 
 if TYPE_CHECKING:
@@ -32,6 +33,11 @@ class TrainedSetLabeler:
         self.network = network.eval()
         self.marker_names = marker_names
         self._scorer: CloudScorer | None = None  # made for the first cloud that comes alone
+
+    @property
+    def prior(self) -> PosePrior | None:
+        """What it knows of hands as wholes."""
+        return self.network.prior
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
