@@ -26,6 +26,7 @@ VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))
 _MOST_POINTS: Final = 1500  # in a datagram
 _MOST_CLIENTS: Final = 8
 _CLIENT_TIMEOUT: Final = 10.0  # [s] without a packet from a client
+_WAIT: Final = 0.05  # [s] for a client's packet, after which the end is looked at
 _NUMBERS: Final = 1 << 31  # of frames and of IDs in a packet
 
 
@@ -169,9 +170,11 @@ class ReplayServer:
         while not self._ended.is_set():
             number = self.sent
             if not self._clients:
+                self._answer(_WAIT)
                 start = time.monotonic() - number / self.rate  # continue at this frame
+                continue
             due = np.inf if self.finished else start + number / self.rate
-            self._answer(min(0.05, max(0.0, due - time.monotonic())))
+            self._answer(min(_WAIT, max(0.0, due - time.monotonic())))
             if self._clients and time.monotonic() >= due:
                 self._send_all(natnet.pack_frame(self._frame(number), self._version))
                 self.sent += 1

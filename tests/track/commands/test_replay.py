@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import os
 import re
 import signal
 import socket
 import subprocess
 import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,10 +33,18 @@ def capture(tmp_path_factory):
     return out
 
 
-def replay(path, *options):
+@pytest.fixture
+def replay():
+    """The command in a process of its own, ended with the test."""
+    with ExitStack() as stack:
+        yield functools.partial(_replay, stack)
+
+
+def _replay(stack, path, *options):
     """The command in a process of its own, and the address of its server."""
     command = [sys.executable, "-u", "-c", RUN, "replay", str(path), "--port", "0", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    stack.callback(process.kill)
     assert process.stdout is not None
     told = process.stdout.readline()
     url = re.search(r"natnet://\S+", told)
@@ -39,8 +52,13 @@ def replay(path, *options):
     return process, told, url[0]
 
 
+def _processor_seconds(pid: int) -> float:
+    user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
 @pytest.mark.parametrize("ending", [".c3d", ".truth.npz"])
-def test_a_capture_is_tracked_as_a_stream(capture, ending, tmp_path):
+def test_a_capture_is_tracked_as_a_stream(capture, ending, tmp_path, replay):
     process, told, url = replay(capture.with_name("take" + ending))
     assert f"{FRAMES} frames at 120 Hz on {url}" in told
     out = tmp_path / "live.npz"
@@ -56,7 +74,7 @@ def test_a_capture_is_tracked_as_a_stream(capture, ending, tmp_path):
         assert len(got) == len(seen) and nearest.max() < 1e-5
 
 
-def test_a_loop_goes_on_with_new_numbers_and_ids(capture):
+def test_a_loop_goes_on_with_new_numbers_and_ids(capture, replay):
     process, _, url = replay(capture, "--loop", "--rate", "600")
     stream = open_stream(url)
     frames = [next(stream) for _ in range(3 * FRAMES)]
@@ -76,10 +94,13 @@ def test_a_loop_goes_on_with_new_numbers_and_ids(capture):
     assert of[0] and of[1] and not of[0] & of[1]
 
 
-def test_it_waits_for_a_client_until_it_is_ended(capture):
+def test_it_waits_for_a_client_until_it_is_ended(capture, replay):
     process, _, _ = replay(capture)
     assert process.stderr is not None
     assert "waiting for a client at frame 0" in process.stderr.readline()
+    began, before = time.monotonic(), _processor_seconds(process.pid)
+    time.sleep(0.5)
+    assert _processor_seconds(process.pid) - before < 0.5 * (time.monotonic() - began), "it waits by asking"
     process.send_signal(signal.SIGTERM)
     out, _ = process.communicate(timeout=20)
     assert process.returncode == 0 and "0 frames played" in out
