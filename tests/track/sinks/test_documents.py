@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+from pathlib import Path
 
 import msgpack
 import numpy as np
@@ -71,3 +73,20 @@ def test_a_missing_package_is_told(monkeypatch):
         ArgumentError, match=r"format=msgpack needs the package msgpack.*pip install 'handsim\[send\]'"
     ):
         encoder_of("msgpack")
+
+
+def test_the_page_shows_what_is_sent(message):
+    """Keys and kinds of values in docs/live_output.md are those of real documents."""
+    page = Path(__file__).parents[3] / "docs" / "live_output.md"
+    shown = [json.loads(block) for block in re.findall(r"```json\n(.*?)```", page.read_text(), re.DOTALL)]
+    one = message(lost=True)
+    header, frame = header_document(one.header), frame_document(one)
+    assert [set(block) for block in shown] == [set(header), set(frame)]
+    assert shown[0]["source"] == header["source"] and shown[0]["units"] == header["units"]
+    for key in ("sides", "angles", "positions", "markers"):
+        assert shown[0][key][0] == header[key][0]
+    for hand, real in zip(shown[1]["hands"], frame["hands"], strict=True):
+        assert {key: type(value) for key, value in hand.items()} == {
+            key: type(value) for key, value in real.items()
+        }
+    assert set(shown[1]["bodies"][0]) == set(frame["bodies"][0])
