@@ -75,9 +75,12 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         for temporary, final in zip(temporaries, finals, strict=True):
             os.replace(temporary, final)
             renamed.append(final)
-    except BaseException:  # also an interrupt must leave nothing behind
+    except BaseException as error:  # also an interrupt must leave nothing behind
         for file in (*temporaries, *renamed):
             file.unlink(missing_ok=True)
+        names = dict(zip(map(str, temporaries), map(str, finals), strict=True))
+        if isinstance(error, OSError) and str(error.filename) in names:  # nobody knows the temporary name
+            error.filename = names[str(error.filename)]
         raise
 
 

@@ -1,5 +1,6 @@
 """Atomic writing: a file is whole or not there, on success, errors, interrupts and a full disk."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -133,3 +134,9 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path)
     with pytest.raises(PermissionError) as caught, atomic_write(tmp_path / "a.trc"):
         pytest.fail("the block must not run")
     assert caught.value.filename == str(tmp_path / "a.trc")
+
+
+def test_an_error_names_the_file_that_was_asked_for(tmp_path):
+    with pytest.raises(OSError) as caught, atomic_write(tmp_path / "take.c3d") as temporary:
+        raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
+    assert caught.value.filename == str(tmp_path / "take.c3d")
