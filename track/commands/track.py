@@ -18,11 +18,13 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import WRITABLE, check_suffix, read_capture, write_capture
 from gloves.captures.markers import labeled_capture
 from gloves.fit import GloveFit
+from gloves.optics.identities import number_runs
+from gloves.takes.corrections import Correction, corrections_of, corrections_path, find_pins, told
 from gloves.takes.take import SUFFIX
-from gloves.takes.tracked_take import TrackedTake, load_tracked_take
+from gloves.takes.tracked_take import TrackedTake, label_names, load_tracked_take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.errors import ArgumentError, HandSimWarning
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from track.bodies.body_file import load_bodies
@@ -31,6 +33,7 @@ from track.calibration.hand_size import sample_frames
 from track.capture_tracking import capture_frames, track_capture, warm_up
 from track.commands.live import TrackedSource, track_live
 from track.commands.user_options import USUAL_SIZE, Size, measured_users, users_of
+from track.corrected_take import correct_take
 from track.evaluation.take_summary import summarize, suspicions
 from track.sinks.addresses import open_sinks
 from track.sinks.sink_group import SinkGroup
@@ -65,6 +68,8 @@ def track(
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
 
+    Corrections that handsim view saved beside OUT are applied again.
+
     Args:
         capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not
             used.
@@ -93,6 +98,9 @@ def track(
     user = users_of(glove, size, shape, hands)
     bodies = load_bodies(body)
     source = None if capture is None else read_capture(capture)
+    corrections = _corrections_for(
+        out, source, label_names(user, bodies)
+    )
     start = TrackerStart(user, labeler_for_glove(glove, labeler), bodies, glove)
     start.settings.update(
         capture=live if capture is None else capture.name,
@@ -108,7 +116,7 @@ def track(
             fewest = SHOWN * user[0].layout.num_markers if measures else None
             tracked = track_live(str(live), seconds, start, out, fewest_points=fewest, sinks=sinks)
         else:
-            tracked = _track_file(source, start, out, sinks, measures=measures)
+            tracked = _track_file(source, start, out, corrections, sinks, measures=measures)
     if labeled is not None:
         write_capture(labeled, labeled_points(tracked.take if tracked.whole else load_tracked_take(out)))
     rate, frames = tracked.take.rate, tracked.num_frames
@@ -214,8 +222,46 @@ def _check_options(
         check_suffix(labeled, WRITABLE)
 
 
+def _corrections_for(out: Path, source: Capture | None, names: Sequence[str]) -> tuple[Correction, ...]:
+    """The corrections beside a take that is to be made, checked before the long work."""
+    path = corrections_path(out)
+    if source is None and path.exists():
+        raise ArgumentError(
+            f"{path} corrects the take that --live would replace, expected another --out than {out}"
+        )
+    corrections = corrections_of(out)
+    if source is not None and corrections:
+        try:
+            ids = number_runs(np.isfinite(source.positions[..., 0]))
+            find_pins(corrections, source.positions, ids, names)
+        except CaptureError as error:
+            raise CaptureError(f"{path}: {error}") from error
+    return corrections
+
+
+def _corrected(take: TrackedTake, out: Path, corrections: Sequence[Correction]) -> TrackedTake:
+    """The take with its corrections, if there are any; what does not fit is told."""
+    if not corrections:
+        return take
+    path, corrected = corrections_path(out), correct_take(take, corrections)
+    for sentence in told(path, corrected.unfitting):
+        warnings.warn(sentence, HandSimWarning, stacklevel=2)
+    count = len(corrections) - len(corrected.unfitting)
+    print_line(
+        f"{path}: {count} correction{'s' * (count != 1)} applied, {corrected.labels} labels in "
+        f"{corrected.frames} frames"
+    )
+    return corrected.take
+
+
 def _track_file(
-    source: Capture, start: TrackerStart, out: Path, sinks: SinkGroup, *, measures: bool
+    source: Capture,
+    start: TrackerStart,
+    out: Path,
+    corrections: Sequence[Correction],
+    sinks: SinkGroup,
+    *,
+    measures: bool,
 ) -> TrackedSource:
     """Track a capture and write the take; where it is sent on, at the capture's own rate."""
     with Console(stderr=True).status("measuring the hands"):
@@ -235,5 +281,6 @@ def _track_file(
             taken=send if sinks else None,
         )
     take = dataclasses.replace(take, settings={**take.settings, **start.settings})
+    take = _corrected(take, out, corrections)
     take.save(out)
     return TrackedSource(take, take.num_frames, sinks.notes())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from gloves.takes.tracked_take import label_names
 from handsim.hand.topology import NUM_QPOS
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
@@ -38,11 +39,9 @@ class LiveRecording(Recording):
     def __init__(self, tracker: Tracker, rig: CameraRig | None = None) -> None:
         self._hands = tracker.hands
         self._offsets = np.cumsum([0, *(hand.layout.num_markers for hand in tracker.hands)])
-        names = [f"{hand.side}:{name}" for hand in tracker.hands for name in hand.layout.names]
-        names += [f"{body.name}:{name}" for body in tracker.bodies for name in body.marker_names]
         super().__init__(
             np.zeros(1),
-            tuple(names),
+            label_names(tracker.hands, tracker.bodies),
             most_points=_MOST_POINTS,
             radius=tracker.hands[0].layout.radius,
             bodies=tuple(shown_body(body.name) for body in tracker.bodies),
