@@ -153,8 +153,8 @@ def follow_point(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Frames (K,) in which the point of a correction is there, and its column (K,) in each.
 
-    Nothing where there is no point at the place. A point with an ID is what has that ID, also after a gap. One
-    without is the nearest to where its last two places lead, until there is none.
+    Nothing where there is no point at the place. A point with an ID is what has that ID, also after a gap.
+    One without is the nearest to where its last two places lead, until there is none.
 
     Args:
         points: Observed points [m], NaN where a column has no point.

@@ -9,6 +9,7 @@ Nothing here imports viser, the package that serves the page, but `server`, when
 `timeline`: which frame is shown.
 `status_panel`: its state in words, plots, doubtful frames.
 `live_view`: the newest frame of a tracker that runs.
+`label_editor`: labels of a tracked take, corrected over a span of frames and saved.
 `layout_editor`: a layout whose markers are dragged over the skin.
 `user_view`: a calibrated user's hands over those of a named size.
 """

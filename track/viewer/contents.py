@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -10,19 +11,20 @@ import numpy as np
 
 from gloves.captures.formats import READABLE, read_capture
 from gloves.layout import list_layouts, load_layout
-from gloves.takes.archives import archive_kind
+from gloves.takes.corrections import corrections_path, told
 from gloves.takes.growing import is_growing
-from gloves.takes.take import KIND as SIMULATED
-from gloves.takes.take import load_take
-from gloves.takes.tracked_take import load_tracked_take
-from handsim.errors import ArgumentError, FileError
+from gloves.takes.motion import load_any_take
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError, FileError, HandSimWarning
 from handsim.files.atomic import read_toml
 from handsim.files.outputs import check_outputs
 from handsim.hand.model import HandModel
 from handsim.space.cameras import CameraRig, list_rigs, load_rig
 from track.user import load_user
+from track.viewer.label_editor import LabelEditor
 from track.viewer.layout_editor import LayoutEditor, edited_path
 from track.viewer.recordings.captures import CaptureRecording
+from track.viewer.recordings.corrector import Corrector
 from track.viewer.recordings.datasets import DatasetRecording
 from track.viewer.recordings.recording import Recording
 from track.viewer.recordings.takes import TrackedRecording, TruthRecording
@@ -90,20 +92,27 @@ def open_content(name: str, *, out: Path | None = None, size: str = "M", rig: st
     if suffix == ".json":
         hands = load_user(path)
         return Content("user", lambda server: _still(UserView(server, hands)))
-    recording = _recording(path, None if rig is None else load_rig(rig))
+    recording, corrector = _recording(path, None if rig is None else load_rig(rig))
     kind = type(recording).__name__.removesuffix("Recording").lower()
-    return Content(kind, lambda server: show_recording(server, recording))
+    return Content(kind, lambda server: show_recording(server, recording, corrector))
 
 
-def _recording(path: Path, rig: CameraRig | None) -> Recording:
+def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector | None]:
+    """What is shown over time, and where its labels can be corrected."""
     if path.is_dir():
-        return DatasetRecording(Dataset(path), rig)
+        return DatasetRecording(Dataset(path), rig), None
     if path.suffix.lower() in READABLE:
-        return CaptureRecording(read_capture(path), rig)
+        return CaptureRecording(read_capture(path), rig), None
     if path.suffix.lower() == ".npz" or is_growing(path):
-        if archive_kind(path) == SIMULATED:
-            return TruthRecording(load_take(path), rig)
-        return TrackedRecording(load_tracked_take(path), rig)
+        take = load_any_take(path)
+        if isinstance(take, Take):
+            return TruthRecording(take, rig), None
+        if is_growing(path):
+            return TrackedRecording(take, rig), None
+        corrector = Corrector(path, take)
+        for sentence in told(corrections_path(path), corrector.unfitting):
+            warnings.warn(sentence, HandSimWarning, stacklevel=2)
+        return TrackedRecording(corrector.take, rig), corrector
     raise ArgumentError(f"{path}: a file of another kind, expected {ACCEPTED}")
 
 
@@ -136,12 +145,13 @@ def _rig(name: str | Path) -> Content:
     return Content("rig", show)
 
 
-def show_recording(server: ViserServer, recording: Recording) -> Run:
+def show_recording(server: ViserServer, recording: Recording, corrector: Corrector | None = None) -> Run:
     """Put a recording into a page, with its timeline.
 
     Args:
         server: Where the page is.
         recording: What is shown.
+        corrector: Where its labels can be corrected: the tracked take that the recording shows.
 
     Returns:
         What serves the page.
@@ -151,10 +161,20 @@ def show_recording(server: ViserServer, recording: Recording) -> Run:
         frame = recording.frame(index)
         view.show(frame)
         panel.show(index, frame, hurried=timeline.playing)
+        if editor is not None:
+            editor.show(index, hurried=timeline.playing)
+
+    def changed() -> None:
+        panel.renew_lists()
+        timeline.refresh()
 
     timeline = Timeline(server, recording.times, show)
     panel = StatusPanel(server, recording)
     view = FrameView(server, recording)
+    editor: LabelEditor | None = None
+    if corrector is not None and isinstance(recording, TrackedRecording):
+        editor = LabelEditor(server, recording, corrector, changed)
+        view.on_pick = editor.pick
     panel.add_lists(timeline.jump)
     set_stage(server, first_look(recording))
     timeline.update()

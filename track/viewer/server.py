@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+import ipaddress
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlsplit
 
 from handsim.errors import ArgumentError, HandSimError
 
@@ -46,7 +49,7 @@ def opened_server(host: str, port: int | None, title: str) -> Iterator[ViserServ
             return None
 
     free = _free_port(host, port)
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a panel of its own
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(host):  # viser prints a panel of its own
         server = Server(host=host, port=free, label=title, verbose=False)
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -63,6 +66,64 @@ def address_of(server: ViserServer) -> str:
     if host in ("0.0.0.0", "::"):
         host = "localhost"
     return f"http://[{host}]:{server.get_port()}" if ":" in host else f"http://{host}:{server.get_port()}"
+
+
+def is_own_page(origin: str | None, asked: str | None, host: str) -> bool:
+    """Whether a connection comes from the page itself, or from a program that is no browser.
+
+    A browser tells which page opens a connection, and any page may open one to this machine. A page that has
+    a name of its own for this machine's address (DNS rebinding) gives that name twice, so at a loopback
+    address only names of loopback count.
+
+    Args:
+        origin: The header Origin, such as `http://127.0.0.1:8080`; None from what is no browser.
+        asked: The header Host, such as `127.0.0.1:8080`.
+        host: Address that the server listens at.
+    """
+    if origin is None:
+        return True
+    parts = urlsplit(origin)
+    if asked is None or parts.netloc.lower() != asked.lower():
+        return False
+    return not _is_loopback(host) or _is_loopback(parts.hostname or "")
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+@contextmanager
+def _guarded(host: str) -> Iterator[None]:
+    """Servers of websockets that are started in the block refuse other pages than their own.
+
+    viser passes nothing on that could do this.
+    """
+    import websockets.asyncio.server as websockets_server
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+    serve = websockets_server.serve
+
+    def guarded(*arguments: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: ServerConnection, request: Request) -> Response | None:
+            headers = request.headers
+            if not is_own_page(headers.get("Origin"), headers.get("Host"), host):
+                return connection.respond(HTTPStatus.FORBIDDEN, "another page's connection is refused\n")
+            answer: Response | None = process_request(connection, request)
+            return answer
+
+        return serve(*arguments, process_request=process, **options)
+
+    websockets_server.serve = guarded  # type: ignore[assignment, misc]
+    try:
+        yield
+    finally:
+        websockets_server.serve = serve  # type: ignore[misc]
 
 
 def _free_port(host: str, port: int | None) -> int:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from track.viewer.recordings.recording import Curve, Recording, ShownFrame
+from track.viewer.recordings.recording import Recording, ShownFrame
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-    from viser import ViserServer, uplot
+    from viser import GuiButtonHandle, GuiFolderHandle, GuiUplotHandle, ViserServer, uplot
 
 _EVERY: Final = 0.1  # [s] between two texts while frames follow each other quickly
 _COLUMNS: Final = 600  # of a plot
@@ -32,6 +32,10 @@ class StatusPanel:
         self._server, self._recording, self._due = server, recording, 0.0
         self.text = server.gui.add_markdown("")
         """The state of the frame."""
+        self._go_to: Callable[[int], None] = lambda frame: None
+        self._rows: GuiFolderHandle | None = None
+        self._buttons: list[GuiButtonHandle] = []
+        self._plots: list[tuple[GuiUplotHandle, list[int]]] = []
 
     def add_lists(self, go_to: Callable[[int], None]) -> None:
         """Add the rows and the plots.
@@ -40,14 +44,31 @@ class StatusPanel:
             go_to: Called with a frame whose row was clicked.
         """
         server, recording = self._server, self._recording
+        self._go_to = go_to
         if recording.doubts:
-            with server.gui.add_folder("Doubtful frames"):
-                for doubt in recording.doubts:
-                    row = server.gui.add_button(f"{doubt.frame}: {doubt.words}", color="gray")
-                    row.on_click(partial(_jump, go_to, doubt.frame))
+            self._rows = server.gui.add_folder("Doubtful frames")
+            self._add_rows(self._rows)
         if recording.curves and recording.num_frames > 1:
             with server.gui.add_folder("Over time", expand_by_default=True):
-                _add_plots(server, recording)
+                self._plots = _add_plots(server, recording)
+
+    def renew_lists(self) -> None:
+        """Show the rows and the plots of a recording that was changed."""
+        if self._rows is not None:
+            for row in self._buttons:
+                row.remove()
+            self._add_rows(self._rows)
+        for plot, numbers in self._plots:
+            plot.data = _columns(self._recording, numbers)
+
+    def _add_rows(self, folder: GuiFolderHandle) -> None:
+        self._buttons = []
+        with folder:
+            for doubt in self._recording.doubts:
+                span = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first}-{doubt.last}"
+                row = self._server.gui.add_button(f"{span}: {doubt.words}", color="gray")
+                row.on_click(partial(_jump, self._go_to, doubt.worst))
+                self._buttons.append(row)
 
     def show(self, index: int, frame: ShownFrame, *, hurried: bool) -> None:
         """Show the state of a frame; where `hurried`, not more than ten times a second."""
@@ -63,23 +84,28 @@ def _jump(go_to: Callable[[int], None], frame: int, _event: object) -> None:
     go_to(frame)
 
 
-def _add_plots(server: ViserServer, recording: Recording) -> None:
-    """One plot for the curves of each unit."""
-    groups: dict[bool, list[Curve]] = {}
-    for curve in recording.curves:
-        groups.setdefault(curve.name.endswith("]"), []).append(curve)
-    for curves in groups.values():
-        columns = [thinned(recording.times, curve.values) for curve in curves]
-        data = (columns[0][0], *(values for _, values in columns))
+def _add_plots(server: ViserServer, recording: Recording) -> list[tuple[GuiUplotHandle, list[int]]]:
+    """One plot for the curves of each unit, with the numbers of its curves."""
+    groups: dict[bool, list[int]] = {}
+    for number, curve in enumerate(recording.curves):
+        groups.setdefault(curve.name.endswith("]"), []).append(number)
+    plots = []
+    for numbers in groups.values():
         series: list[uplot.Series] = [{"label": "time [s]"}]
-        for curve, stroke in zip(curves, _STROKES, strict=False):
-            series.append({"label": curve.name, "stroke": stroke, "width": 1.2, "spanGaps": False})
-        server.gui.add_uplot(
-            data,
-            tuple(series),
-            scales={"x": {"time": False}},
-            aspect=2.2,
+        for number, stroke in zip(numbers, _STROKES, strict=False):
+            name = recording.curves[number].name
+            series.append({"label": name, "stroke": stroke, "width": 1.2, "spanGaps": False})
+        plot = server.gui.add_uplot(
+            _columns(recording, numbers), tuple(series), scales={"x": {"time": False}}, aspect=2.2
         )
+        plots.append((plot, numbers))
+    return plots
+
+
+def _columns(recording: Recording, numbers: list[int]) -> tuple[np.ndarray, ...]:
+    """Times, and the values of some curves."""
+    columns = [thinned(recording.times, recording.curves[number].values) for number in numbers]
+    return (columns[0][0], *(values for _, values in columns))
 
 
 def thinned(times: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[np.ndarray, np.ndarray]:

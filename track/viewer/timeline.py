@@ -103,6 +103,11 @@ class Timeline:
             self._wake.wait(due - now if self._playing else _IDLE)
             self._wake.clear()
 
+    def refresh(self) -> None:
+        """Ask for the frame again: what it shows has changed."""
+        self._shown = -1
+        self._wake.set()
+
     def update(self) -> None:
         """Show the frame that was asked for, unless it is shown."""
         index = self._index

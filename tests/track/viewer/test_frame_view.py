@@ -116,5 +116,5 @@ def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
     assert page.says("**right** tracked, RMS 1.00 mm")
     rows = [props["label"] for props in page.panel.values() if "label" in props]
     assert [row for row in rows if ": " in row] == [
-        "10: right coasting", "25: left lost", "20: right:ThumbTip 40 %",
+        "25-29: left lost", "10: right coasting", "20: right:ThumbTip 40 %",
     ]  # fmt: skip

@@ -7,9 +7,12 @@ import sys
 import urllib.request
 
 import pytest
+import viser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from handsim.errors import ArgumentError, HandSimError
-from track.viewer.server import LOOPBACK, address_of, opened_server
+from track.viewer.server import LOOPBACK, address_of, is_own_page, opened_server
 
 
 def test_the_page_is_served_here_until_the_end(capsys):
@@ -28,6 +31,28 @@ def test_no_page_can_ask_for_a_public_address(server, page_of):
     page.settle()
     assert server.request_share_url() is None
     assert page.counts["ShareUrlUpdated"] == 0
+
+
+def test_only_the_own_page_is_connected():
+    with opened_server(LOOPBACK, 0, "title") as server:
+        port = server.get_port()
+        address, protocol = f"ws://127.0.0.1:{port}", [f"viser-v{viser.__version__}"]
+        for origin in (None, f"http://127.0.0.1:{port}"):
+            connect(address, subprotocols=protocol, origin=origin).close()
+        connect(f"ws://localhost:{port}", subprotocols=protocol, origin=f"http://localhost:{port}").close()
+        for origin in ("http://example.com", "null", f"http://localhost:{port}", "http://127.0.0.1:1"):
+            with pytest.raises(InvalidStatus) as caught:
+                connect(address, subprotocols=protocol, origin=origin)
+            assert caught.value.response.status_code == 403, origin
+
+
+def test_a_name_for_this_machine_that_a_page_brings_is_no_own_page():
+    rebound = ("http://example.com:8080", "example.com:8080")
+    assert not is_own_page(*rebound, "127.0.0.1") and not is_own_page(*rebound, "localhost")
+    assert is_own_page(*rebound, "0.0.0.0"), "there the machine has names that nobody here knows"
+    assert is_own_page("http://[::1]:8080", "[::1]:8080", "::1")
+    assert is_own_page("https://Lab.example", "lab.example", "0.0.0.0"), "behind a proxy with encryption"
+    assert not is_own_page("http://127.0.0.1:8080", None, "127.0.0.1")
 
 
 def test_a_port_that_is_taken_or_none_is_told():

@@ -55,9 +55,13 @@ class Curve(NamedTuple):
 
 
 class Doubt(NamedTuple):
-    """A frame that deserves a look."""
+    """Frames that deserve a look."""
 
-    frame: int
+    first: int
+    last: int
+    """The last one, which belongs to them."""
+    worst: int
+    """The one to look at."""
     words: str
 
 
@@ -72,7 +76,7 @@ class Recording(ABC):
         bodies: The rigid bodies, in the order of `ShownFrame.bodies`.
         rig: The cameras, where they are known.
         curves: What to plot over time.
-        doubts: Frames that deserve a look, the most doubtful first.
+        doubts: Spans of frames that deserve a look, the most doubtful first.
         has_hands: Whether there are hands in any frame.
         has_filled: Whether there are points that were not seen.
     """
@@ -106,20 +110,7 @@ class Recording(ABC):
         """One of the frames."""
 
 
-def doubtful_frames(
-    confidence: Float[np.ndarray, "T"], below: float, most: int = 8
-) -> list[tuple[int, float]]:
-    """The worst frame of each run of frames whose confidence is below a limit, the worst run first.
-
-    Args:
-        confidence: Of each frame, 0 to 1; NaN counts as certain.
-        below: The limit.
-        most: Number of runs.
-    """
-    low = np.nan_to_num(confidence, nan=1.0) < below
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], low, [False]]).astype(np.int8)))
-    worst = []
-    for first, last in edges.reshape(-1, 2):
-        frame = int(first + np.nanargmin(confidence[first:last]))
-        worst.append((frame, float(confidence[frame])))
-    return sorted(worst, key=lambda entry: (entry[1], entry[0]))[:most]
+def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
+    """The first and the last frame of each unbroken stretch of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

@@ -11,13 +11,14 @@ from gloves.takes.tracked_take import COASTING, LOST, STATUSES, TrackedTake
 from handsim.space.cameras import CameraRig, list_rigs, named_rig
 from handsim.space.objects import named_object, object_names
 from handsim.space.transforms import rotation_quaternions
-from track.viewer.recordings.recording import Curve, Doubt, Recording, ShownBody, ShownFrame, doubtful_frames
+from track.viewer.recordings.recording import Curve, Doubt, Recording, ShownBody, ShownFrame, runs_of
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
 
 _CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
+_MOST_DOUBTS: Final = 12  # rows
 
 
 class TrackedRecording(Recording):
@@ -32,20 +33,21 @@ class TrackedRecording(Recording):
         self._take = take
         self._models = tuple(hand.model for hand in take.hands)
         self._offsets = np.cumsum([0, *(hand.layout.num_markers for hand in take.hands)])
-        certain = frame_confidence(take)
-        worst = doubtful_frames(certain, _CERTAIN)
-        curves = [Curve(f"{side} RMS [mm]", 1e3 * take.rms[:, hand]) for hand, side in enumerate(take.sides)]
-        points = np.isfinite(take.points[..., 0]).sum(axis=1) + take.filled.sum(axis=(1, 2))
+        points = np.isfinite(take.points[..., 0]).sum(axis=1)
         super().__init__(
             take.times,
             take.label_names,
-            most_points=int(points.max()),
+            most_points=int(points.max()) + int(self._offsets[-1]),
             radius=take.hands[0].layout.radius,
             bodies=tuple(shown_body(body.name) for body in take.bodies),
             rig=rig,
-            curves=(*curves, Curve("doubt, 0 to 1", 1.0 - certain)),
-            doubts=tuple(Doubt(frame, self._doubt(frame, value)) for frame, value in worst),
+            curves=_curves(take),
+            doubts=doubts_of(take),
         )
+
+    def replace(self, take: TrackedTake) -> None:
+        """Show the same frames with other labels and poses."""
+        self._take, self.curves, self.doubts = take, _curves(take), doubts_of(take)
 
     def frame(self, index: int) -> ShownFrame:
         """One of the frames."""
@@ -83,18 +85,34 @@ class TrackedRecording(Recording):
         there = np.isfinite(take.points[index, :, 0])
         return [*lines, f"{there.sum()} points, {(take.labels[index, there] < 0).sum()} without label"]
 
-    def _doubt(self, frame: int, confidence: float) -> str:
-        take = self._take
-        states = [
-            f"{side} {STATUSES[take.status[frame, hand]]}"
-            for hand, side in enumerate(take.sides)
-            if take.status[frame, hand] in (LOST, COASTING)
-        ]
-        if states:
-            return ", ".join(states)
-        there = take.labels[frame] >= 0
-        label = take.labels[frame, there][take.confidence[frame, there].argmin()]
-        return f"{take.label_names[label]} {100 * confidence:.0f} %"
+
+def doubts_of(take: TrackedTake) -> tuple[Doubt, ...]:
+    """Spans in which a hand is lost or coasts, the longest first, then unsure labels, the worst first.
+
+    A hand that has not been seen yet is not lost.
+    """
+    found: list[tuple[float, int, Doubt]] = []
+    for number, side in enumerate(take.sides):
+        status = take.status[:, number]
+        known = np.logical_or.accumulate(status != LOST)
+        for first, last in runs_of(known & ((status == LOST) | (status == COASTING))):
+            state = LOST if (status[first : last + 1] == LOST).any() else COASTING
+            found.append((0.0, last - first, Doubt(first, last, first, f"{side} {STATUSES[state]}")))
+    sure = np.where(take.labels >= 0, take.confidence, 1.0)
+    least = sure.min(axis=1, initial=1.0)
+    for first, last in runs_of(least < _CERTAIN):
+        worst = first + int(least[first : last + 1].argmin())
+        label = take.label_names[take.labels[worst, sure[worst].argmin()]]
+        words = f"{label} {100 * least[worst]:.0f} %"
+        found.append((float(least[worst]), last - first, Doubt(first, last, worst, words)))
+    found.sort(key=lambda entry: (entry[0], -entry[1], entry[2].first))
+    return tuple(doubt for *_, doubt in found[:_MOST_DOUBTS])
+
+
+def _curves(take: TrackedTake) -> tuple[Curve, ...]:
+    """RMS of each hand, and doubt."""
+    curves = [Curve(f"{side} RMS [mm]", 1e3 * take.rms[:, hand]) for hand, side in enumerate(take.sides)]
+    return (*curves, Curve("doubt, 0 to 1", 1.0 - frame_confidence(take)))
 
 
 def frame_confidence(take: TrackedTake) -> Float[np.ndarray, "T"]:

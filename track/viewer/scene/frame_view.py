@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -51,6 +52,9 @@ class FrameView:
         """The rigid bodies, in their order."""
         self._rays: LineSegmentsHandle | None = None
         self._clicked: frozenset[int] = frozenset()
+        self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points among the frame's
+        self.on_pick: Callable[[int], None] = lambda index: None
+        """Called with the index of a point of the frame that was clicked."""
         self._frame: ShownFrame | None = None
         self._add_switches()
         if recording.rig is not None:
@@ -115,6 +119,7 @@ class FrameView:
             return
         frame = self._frame
         kept = (self._ghosts.value | (frame.labels >= 0)) & (self._filled.value | frame.seen)
+        self._kept = np.flatnonzero(kept)
         self.balls.show(frame.points[kept], frame.labels[kept], frame.seen[kept])
         every = frozenset(range(len(self._recording.label_names)))
         self.balls.name(every if self._names.value else self._clicked)
@@ -134,9 +139,12 @@ class FrameView:
     def _click(self, event: SceneNodePointerEvent[BatchedMeshHandle]) -> None:
         """Name the clicked marker, or leave it without a name again."""
         index = self.balls.nearest(np.array(event.ray_origin), np.array(event.ray_direction))
-        if index is not None and (label := self.balls.label_at(index)) >= 0:
+        if index is None:
+            return
+        if (label := self.balls.label_at(index)) >= 0:
             self._clicked ^= {label}
             self._refresh()
+        self.on_pick(int(self._kept[index]))
 
 
 def _add_body(server: ViserServer, body: ShownBody) -> MeshHandle | FrameHandle:

@@ -1,0 +1,159 @@
+"""A label that is corrected in the page is in the saved take and in the file beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+
+from gloves.takes.corrections import corrections_of, corrections_path
+from gloves.takes.tracked_take import load_tracked_take
+from handsim.errors import CaptureError
+from track.viewer.contents import open_content, show_recording
+from track.viewer.recordings.corrector import Corrector
+from track.viewer.recordings.takes import TrackedRecording
+
+TIP = "right:ThumbTip"
+
+
+@pytest.fixture
+def path(tracked, tmp_path):
+    """A take whose third point has the label of the fourth's marker in frames 8 to 14, and the other way."""
+    labels = tracked.labels.copy()
+    labels[8:15, [2, 3]] = labels[8:15, [3, 2]]
+    dataclasses.replace(tracked, labels=labels).save(tmp_path / "tracked.npz")
+    return tmp_path / "tracked.npz"
+
+
+@pytest.fixture
+def open_page(server, page_of, path):
+    """The page of the take, served from a thread."""
+    ended = threading.Event()
+    run = open_content(str(path)).show(server)
+    serving = threading.Thread(target=run, args=(ended.is_set,))
+    serving.start()
+    yield page_of(server)
+    ended.set()
+    serving.join()
+
+
+def click(page, point) -> None:
+    page.send(
+        "SceneNodeClickMessage", name="/points", instance_index=None, owner="", modifier=None,
+        ray_origin=(np.asarray(point) + [0.0, 0.0, 0.5]).tolist(), ray_direction=[0.0, 0.0, -1.0],
+        screen_pos=[0.5, 0.5],
+    )  # fmt: skip
+
+
+def value(page, label):
+    (found,) = [props["value"] for props in page.panel.values() if props.get("label") == label]
+    return found
+
+
+def test_a_click_two_labels_and_a_save(open_page, path, tracked):
+    page, names = open_page, tracked.label_names
+    page.press("frame", 10)
+    page.wait(lambda: page.says("**frame 10** of 30"))
+    click(page, tracked.points[10, 2])
+    page.wait(lambda: page.says(f"**ID 2: {names[3]}**, 99 %, with this label in frames 8 to 14"))
+    page.settle()
+    assert list(value(page, "frames")) == [8, 14] and value(page, "right label") == names[3]
+    np.testing.assert_allclose(page.places["/chosen"], tracked.points[10, 2])
+    assert "/chosen" not in page.hidden
+    page.press("right label", names[2])
+    page.settle()
+    page.press("Correct")
+    page.wait(lambda: page.says(f"corrected: {names[2]} in frames 8 to 14"))
+    page.press("point", "ID 3: none")  # it lost the label to the other point
+    page.wait(lambda: value(page, "right label") == "none")
+    page.press("right label", names[3])
+    page.settle()
+    page.press("Correct")
+    page.wait(lambda: page.says(f"corrected: {names[3]}"))
+    page.press("Save take")
+    page.wait(lambda: page.says("saved "))
+    saved = load_tracked_take(path)
+    np.testing.assert_array_equal(saved.labels, tracked.labels)
+    assert (saved.confidence[8:15, 2:4] == 1.0).all()
+    np.testing.assert_allclose(saved.markers[8:15, 0, 2:4], tracked.points[8:15, 2:4])
+    assert [one.label for one in corrections_of(path)] == [names[2], names[3]]
+    again = Corrector(path, saved)
+    assert not again.unsaved and again.take is saved, "what the take has is not made again"
+
+
+def test_what_was_not_saved_is_taken_back(open_page, path, tracked):
+    page = open_page
+    page.press("point", f"ID 5: {tracked.label_names[5]}")
+    page.wait(lambda: page.says("**ID 5:"))
+    page.press("shown frame is", "last")
+    page.wait(lambda: list(value(page, "frames")) == [0, 0])
+    page.press("right label", "none")
+    page.settle()
+    page.press("Correct")
+    page.wait(lambda: page.says("none in frames 0 to 0, not saved"))
+    page.wait(lambda: np.ptp(page.nodes["/points"]["batched_colors"][12:15]) == 0)  # column 4 has no point
+    page.press("Undo")
+    page.wait(lambda: page.says("taken back"))
+    page.wait(lambda: np.ptp(page.nodes["/points"]["batched_colors"][12:15]) > 0)
+    assert not corrections_path(path).exists()
+
+
+def test_a_marker_that_was_not_seen_has_no_point_to_correct(open_page, tracked):
+    click(open_page, tracked.markers[0, 0, 4])
+    open_page.wait(lambda: open_page.says("That marker was not seen"))
+    open_page.press("Correct")
+    open_page.wait(lambda: open_page.says("Choose a point first"))
+
+
+def test_the_span_is_cut_to_where_the_point_is(path):
+    corrector = Corrector(path, load_tracked_take(path))
+    assert corrector.span_of(0, 20) == (0, 24), "the left hand is lost from frame 25 on"
+    correction = corrector.add(3, 20, (0, 29), "none")
+    assert (correction.first, correction.last) == (0, 24)
+    with pytest.raises(CaptureError, match="the point is not there in frames 26 to 29"):
+        corrector.add(3, 20, (26, 29), "none")
+
+
+def test_one_label_for_two_points_is_refused_until_one_of_them_gives_it_back(path):
+    corrector = Corrector(path, load_tracked_take(path))
+    corrector.add(10, 2, (8, 14), TIP)
+    with pytest.raises(CaptureError, match="two points of frame 9 are corrected to right:ThumbTip"):
+        corrector.add(10, 3, (9, 9), TIP)
+    assert len(corrector.added) == 1
+    corrector.add(10, 2, (9, 9), "none")
+    corrector.add(10, 3, (9, 9), TIP)
+    assert len(corrector.added) == 3
+
+
+def test_files_that_changed_meanwhile_are_not_overwritten(path, tracked):
+    corrector = Corrector(path, load_tracked_take(path))
+    corrector.add(10, 2, (8, 14), "none")
+    tracked.save(path)
+    with pytest.raises(CaptureError, match="have changed since they were opened"):
+        corrector.save()
+    assert not corrections_path(path).exists()
+
+
+def test_a_file_that_the_take_does_not_know_is_applied_and_told(path, tracked, recwarn):
+    x, y, z = (1e3 * tracked.points[8, 2]).tolist()
+    corrections_path(path).write_text(
+        f'[[correction]]\nframes = [8, 14]\nplace_mm = [{x}, {y}, {z}]\nlabel = "{TIP}"\n'
+        '[[correction]]\nframes = [8, 14]\nplace_mm = [0, 0, 0]\nlabel = "none"\n'
+    )
+    open_content(str(path))
+    assert "none in frames 8 to 14 no longer fits" in str(recwarn.pop().message)
+    corrector = Corrector(path, load_tracked_take(path))
+    index = tracked.label_names.index(TIP)
+    assert corrector.unsaved and (corrector.take.labels[8:15, 2] == index).all()
+    corrections_path(path).write_text(
+        '[[correction]]\nframes = [8, 99]\nplace_mm = [0, 0, 0]\nlabel = "none"\n'
+    )
+    with pytest.raises(CaptureError, match=r"tracked\.corrections\.toml: correction 1 is for frames 8 to 99"):
+        open_content(str(path))
+
+
+def test_only_a_take_with_a_file_can_be_corrected(server, page_of, tracked):
+    show_recording(server, TrackedRecording(tracked))
+    assert not any(props.get("label") == "Correct labels" for props in page_of(server).panel.values())
