@@ -51,6 +51,9 @@ DEMO_STEPS: Final = (
     "train.commands.demo:figures_section",
 )
 
+VIDEO_WRITER: Final = "render.illustrations.clip:write_clip"
+"""What draws the video of `handsim view --video`; its package is not imported by that of the command."""
+
 
 def load(target: str) -> Any:
     """What "module:name" stands for, imported now and not before."""

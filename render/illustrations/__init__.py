@@ -5,5 +5,6 @@
 - drawing: colors and depth of a scene.
 - captions: names with leader lines, titles, pictures side by side, PNG files.
 - hands: sizes, gestures, gloves, camera views and labeled frames of hands.
+- clip: a video of hands and points in one view.
 - contact_sheet: rendered frames on one sheet, with keypoints and colored depth.
 """

@@ -15,6 +15,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GlovedHand, GloveFit, attach
 from gloves.layout import load_layout, save_layout, starter_layout
+from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import STATUSES, MarkedBody, TrackedTake
 from handsim.hand.model import HandModel
@@ -134,6 +135,15 @@ def own_poses(folder: Path) -> list[Path]:
 def body(folder: Path) -> list[Path]:
     save_body(folder / "body.toml", RigidTemplate.of(named_object("controller")))
     return [folder / "body.toml"]
+
+
+def corrections(folder: Path) -> list[Path]:
+    made = [
+        Correction(3, 7, (0.1, -0.2, 1.0), "right:ThumbTip"),
+        Correction(0, 0, (0.0, 0.0, 0.0), NO_MARKER),
+    ]
+    save_corrections(folder / "take.corrections.toml", made)
+    return [folder / "take.corrections.toml"]
 
 
 def mesh(folder: Path) -> list[Path]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
+from gloves.takes.corrections import load_corrections
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import load_tracked_take
 from handsim.errors import HandSimError
@@ -112,6 +113,7 @@ _ALL: Final = (
     Target("mesh", seeds.mesh, load_object),
     Target("truth", seeds.truth, load_take, mutate_archive),
     Target("tracked", seeds.tracked, load_tracked_take, mutate_archive),
+    Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
     Target("weights", seeds.weights, _read_weights),
     Target("onnx", seeds.onnx, _read_onnx),

@@ -12,7 +12,9 @@ from rich.console import Console
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.live_status import LiveStatus
 from handsim.app.messages import print_line
+from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
+from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from handsim.space.cameras import load_rig
 from track.bodies.body_file import load_bodies
@@ -21,9 +23,10 @@ from track.commands.live import first_frames
 from track.commands.track import SHOWN, TrackerStart
 from track.commands.user_options import USUAL_SIZE, Size, users_of
 from track.streams.addresses import open_source
-from track.viewer.contents import open_content
+from track.viewer.contents import Content, first_look, open_content
 from track.viewer.live_view import LiveView
 from track.viewer.server import LOOPBACK, address_of, opened_server
+from track.viewer.video import write_video
 from train.labelers.storage import labeler_for_glove
 
 
@@ -41,8 +44,11 @@ def view(
     hands: tuple[Side, ...] | None = None,
     body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     labeler: str | None = None,
+    video: Path | None = None,
 ) -> None:
     """Show a file or a live tracker in the browser; Ctrl-C ends it.
+
+    In a tracked take labels can be corrected, and are saved.
 
     Args:
         file: A marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture
@@ -59,11 +65,14 @@ def view(
         hands: Which hands a live tracker follows; both, or those of --shape, when not given.
         body: A rigid body for a live tracker, once per body.
         labeler: Folder of a trained labeler for a live tracker, or an exported .onnx file.
+        video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
     """
     if (file is None) == (live is None):
         given = "neither a file nor --live" if file is None else f"a file, {file}, and --live {live}"
         raise ArgumentError(f"given {given}, expected a file or --live natnet://host")
     if live is not None:
+        if video is not None:
+            raise ArgumentError(f"--video is {video}, but a live view is not drawn; see handsim track")
         if out is not None:
             raise ArgumentError(f"--out is {out}, but nothing of a live view is saved; see handsim track")
         start = TrackerStart(
@@ -74,10 +83,29 @@ def view(
     content = open_content(
         str(file), out=out, size=USUAL_SIZE if size is None or size == "auto" else size, rig=rig
     )
+    if video is not None:
+        _draw(str(file), content, video)
+        return
     with interrupt_flag() as ended, opened_server(host, port, "handsim view") as server:
         run = content.show(server)
         print_line(f"{file} ({content.kind}): {address_of(server)} ; Ctrl-C ends it")
         run(ended)
+
+
+def _draw(name: str, content: Content, video: Path) -> None:
+    """Draw the video of a recording."""
+    check_outputs((name,), (video,))
+    recording = content.recording
+    if recording is None:
+        raise ArgumentError(f"--video is {video}, but {name} is a {content.kind}: nothing in it moves")
+    with progress_bar("pictures") as (bar, task):
+        count = write_video(
+            video,
+            recording,
+            first_look(recording),
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print_line(f"{video}: {count} pictures of {name} ({content.kind})")
 
 
 def _view_live(

@@ -11,5 +11,6 @@ Nothing here imports viser, the package that serves the page, but `server`, when
 `live_view`: the newest frame of a tracker that runs.
 `label_editor`: labels of a tracked take, corrected over a span of frames and saved.
 `layout_editor`: a layout whose markers are dragged over the skin.
+`video`: a recording as a video file, without a browser.
 `user_view`: a calibrated user's hands over those of a named size.
 """

@@ -57,6 +57,8 @@ class Content(NamedTuple):
     """In words."""
     show: Callable[[ViserServer], Run]
     """Puts it into a page; the result serves that page."""
+    recording: Recording | None = None
+    """Its frames, where there are some."""
 
 
 def open_content(name: str, *, out: Path | None = None, size: str = "M", rig: str | None = None) -> Content:
@@ -94,7 +96,7 @@ def open_content(name: str, *, out: Path | None = None, size: str = "M", rig: st
         return Content("user", lambda server: _still(UserView(server, hands)))
     recording, corrector = _recording(path, None if rig is None else load_rig(rig))
     kind = type(recording).__name__.removesuffix("Recording").lower()
-    return Content(kind, lambda server: show_recording(server, recording, corrector))
+    return Content(kind, lambda server: show_recording(server, recording, corrector), recording)
 
 
 def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector | None]:
@@ -165,17 +167,18 @@ def show_recording(server: ViserServer, recording: Recording, corrector: Correct
             editor.show(index, hurried=timeline.playing)
 
     def changed() -> None:
-        panel.renew_lists()
+        panel.renew()
         timeline.refresh()
 
     timeline = Timeline(server, recording.times, show)
     panel = StatusPanel(server, recording)
     view = FrameView(server, recording)
+    panel.add_doubts(timeline.jump)
     editor: LabelEditor | None = None
     if corrector is not None and isinstance(recording, TrackedRecording):
         editor = LabelEditor(server, recording, corrector, changed)
         view.on_pick = editor.pick
-    panel.add_lists(timeline.jump)
+    panel.add_plots()
     set_stage(server, first_look(recording))
     timeline.update()
     return timeline.run

@@ -37,22 +37,25 @@ class StatusPanel:
         self._buttons: list[GuiButtonHandle] = []
         self._plots: list[tuple[GuiUplotHandle, list[int]]] = []
 
-    def add_lists(self, go_to: Callable[[int], None]) -> None:
-        """Add the rows and the plots.
+    def add_doubts(self, go_to: Callable[[int], None]) -> None:
+        """Add the rows of doubtful frames, if there are any.
 
         Args:
             go_to: Called with a frame whose row was clicked.
         """
-        server, recording = self._server, self._recording
         self._go_to = go_to
-        if recording.doubts:
-            self._rows = server.gui.add_folder("Doubtful frames")
+        if self._recording.doubts:
+            self._rows = self._server.gui.add_folder("Doubtful frames")
             self._add_rows(self._rows)
+
+    def add_plots(self) -> None:
+        """Add the plots, if there is anything to plot."""
+        server, recording = self._server, self._recording
         if recording.curves and recording.num_frames > 1:
             with server.gui.add_folder("Over time", expand_by_default=True):
                 self._plots = _add_plots(server, recording)
 
-    def renew_lists(self) -> None:
+    def renew(self) -> None:
         """Show the rows and the plots of a recording that was changed."""
         if self._rows is not None:
             for row in self._buttons:

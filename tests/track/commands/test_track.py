@@ -6,6 +6,7 @@ import contextlib
 import functools
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -22,10 +23,12 @@ from gloves.captures.formats import read_capture, write_capture
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.archives import CutOffWarning
+from gloves.takes.corrections import NO_MARKER
 from gloves.takes.growing import GrownArchive
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import LOST, load_tracked_take
 from handsim.app.cli import main
+from handsim.errors import HandSimWarning
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
@@ -34,6 +37,7 @@ from track.evaluation.hand_errors import hand_errors
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
 from track.user import load_user
+from track.viewer.recordings.corrector import Corrector
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
 FRAMES = 60
@@ -114,6 +118,52 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     np.testing.assert_allclose(seen, take.observed("right"), atol=1e-6)
     unlabeled = np.isfinite(columns.positions[:, 38:, 0]).sum()
     assert f"{unlabeled} of " in lines[3]
+
+
+def test_corrections_come_back_with_a_new_tracking(capture, tmp_path, capsys, recwarn):
+    out, labeled = tmp_path / "tracked.npz", tmp_path / "labeled.trc"
+    arguments = ["track", str(capture), "--out", str(out), "--size", "L"]
+    assert main(arguments) == 0
+    first = load_tracked_take(out)
+    corrector = Corrector(out, first)
+    (column,) = np.flatnonzero(first.labels[30] == 5)
+    number = first.ids[30, column]
+    corrector.add(30, column, (20, 40), NO_MARKER)
+    corrector.save()
+    saved = load_tracked_take(out)
+    about = (first.ids == number) & np.isin(np.arange(FRAMES), np.arange(20, 41))[:, None]
+    assert (saved.labels[about] == -1).all() and (first.labels[about] == 5).all()
+    capsys.readouterr()
+    assert main([*arguments, "--labeled", str(labeled)]) == 0
+    beside = tmp_path / "tracked.corrections.toml"
+    assert (
+        f"{beside}: 1 correction applied, {about.sum()} labels in {about.sum()} frames"
+        in capsys.readouterr().out
+    )
+    again = load_tracked_take(out)
+    np.testing.assert_array_equal(again.labels, saved.labels)
+    np.testing.assert_allclose(again.qpos, saved.qpos, atol=1e-9)
+    assert again.settings["corrections"] == saved.settings["corrections"] != []
+    rows = about.any(axis=1)
+    assert np.isnan(read_capture(labeled).positions[rows, 5]).all()
+
+    beside.write_text(re.sub("place_mm = .*", "place_mm = [5000, 0, 0]", beside.read_text()))
+    assert main(arguments) == 0
+    assert "the correction to none in frames" in str(recwarn.pop(HandSimWarning).message)
+    np.testing.assert_array_equal(load_tracked_take(out).labels, first.labels)
+
+
+def test_corrections_that_cannot_be_meant_are_told_before_the_work(capture, tmp_path, capsys):
+    out, beside = tmp_path / "tracked.npz", tmp_path / "tracked.corrections.toml"
+    beside.write_text('[[correction]]\nframes = [0, 60]\nplace_mm = [0, 0, 0]\nlabel = "none"\n')
+    assert main(["track", str(capture), "--out", str(out), "--size", "L"]) == 1
+    assert (
+        f"{beside}: correction 1 is for frames 0 to 60, expected frames from 0 to 59"
+        in capsys.readouterr().err
+    )
+    assert main(["track", "--live", "natnet://127.0.0.1", "--out", str(out), "--size", "L"]) == 1
+    assert "corrects the take that --live would replace" in capsys.readouterr().err
+    assert not out.exists()
 
 
 def test_the_size_of_the_hands_is_measured(capture, tmp_path, capsys):

@@ -9,12 +9,15 @@ import threading
 import time
 import urllib.request
 
+import cv2
+import numpy as np
 import pytest
 
 from gloves.takes.take import load_take
 from handsim.app.cli import main
 from track.streams.natnet_server import ReplayServer
 from track.viewer import live_view
+from track.viewer.video import chosen_frames
 
 FRAMES = 120
 
@@ -83,6 +86,35 @@ def test_a_live_tracker_is_shown_and_frames_are_never_dropped(capture, capsys, m
     assert frames == len(offered) and 5 < pictures < frames
 
 
+def test_a_video_is_drawn_without_a_page(capture, tmp_path, capsys):
+    out = tmp_path / "take.mp4"
+    truth = capture.with_suffix(".truth.npz")
+    assert main(["view", str(truth), "--video", str(out)]) == 0
+    assert f"{out}: 30 pictures of {truth} (truth)" in capsys.readouterr().out
+    video = cv2.VideoCapture(str(out))
+    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (30, 30)
+    pictures = [video.read()[1].astype(int) for _ in range(30)]
+    paper = pictures[0][0, 0]
+    drawn = [(np.abs(picture - paper).max(axis=-1) > 40).mean() for picture in pictures]
+    assert min(drawn) > 0.01, "a hand is in every picture"
+    assert np.abs(pictures[0] - pictures[-1]).max() > 100, "and it moves"
+
+    assert main(["view", str(truth), "--video", str(tmp_path / "take.avi")]) == 1
+    assert "expected a name that ends in .mp4" in capsys.readouterr().err
+
+    assert not (tmp_path / "take.avi").exists()
+
+
+def test_a_video_keeps_the_time_of_the_take():
+    assert chosen_frames(np.arange(120) / 120.0) == (30.0, list(range(0, 120, 4)))
+    rate, frames = chosen_frames(np.arange(5) / 4.0)
+    assert (rate, frames) == (4.0, [0, 1, 2, 3, 4])
+    gap = np.concatenate([np.arange(12), 60 + np.arange(12)]) / 120.0
+    rate, frames = chosen_frames(gap)
+    assert frames == [0, 4, 8, *[11] * 12, 12, 16, 20], "while nothing came, the last frame stays"
+    assert chosen_frames(np.array([3.0])) == (30.0, [0])
+
+
 def test_what_cannot_be_shown_is_told_in_one_line(tmp_path, capture, capsys):
     for arguments, words in (
         ([], "neither a file nor --live, expected a file or --live natnet://host"),
@@ -93,6 +125,8 @@ def test_what_cannot_be_shown_is_told_in_one_line(tmp_path, capture, capsys):
         ),
         ([str(tmp_path / "take.xyz")], "a file of another kind, expected a marker layout or camera rig"),
         (["dense91"], "no such file, folder or shipped name"),
+        (["dense19", "--video", str(tmp_path / "x.mp4")], "dense19 is a layout: nothing in it moves"),
+        (["--live", "natnet://127.0.0.1", "--video", "x.mp4"], "a live view is not drawn"),
         ([str(capture), "--rig", "seven"], "unknown camera rig 'seven'"),
         ([str(capture), "--port", "70000"], "--port is 70000"),
     ):
