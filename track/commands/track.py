@@ -98,9 +98,7 @@ def track(
     user = users_of(glove, size, shape, hands)
     bodies = load_bodies(body)
     source = None if capture is None else read_capture(capture)
-    corrections = _corrections_for(
-        out, source, label_names(user, bodies)
-    )
+    corrections = _corrections_for(out, source, label_names(user, bodies))
     start = TrackerStart(user, labeler_for_glove(glove, labeler), bodies, glove)
     start.settings.update(
         capture=live if capture is None else capture.name,

@@ -181,7 +181,14 @@ def show_recording(server: ViserServer, recording: Recording, corrector: Correct
     panel.add_plots()
     set_stage(server, first_look(recording))
     timeline.update()
-    return timeline.run
+
+    def run(ended: Callable[[], bool]) -> None:
+        timeline.run(ended)
+        if corrector is not None and corrector.added:
+            lost = "; ".join(map(str, corrector.added))
+            warnings.warn(f"{corrector.path}: not saved: {lost}", HandSimWarning, stacklevel=2)
+
+    return run
 
 
 def first_look(recording: Recording) -> np.ndarray:

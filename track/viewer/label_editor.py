@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _NOTHING: Final = "choose"
-_HALO: Final = 2.0  # radius around the chosen point, in radii of a marker
+_HALO: Final = 2.5  # radius around the chosen point, in radii of a marker
 _HALO_COLOR: Final = (255, 190, 0)
 _LISTED: Final = 12  # corrections
 
@@ -44,7 +44,7 @@ class LabelEditor:
         self.chosen: tuple[int, int] | None = None
         """Frame and column of the chosen point."""
         self.halo = server.scene.add_icosphere(
-            "/chosen", _HALO * recording.radius, _HALO_COLOR, opacity=0.45, cast_shadow=False, visible=False
+            "/chosen", _HALO * recording.radius, _HALO_COLOR, opacity=0.5, cast_shadow=False, visible=False
         )
         """Around the chosen point."""
         self._add_controls(server)

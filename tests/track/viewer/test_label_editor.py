@@ -10,7 +10,7 @@ import pytest
 
 from gloves.takes.corrections import corrections_of, corrections_path
 from gloves.takes.tracked_take import load_tracked_take
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, HandSimWarning
 from track.viewer.contents import open_content, show_recording
 from track.viewer.recordings.corrector import Corrector
 from track.viewer.recordings.takes import TrackedRecording
@@ -98,6 +98,14 @@ def test_what_was_not_saved_is_taken_back(open_page, path, tracked):
     page.wait(lambda: page.says("taken back"))
     page.wait(lambda: np.ptp(page.nodes["/points"]["batched_colors"][12:15]) > 0)
     assert not corrections_path(path).exists()
+
+
+def test_what_is_not_saved_at_the_end_is_told(server, path):
+    corrector = Corrector(path, load_tracked_take(path))
+    run = show_recording(server, TrackedRecording(corrector.take), corrector)
+    corrector.add(10, 2, (8, 14), TIP)
+    with pytest.warns(HandSimWarning, match=rf"tracked\.npz: not saved: {TIP} in frames 8 to 14"):
+        run(lambda: True)
 
 
 def test_a_marker_that_was_not_seen_has_no_point_to_correct(open_page, tracked):
