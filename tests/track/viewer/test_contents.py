@@ -148,7 +148,10 @@ def test_doubtful_frames_are_the_worst_of_their_runs(tracked):
     assert [doubt[:3] for doubt in doubts_of(take)] == [
         (25, 29, 25), (12, 13, 12), (10, 10, 10), (20, 20, 20), (4, 6, 5)
     ], "the longest loss first; not there yet is not lost"  # fmt: skip
-    assert [doubt.words for doubt in doubts_of(take)][1::3] == ["left coasting", "right:IndexPIP 70 %"]
+    assert [doubt.words for doubt in doubts_of(take)][1::3] == [
+        "left coasting",
+        f"{tracked.label_names[7]} 70 %",
+    ]
     certain = frame_confidence(tracked)
     assert certain[10] == certain[25] == 0.0 and certain[20] == 0.4
     assert (np.delete(certain, [10, 20, 25]) == 0.99).all(), "lost for long is no news"
