@@ -35,7 +35,7 @@ class Attachment:
 
     layout: MarkerLayout
     points: Float[np.ndarray, "M 3"]
-    """Marker centers at zero angles, in the wrist frame [m]: one radius above the skin."""
+    """Marker centers at zero angles, in the wrist frame [m]: one radius above the skin, and a stalk's length."""
     normals: Float[np.ndarray, "M 3"]
     """Outward unit directions of the skin under the markers, at zero angles."""
     bone_indices: Int[np.ndarray, "M 4"]
@@ -122,7 +122,7 @@ def attach_markers(layout: MarkerLayout, model: HandModel) -> Attachment:
     corners = surface.faces[faces]
     normals = np.einsum("mk,mki->mi", bary, _normals_at(corners, surface))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = origins + distances[:, None] * directions + layout.radius * normals
+    points = origins + distances[:, None] * directions + layout.heights[:, None] * normals
     indices, shares = _blend_weights(surface, corners, bary)
     return Attachment(layout, points, normals, indices, shares)
 

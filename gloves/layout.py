@@ -12,12 +12,17 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from handsim.errors import HandSimError, LayoutError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, number_of, quoted, tables_of, text_of, written
-from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, PALM
+from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
 
 FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60
@@ -27,9 +32,11 @@ ALONG_RANGE: Final = (-0.3, 1.3)
 _AROUND_RANGE: Final = (-180.0, 180.0)  # [deg]
 ACROSS_RANGE: Final = (-1.0, 1.0)
 """Of `MarkerPlace.across`."""
+HEIGHT_RANGE: Final = (0.0, 0.05)
+"""Of `MarkerPlace.height` [m]."""
 _SHIPPED: Final = Path(__file__).parent / "layouts"
-_LAYOUT_KEYS: Final = ("name", "description", "radius_mm", "marker")
-_MARKER_KEYS: Final = ("name", "bone", "along", "around", "across")
+_LAYOUT_KEYS: Final = ("name", "description", "source", "sides", "radius_mm", "marker")
+_MARKER_KEYS: Final = ("name", "bone", "along", "around", "across", "height_mm")
 _STARTER: Final = """\
 # A marker glove. Places are fractions of the bones they sit on, so one file fits every size of hand.
 # Check it with `handsim glove check FILE`, which draws the markers on the hand.
@@ -45,6 +52,7 @@ radius_mm = 3.2  # of every marker, 0.5 to 15
 #   around  degrees about the bone: 0 = back of the hand (nail side), 90 = thumb side,
 #           -90 = little-finger side, 180 = palm side
 #   across  palm only: sideways from the middle of the palm, in hand breadths, positive towards the thumb
+#   height_mm  optional: the length of a stalk, 0 to 50; without it the marker lies on the skin
 # A labeler tells markers apart by their pattern: keep the three on the back away from any symmetry, and every
 # marker where a camera can see it in most poses."""
 
@@ -66,6 +74,8 @@ class MarkerPlace:
     """Angle about the bone [rad]: 0 back, pi/2 thumb side, -pi/2 little-finger side, pi palm side."""
     across: float = 0.0
     """For the palm alone: sideways from its middle, in hand breadths, positive towards the thumb."""
+    height: float = 0.0
+    """Length of the stalk [m]: how far the center stands above where it is when the marker lies on the skin."""
 
     def __post_init__(self) -> None:
         if not self.name or self.name != self.name.strip() or not self.name.isprintable():
@@ -75,13 +85,13 @@ class MarkerPlace:
         if self.bone not in BONE_NAMES:
             raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
         degrees = math.degrees(self.around)
-        for key, value, (low, high) in (
-            ("along", self.along, ALONG_RANGE),
-            ("around", round(degrees, 9), _AROUND_RANGE),
-            ("across", self.across, ACROSS_RANGE),
+        for key, value, (low, high), unit in (
+            ("along", self.along, ALONG_RANGE, ""),
+            ("around", round(degrees, 9), _AROUND_RANGE, " degrees"),
+            ("across", self.across, ACROSS_RANGE, ""),
+            ("height_mm", round(1e3 * self.height, 9), (0.0, 1e3 * HEIGHT_RANGE[1]), " millimeters"),
         ):
             if not low <= value <= high:
-                unit = " degrees" if key == "around" else ""
                 raise LayoutError(
                     f"marker '{self.name}': {key} is {value:g}, expected {low:g} to {high:g}{unit}"
                 )
@@ -103,9 +113,12 @@ class MarkerLayout:
     markers: tuple[MarkerPlace, ...]
     radius: float
     """Radius of every marker [m]."""
+    sides: tuple[Side, ...] = SIDES
+    """The hands that the glove fits: both, or one."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "markers", tuple(self.markers))
+        object.__setattr__(self, "sides", tuple(self.sides))
         if not self.name or not self.name.isprintable():
             raise LayoutError(f"layout name {self.name!r}: expected printable characters")
         if not FEWEST_MARKERS <= self.num_markers <= MOST_MARKERS:
@@ -121,15 +134,37 @@ class MarkerLayout:
                 f"radius_mm is {self.radius * 1e3:g}, expected {low * 1e3:g} to {high * 1e3:g} millimeters"
             )
 
+        for side in self.sides:
+            if side not in SIDES:
+                raise LayoutError(f"sides: {choices(side, SIDES, noun='side')}")
+        if not self.sides or len(set(self.sides)) < len(self.sides):
+            raise LayoutError('sides: expected "right", "left" or both, each once')
+
     @property
     def names(self) -> tuple[str, ...]:
         """Marker names in label order."""
         return tuple(marker.name for marker in self.markers)
 
     @property
+    def heights(self) -> Float[np.ndarray, "M"]:
+        """Heights of the marker centers above the skin [m]: the radius, and the stalk where there is one."""
+        return self.radius + np.array([marker.height for marker in self.markers])
+
+    @property
     def num_markers(self) -> int:
         """Number of markers, M."""
         return len(self.markers)
+
+
+@dataclass(frozen=True, slots=True)
+class ShippedLayout:
+    """A layout that comes with the package, and what its file says about it."""
+
+    layout: MarkerLayout
+    description: str
+    """One sentence."""
+    source: str
+    """Where its markers were described: a publication or a page."""
 
 
 def list_layouts() -> tuple[str, ...]:
@@ -160,6 +195,23 @@ def load_layout(name_or_path: str | Path) -> MarkerLayout:
         return parse_layout(table)
     except HandSimError as error:
         raise LayoutError(f"{path}: {error}") from error
+
+
+def shipped_layout(name: str) -> ShippedLayout:
+    """A shipped layout with its description and its source.
+
+    Args:
+        name: One of `list_layouts`.
+
+    Raises:
+        LayoutError: There is no such layout.
+    """
+    if name not in list_layouts():
+        raise LayoutError(choices(name, list_layouts(), noun="glove"))
+    table = read_toml(_SHIPPED / f"{name}.toml", error=LayoutError)
+    return ShippedLayout(
+        parse_layout(table), text_of(table, "description", default=""), text_of(table, "source", default="")
+    )
 
 
 def save_layout(path: str | Path, layout: MarkerLayout) -> None:
@@ -204,6 +256,8 @@ def starter_layout() -> str:
 def layout_lines(layout: MarkerLayout) -> list[str]:
     """The lines of a layout's file."""
     lines = [f"name = {quoted(layout.name)}", f"radius_mm = {written(layout.radius * 1e3)}"]
+    if set(layout.sides) != set(SIDES):
+        lines.append(f"sides = [{', '.join(map(quoted, layout.sides))}]")
     for marker in layout.markers:
         lines += _marker_lines(marker)
     return lines
@@ -213,7 +267,9 @@ def _marker_lines(marker: MarkerPlace) -> list[str]:
     """The lines of one [[marker]] table, after a blank one."""
     lines = ["", "[[marker]]", f"name = {quoted(marker.name)}", f"bone = {quoted(marker.bone)}"]
     lines += [f"along = {written(marker.along)}", f"around = {written(math.degrees(marker.around))}"]
-    return [*lines, f"across = {written(marker.across)}"] if marker.across else lines
+    lines += [f"across = {written(marker.across)}"] if marker.across else []
+    lines += [f"height_mm = {written(1e3 * marker.height)}"] if marker.height else []
+    return lines
 
 
 def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
@@ -222,23 +278,32 @@ def parse_layout(table: Mapping[str, object]) -> MarkerLayout:
     Raises:
         HandSimError: A value is missing, unknown or out of range.
     """
-    check_keys(table, "the file", _LAYOUT_KEYS, optional=("description", "marker"))
+    check_keys(table, "the file", _LAYOUT_KEYS, optional=("description", "source", "sides", "marker"))
     text_of(table, "description", default="")
+    text_of(table, "source", default="")
     markers = tuple(
         _parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)
     )
     radius = number_of(table, "radius_mm") * 1e-3
-    return MarkerLayout(text_of(table, "name"), markers, radius)
+    return MarkerLayout(text_of(table, "name"), markers, radius, _parse_sides(table))
+
+
+def _parse_sides(table: Mapping[str, object]) -> tuple[Side, ...]:
+    sides = table.get("sides", list(SIDES))
+    if not isinstance(sides, list) or not all(isinstance(side, str) for side in sides):
+        raise LayoutError(f'sides is {sides!r}, expected a list of "right" and "left"')
+    return tuple(sides)
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> MarkerPlace:
     name = table.get("name")
     owner = f"marker '{name}'" if isinstance(name, str) else f"marker number {number}"
-    check_keys(table, owner, _MARKER_KEYS, optional=("across",))
+    check_keys(table, owner, _MARKER_KEYS, optional=("across", "height_mm"))
     return MarkerPlace(
         text_of(table, "name", f"{owner}: "),
         text_of(table, "bone", f"{owner}: "),
         along=number_of(table, "along", f"{owner}: "),
         around=math.radians(number_of(table, "around", f"{owner}: ")),
         across=number_of(table, "across", f"{owner}: ", default=0.0),
+        height=number_of(table, "height_mm", f"{owner}: ", default=0.0) * 1e-3,
     )

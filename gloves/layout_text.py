@@ -41,7 +41,9 @@ def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
 
 def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
     """The lines of one table with the values of a marker; a value that is the same stays as it is written."""
-    numbers = {"along": marker.along, "around": math.degrees(marker.around), "across": marker.across}
+    numbers = {"along": marker.along, "around": math.degrees(marker.around)}
+    optional = {"across": marker.across, "height_mm": 1e3 * marker.height}
+    numbers |= optional
     result, met, last = [], set(), 0
     for line in lines:
         match = _ENTRY.match(line)
@@ -51,14 +53,14 @@ def _moved_table(lines: list[str], marker: MarkerPlace) -> list[str]:
             continue
         key = match[2]
         met.add(key)
-        if key == "across" and not marker.across:
+        if key in optional and not optional[key]:
             continue
         value = quoted(marker.bone) if key == "bone" else written(numbers[key])
         same = key != "bone" and _is_number(match[3], numbers[key])
         result.append(line if same else f"{match[1]}{value}{match[4]}")
         last = len(result)
-    if marker.across and "across" not in met:
-        result.insert(last, f"across = {written(marker.across)}")
+    new = [f"{key} = {written(value)}" for key, value in optional.items() if value and key not in met]
+    result[last:last] = new
     return result
 
 
@@ -75,10 +77,11 @@ def _says(text: str, layout: MarkerLayout) -> bool:
         read = parse_layout(tomllib.loads(text))
     except (HandSimError, ValueError):
         return False
-    return len(read.markers) == layout.num_markers and all(
+    return read.sides == layout.sides and len(read.markers) == layout.num_markers and all(
         (ours.name, ours.bone) == (theirs.name, theirs.bone)
         and abs(ours.along - theirs.along) < _DECIMALS
         and abs(ours.around - theirs.around) < _DECIMALS
         and abs(ours.across - theirs.across) < _DECIMALS
+        and abs(ours.height - theirs.height) < _DECIMALS
         for ours, theirs in zip(read.markers, layout.markers, strict=True)
     )

@@ -48,7 +48,7 @@ def place_marker(
     aside = point - surface.vertices[nearest]
     aside -= (aside @ normal) * normal
     aside *= min(1.0, _SPACING / max(float(np.linalg.norm(aside)), _NEAR))
-    center = surface.vertices[nearest] + aside + layout.radius * normal
+    center = surface.vertices[nearest] + aside + layout.heights[index] * normal
     bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
     best, least = layout, math.inf
     for bone in dict.fromkeys(bones):
@@ -72,7 +72,7 @@ def _place_on(
     wanted, start = center, model.rest_transforms[bone]
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
     best, least = layout, math.inf
-    for _ in range(_STEPS):  # the center is one radius off the skin, not along the ray that finds the skin
+    for _ in range(_STEPS):  # the center is one radius or more off the skin, not along the ray that finds the skin
         moved = _place(layout.markers[index], bone, model, wanted)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)
@@ -97,6 +97,7 @@ def _place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.f
     y *= 1.0 if model.shape.side == "right" else -1.0
     along = float(np.clip(x / model.skeleton.lengths[bone], *ALONG_RANGE))
     if bone != PALM:
-        return MarkerPlace(marker.name, BONE_NAMES[bone], along, math.atan2(y, z))
+        return MarkerPlace(marker.name, BONE_NAMES[bone], along, math.atan2(y, z), height=marker.height)
     across = float(np.clip(y / model.shape.breadth, *ACROSS_RANGE))
-    return MarkerPlace(marker.name, BONE_NAMES[bone], along, 0.0 if z >= 0.0 else math.pi, across)
+    around = 0.0 if z >= 0.0 else math.pi
+    return MarkerPlace(marker.name, BONE_NAMES[bone], along, around, across, marker.height)

@@ -8,6 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gloves.attachment import _crossings, _ray, attach_markers, vary_layout
 from gloves.layout import load_layout
@@ -17,6 +19,8 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.hand.skin.surface import linear_blend_skinning
 from handsim.space.transforms import MIRROR
+
+MODELS = {side: HandModel.named("M", side=side) for side in ("left", "right")}
 
 
 @pytest.mark.parametrize("glove", ["dense19", "sparse13"])
@@ -29,6 +33,20 @@ def test_markers_sit_one_radius_above_the_skin(glove, rng):
     np.testing.assert_allclose(distance, layout.radius, atol=0.0004)
     np.testing.assert_allclose(np.linalg.norm(attachment.normals, axis=1), 1.0)
     np.testing.assert_allclose(attachment.bone_weights.sum(axis=1), 1.0)
+
+
+@given(side=st.sampled_from(["left", "right"]), index=st.integers(0, 18), height=st.floats(0.0, 0.05))
+def test_a_stalk_lifts_its_marker_alone_straight_off_the_skin(side, index, height):
+    layout, model = load_layout("dense19"), MODELS[side]
+    markers = list(layout.markers)
+    markers[index] = dataclasses.replace(markers[index], height=height)
+    flat = attach_markers(layout, model)
+    lifted = attach_markers(dataclasses.replace(layout, markers=tuple(markers)), model)
+    expected = flat.points.copy()
+    expected[index] += height * flat.normals[index]
+    np.testing.assert_allclose(lifted.points, expected, atol=1e-12)
+    np.testing.assert_array_equal(lifted.normals, flat.normals)
+    np.testing.assert_array_equal(lifted.bone_weights, flat.bone_weights)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])

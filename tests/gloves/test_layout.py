@@ -67,6 +67,7 @@ NAMES = st.text(st.characters(exclude_categories=["C", "Z"]), min_size=1, max_si
 NUMBERS = {
     "along": st.floats(-0.3, 1.3),
     "around": st.floats(-180.0, 180.0).map(math.radians),
+    "height": st.just(0.0) | st.floats(0.0, 0.05),
 }
 PLACES = st.one_of(
     st.builds(MarkerPlace, NAMES, st.sampled_from(BONE_NAMES), **NUMBERS),
@@ -77,6 +78,7 @@ LAYOUTS = st.builds(
     NAMES,
     st.lists(PLACES, min_size=5, max_size=60, unique_by=lambda place: place.name).map(tuple),
     st.floats(0.0005, 0.015),
+    st.sampled_from([("left", "right"), ("right",), ("left",)]),
 )
 
 
@@ -85,13 +87,14 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, layout: MarkerLayo
     path = tmp_path_factory.mktemp("layout") / "glove.toml"
     save_layout(path, layout)
     again = load_layout(path)
-    assert (again.name, again.names) == (layout.name, layout.names)
+    assert (again.name, again.names, again.sides) == (layout.name, layout.names, layout.sides)
     assert again.radius == pytest.approx(layout.radius, abs=1e-12)
     for one, other in zip(layout.markers, again.markers, strict=True):
         assert other.bone == one.bone
         assert (other.along, other.around, other.across) == pytest.approx(
             (one.along, one.around, one.across), abs=1e-9
         )
+        assert other.height == pytest.approx(one.height, abs=1e-12)
     assert stored_layout(json.loads(json.dumps(dataclasses.asdict(layout)))) == layout
 
 
@@ -141,6 +144,16 @@ BAD = {
     "around too large": text(around="181"),
     "across on a finger": text(bone='"index_middle"', across="0.1"),
     "across too large": text(across="-1.5"),
+    "height below the skin": text(height_mm="-1"),
+    "height far off": text(height_mm="51"),
+    "height is NaN": text(height_mm="nan"),
+    "height is text": text(height_mm='"10"'),
+    "source is a number": text(head='name = "g"\nradius_mm = 3.2\nsource = 3'),
+    "unknown side": text(head='name = "g"\nradius_mm = 3.2\nsides = ["rihgt"]'),
+    "no side": text(head='name = "g"\nradius_mm = 3.2\nsides = []'),
+    "one side twice": text(head='name = "g"\nradius_mm = 3.2\nsides = ["left", "left"]'),
+    "sides is text": text(head='name = "g"\nradius_mm = 3.2\nsides = "left"'),
+    "sides is a list of numbers": text(head='name = "g"\nradius_mm = 3.2\nsides = [1]'),
     "not TOML": "name = ",
     "nested too deep": "name = " + "[" * 5000,
     "empty file": "",
@@ -168,6 +181,14 @@ def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]],
     actual["save onto a folder"] = str(caught.value).replace(str(tmp_path), "folder")
     assert not any("\n" in sentence for sentence in actual.values())
     golden("layout_errors", actual)
+
+
+def test_what_was_stored_before_stalks_and_sides_loads() -> None:
+    stored = json.loads(json.dumps(dataclasses.asdict(load_layout("dense19"))))
+    del stored["sides"]
+    for marker in stored["markers"]:
+        del marker["height"]
+    assert stored_layout(stored) == load_layout("dense19")
 
 
 def test_good_text_loads(tmp_path: Path) -> None:

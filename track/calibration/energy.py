@@ -59,7 +59,7 @@ ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 POSITION_SPREAD: Final = 0.006
 """Standard deviation of a marker's slip along the skin [m]; (noise / spread)^2 is the paper's lambda_1."""
 HEIGHT_SPREAD: Final = 0.002
-"""Standard deviation of a marker center's height around one radius above the skin [m]."""
+"""Standard deviation of a marker center's height around that of the design [m]."""
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
@@ -117,7 +117,7 @@ class Problem:
     Args:
         shape: Right hand that the parameters start from.
         design: Skin coordinates of the markers by the glove's design.
-        radius: Radius of the markers [m].
+        heights: Heights of the marker centers above the skin, as designed [m].
         targets: Labeled markers of the chosen frames [m]; NaN where missing.
         noise: Standard deviation of a marker's coordinates [m].
         robust_scale: Distance [m] at which a residual has half the cost of a quadratic one
@@ -128,13 +128,13 @@ class Problem:
         self,
         shape: HandShape,
         design: SkinCoordinates,
-        radius: float,
+        heights: Float[np.ndarray, "M"],
         targets: Float[np.ndarray, "F M 3"],
         *,
         noise: float,
         robust_scale: float,
     ) -> None:
-        self.shape, self.design, self.radius = shape, design, radius
+        self.shape, self.design, self.heights = shape, design, heights
         self.present: Bool[np.ndarray, "F M"] = np.isfinite(targets).all(axis=2)
         """Markers that are not missing."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
@@ -175,7 +175,7 @@ class Problem:
         cost = (squares / (1.0 + squares / self.robust_scale**2)).sum() / self.noise**2
         cost += estimate.parameters @ self.precision @ estimate.parameters
         cost += (fit.design_residuals * self._apply_position_precision(fit, fit.design_residuals)).sum()
-        cost += ((estimate.coordinates.heights - self.radius) ** 2).sum() / HEIGHT_SPREAD**2
+        cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / HEIGHT_SPREAD**2
         values, weights = self._joint_angle_residuals(estimate)
         cost += (weights * values**2).sum()
         if fit.geometry is not None and estimate.contacts is not None:
@@ -304,7 +304,7 @@ class Problem:
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
         result.shared[:] += heights.T @ heights / HEIGHT_SPREAD**2
-        result.shared_gradient[:] += (estimate.coordinates.heights - self.radius) @ heights / HEIGHT_SPREAD**2
+        result.shared_gradient[:] += (estimate.coordinates.heights - self.heights) @ heights / HEIGHT_SPREAD**2
         values, weights = self._joint_angle_residuals(estimate)
         angles = np.arange(6, 26)
         result.pose[:, angles, angles] += weights[:, :20] + weights[:, 20:]

@@ -44,7 +44,7 @@ def fit_proportions(
     seen = np.concatenate([some @ MIRROR if side == "left" else some for side, some in markers.items()])
     worn, shape = start.attachment, start.model.shape
     coordinates = nearest_coordinates(worn.points, shape)
-    problem = Problem(shape, coordinates, worn.layout.radius, seen, noise=_NOISE, robust_scale=_ROBUST_SCALE)
+    problem = Problem(shape, coordinates, worn.layout.heights, seen, noise=_NOISE, robust_scale=_ROBUST_SCALE)
     poses = PoseSolver(start).solve(seen).qpos
     estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
     estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _STEPS, None)

@@ -190,7 +190,7 @@ def displace_markers(
     coordinates = project_onto_skin(
         nearest_coordinates(worn.points, shape), worn.points + steps, build_skin(shape)
     )
-    heights = worn.layout.radius + rng.normal(scale=lift, size=len(steps))
+    heights = worn.layout.heights + rng.normal(scale=lift, size=len(steps))
     return attachment_at(worn.layout, coordinates._replace(heights=heights), shape)
 
 

@@ -228,7 +228,7 @@ def _initial_problem(
     problem = Problem(
         shape,
         coordinates,
-        worn.layout.radius,
+        worn.layout.heights,
         markers[track.frames[chosen]],
         noise=_FIRST_NOISE,
         robust_scale=_FIRST_SCALE,
@@ -264,7 +264,7 @@ def _with_touches(
     larger = Problem(
         problem.shape,
         problem.design,
-        problem.radius,
+        problem.heights,
         markers[track.frames[frames]],
         noise=effective_noise(noise, repeated_share(track.qpos, track.residuals), len(frames)),
         robust_scale=_SCALE_IN_NOISES * noise,
