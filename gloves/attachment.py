@@ -35,7 +35,7 @@ class Attachment:
 
     layout: MarkerLayout
     points: Float[np.ndarray, "M 3"]
-    """Marker centers at zero angles, in the wrist frame [m]: one radius above the skin, and a stalk's length."""
+    """Marker centers at zero angles, in the wrist frame [m]: one radius, and a stalk, above the skin."""
     normals: Float[np.ndarray, "M 3"]
     """Outward unit directions of the skin under the markers, at zero angles."""
     bone_indices: Int[np.ndarray, "M 4"]

@@ -137,6 +137,7 @@ def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
 
     Raises:
         ArgumentError: There is no such size or side.
-        LayoutError: A marker meets no skin; the message names the marker.
+        LayoutError: A marker meets no skin, and the message names it; or the glove is for the other hand.
     """
+    layout.check_side(side)
     return attach(layout, HandModel.named(size, side=side))

@@ -75,7 +75,7 @@ class MarkerPlace:
     across: float = 0.0
     """For the palm alone: sideways from its middle, in hand breadths, positive towards the thumb."""
     height: float = 0.0
-    """Length of the stalk [m]: how far the center stands above where it is when the marker lies on the skin."""
+    """Length of the stalk [m]: how far the center stands above its place on the skin without one."""
 
     def __post_init__(self) -> None:
         if not self.name or self.name != self.name.strip() or not self.name.isprintable():
@@ -139,6 +139,7 @@ class MarkerLayout:
                 raise LayoutError(f"sides: {choices(side, SIDES, noun='side')}")
         if not self.sides or len(set(self.sides)) < len(self.sides):
             raise LayoutError('sides: expected "right", "left" or both, each once')
+        object.__setattr__(self, "sides", tuple(sorted(self.sides)))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -149,6 +150,14 @@ class MarkerLayout:
     def heights(self) -> Float[np.ndarray, "M"]:
         """Heights of the marker centers above the skin [m]: the radius, and the stalk where there is one."""
         return self.radius + np.array([marker.height for marker in self.markers])
+
+    def check_side(self, side: Side) -> None:
+        """Raise a `LayoutError` if the glove does not fit this hand."""
+        if side not in self.sides:
+            raise LayoutError(
+                f"glove '{self.name}' is for a {self.sides[0]} hand only (its file's `sides`), and a {side} "
+                f"hand was asked for"
+            )
 
     @property
     def num_markers(self) -> int:

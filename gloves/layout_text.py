@@ -77,11 +77,15 @@ def _says(text: str, layout: MarkerLayout) -> bool:
         read = parse_layout(tomllib.loads(text))
     except (HandSimError, ValueError):
         return False
-    return read.sides == layout.sides and len(read.markers) == layout.num_markers and all(
-        (ours.name, ours.bone) == (theirs.name, theirs.bone)
-        and abs(ours.along - theirs.along) < _DECIMALS
-        and abs(ours.around - theirs.around) < _DECIMALS
-        and abs(ours.across - theirs.across) < _DECIMALS
-        and abs(ours.height - theirs.height) < _DECIMALS
-        for ours, theirs in zip(read.markers, layout.markers, strict=True)
+    return (
+        read.sides == layout.sides
+        and len(read.markers) == layout.num_markers
+        and all(
+            (ours.name, ours.bone) == (theirs.name, theirs.bone)
+            and abs(ours.along - theirs.along) < _DECIMALS
+            and abs(ours.around - theirs.around) < _DECIMALS
+            and abs(ours.across - theirs.across) < _DECIMALS
+            and abs(ours.height - theirs.height) < _DECIMALS
+            for ours, theirs in zip(read.markers, layout.markers, strict=True)
+        )
     )

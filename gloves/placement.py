@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 _STEPS: Final = 12
 _NEAR: Final = 1e-5  # [m]
 _REACHED: Final = 5e-4  # [m]
+_POINTED: Final = 2e-4  # [m]
+_CURVATURE_RADIUS: Final = 0.006  # of the skin of a finger's tip [m]
 _SPACING: Final = 4e-3  # [m] between the skin's vertices, about
 
 
@@ -37,18 +39,57 @@ def place_marker(
         layout: The glove.
         index: The marker to move.
         model: The hand that the point is meant on.
-        point: Where the marker's center shall be, in the wrist's frame of the flat hand [m].
+        point: Where the marker's center shall be, in the wrist's frame of the flat hand [m]. A marker on a
+            stalk keeps its height, and comes to stand where the stalk points at this.
 
     Raises:
         LayoutError: No marker can be put there.
     """
+    height = layout.markers[index].height
+    placed = _place_on_skin(_with_height(layout, index, 0.0), index, model, point)
+    return placed if height == 0.0 else _stand_up(placed, index, height, model, point)
+
+
+def _stand_up(
+    layout: MarkerLayout, index: int, height: float, model: HandModel, point: NDArray[np.float64]
+) -> MarkerLayout:
+    """A marker that lies near its place, put on its stalk and moved until the stalk points at a point."""
+    foot = attach_markers(layout, model).points[index]
+    best, least = layout, math.inf
+    for _ in range(_STEPS):
+        standing = _with_height(layout, index, height)
+        worn = attach_markers(standing, model)
+        missed = point - worn.points[index]
+        missed -= (missed @ worn.normals[index]) * worn.normals[index]
+        distance = float(np.linalg.norm(missed))
+        if distance < least:
+            best, least = standing, distance
+        if least < _POINTED:
+            break
+        # On skin as curved as a finger's tip the end of the stalk moves more than its foot.
+        foot = foot + missed * _CURVATURE_RADIUS / (_CURVATURE_RADIUS + height)
+        layout = _place_on_skin(layout, index, model, foot)
+    return best
+
+
+def _with_height(layout: MarkerLayout, index: int, height: float) -> MarkerLayout:
+    marker = dataclasses.replace(layout.markers[index], height=height)
+    return dataclasses.replace(
+        layout, markers=(*layout.markers[:index], marker, *layout.markers[index + 1 :])
+    )
+
+
+def _place_on_skin(
+    layout: MarkerLayout, index: int, model: HandModel, point: NDArray[np.float64]
+) -> MarkerLayout:
+    """The layout with a marker without a stalk on the skin that is nearest to a point."""
     surface = model.surface
     nearest = int(((surface.vertices - point) ** 2).sum(axis=1).argmin())
     normal = vertex_normals(surface.vertices, surface.faces)[nearest]
     aside = point - surface.vertices[nearest]
     aside -= (aside @ normal) * normal
     aside *= min(1.0, _SPACING / max(float(np.linalg.norm(aside)), _NEAR))
-    center = surface.vertices[nearest] + aside + layout.heights[index] * normal
+    center = surface.vertices[nearest] + aside + layout.radius * normal
     bones = (BONE_NAMES.index(layout.markers[index].bone), int(surface.bone_indices[nearest, 0]))
     best, least = layout, math.inf
     for bone in dict.fromkeys(bones):
@@ -72,7 +113,7 @@ def _place_on(
     wanted, start = center, model.rest_transforms[bone]
     middle = start[:3, 3] + 0.5 * model.skeleton.lengths[bone] * start[:3, 0]
     best, least = layout, math.inf
-    for _ in range(_STEPS):  # the center is one radius or more off the skin, not along the ray that finds the skin
+    for _ in range(_STEPS):  # the center is one radius off the skin, not along the ray that finds the skin
         moved = _place(layout.markers[index], bone, model, wanted)
         markers = (*layout.markers[:index], moved, *layout.markers[index + 1 :])
         candidate = dataclasses.replace(layout, markers=markers)
@@ -97,7 +138,6 @@ def _place(marker: MarkerPlace, bone: int, model: HandModel, point: NDArray[np.f
     y *= 1.0 if model.shape.side == "right" else -1.0
     along = float(np.clip(x / model.skeleton.lengths[bone], *ALONG_RANGE))
     if bone != PALM:
-        return MarkerPlace(marker.name, BONE_NAMES[bone], along, math.atan2(y, z), height=marker.height)
+        return MarkerPlace(marker.name, BONE_NAMES[bone], along, math.atan2(y, z))
     across = float(np.clip(y / model.shape.breadth, *ACROSS_RANGE))
-    around = 0.0 if z >= 0.0 else math.pi
-    return MarkerPlace(marker.name, BONE_NAMES[bone], along, around, across, marker.height)
+    return MarkerPlace(marker.name, BONE_NAMES[bone], along, 0.0 if z >= 0.0 else math.pi, across)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -15,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gloves.fit import GloveFit, nominal_fit
-from gloves.layout import MarkerLayout, list_layouts, load_layout, starter_layout
+from gloves.layout import MarkerLayout, list_layouts, load_layout, shipped_layout, starter_layout
 from handsim.app.messages import print_line
 from handsim.errors import LayoutError
 from handsim.files.atomic import atomic_write
@@ -26,14 +24,33 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def list_gloves() -> None:
-    """List the marker layouts that come with handsim."""
-    table = Table("name", "markers", "description", box=None, pad_edge=False)
+LABELED_GLOVES: Final = ("dense19", "sparse13")
+"""Gloves whose trained labeler comes with handsim."""
+
+
+def list_gloves(out: Path | None = None) -> None:
+    """List the marker layouts that come with handsim: markers, labeler and source of each.
+
+    Args:
+        out: A picture of all of them, a .png file.
+    """
+    table = Table("name", "markers", "labeler", "description and source", box=None, pad_edge=False)
     for name in list_layouts():
-        text = resources.files("gloves").joinpath(f"layouts/{name}.toml").read_text("utf-8")
-        description = tomllib.loads(text).get("description", "")
-        table.add_row(name, str(load_layout(name).num_markers), Text(description))
+        shipped = shipped_layout(name)
+        labeler = "comes with it" if name in LABELED_GLOVES else "train one"
+        text = Text(shipped.description).append(f"\n{shipped.source}", "dim")
+        table.add_row(name, str(shipped.layout.num_markers), labeler, text)
     Console().print(table)
+    print_line(
+        "A labeler for NAME: handsim generate --glove NAME --out SET && handsim train SET --out RUN, "
+        "then give --labeler RUN."
+    )
+    if out is not None:
+        from render.illustrations.captions import write_png
+        from render.illustrations.hands import draw_gloves
+
+        write_png(out, draw_gloves([_fitted(load_layout(name), "M") for name in list_layouts()]))
+        print_line(f"{out}: the gloves on hands of size M")
 
 
 def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
@@ -46,18 +63,24 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
     table = Table(
         "", "name", "bone", title=Text(f"{layout.name}: {layout.num_markers} markers"), title_justify="left"
     )
-    for column in ("along", "around [deg]", "across"):
+    for column in ("along", "around [deg]", "across", "stalk [mm]"):
         table.add_column(column, justify="right")
     for number, marker in enumerate(layout.markers):
         across = f"{marker.across:.2f}" if marker.bone == "palm" else ""
         around = f"{np.rad2deg(marker.around):.0f}"
-        table.add_row(str(number), Text(marker.name), marker.bone, f"{marker.along:.2f}", around, across)
+        height = f"{1e3 * marker.height:.1f}" if marker.height else ""
+        along = f"{marker.along:.2f}"
+        table.add_row(str(number), Text(marker.name), marker.bone, along, around, across, height)
     console = Console()
     console.print(table)
     console.print(
         f"Radius {1e3 * layout.radius:.1f} mm. Along: 0 at the bone's near end, 1 at its far end. Around: 0 "
         "on the back, 90 on the thumb's side. Across: hand breadths from the palm's middle towards the thumb."
     )
+    if len(layout.sides) == 1:
+        console.print(f"For a {layout.sides[0]} hand only.")
+    if glove in list_layouts():
+        console.print(Text(f"Source: {shipped_layout(glove).source}"))
 
 
 def new_glove(file: Annotated[Path, tyro.conf.Positional]) -> None:
@@ -109,7 +132,7 @@ def check_glove(
     from render.illustrations.captions import write_png
     from render.illustrations.hands import draw_glove
 
-    write_png(picture, draw_glove(nominal_fit(layout, size, "right")))
+    write_png(picture, draw_glove(nominal_fit(layout, size, layout.sides[-1])))
     print_line(f"{picture}: the glove on a hand of size {size}")
 
 
@@ -123,7 +146,7 @@ def nearest_pair(points: NDArray[np.float64]) -> tuple[int, int, float]:
 
 def _fitted(layout: MarkerLayout, size: str) -> GloveFit:
     try:
-        return nominal_fit(layout, size, "right")
+        return nominal_fit(layout, size, layout.sides[-1])
     except LayoutError as error:
         raise LayoutError(f"on a hand of size {size}: {error}") from error
 

@@ -46,7 +46,7 @@ _GAP: Final = 0.025  # between hands in a row [m]
 
 
 def draw_row(
-    hands: Sequence[tuple[str, HandModel, Float[np.ndarray, "27"]]],
+    hands: Sequence[tuple[str, HandModel | GloveFit, Float[np.ndarray, "27"]]],
     *,
     direction: Float[np.ndarray, "3"] | tuple[float, float, float] = SIDES_OF_HAND["back"],
     covering: Covering = "skin",
@@ -55,7 +55,7 @@ def draw_row(
     """Hands side by side at one scale, wrists on one line, each with its caption.
 
     Args:
-        hands: Caption, model and pose of each hand; the wrist's position in the pose is not used.
+        hands: Caption, hand, in its glove or bare, and pose; the wrist's position in the pose is not used.
         direction: Direction of view.
         covering: Bare skin or a dark glove.
         width: Width of the picture [px].
@@ -63,16 +63,16 @@ def draw_row(
     ahead = np.asarray(direction, dtype=np.float64)
     right = np.cross(ahead, FINGERS_UP) / np.linalg.norm(np.cross(ahead, FINGERS_UP))
     posed, centers, extent = [], [], 0.0
-    for _, model, qpos in hands:
+    for _, hand, qpos in hands:
         at_origin = np.array(qpos)
         at_origin[:3] = 0.0
-        vertices = PosedHand(model, at_origin).vertices()
+        vertices = PosedHand(hand, at_origin).vertices()
         across = vertices @ right
         at_origin[:3] = right * (extent - across.min())
         at_origin[0] -= vertices[:, 0].min()
         centers.append(at_origin[:3] + right * (across.min() + across.max()) / 2)
         extent += float(np.ptp(across)) + _GAP
-        posed.append(PosedHand(model, at_origin, covering=covering))
+        posed.append(PosedHand(hand, at_origin, covering=covering))
     points = np.concatenate([hand.vertices() for hand in posed])
     tall = float(np.ptp(points[:, 0])) / (extent - _GAP)
     size = (width, round(width * min(1.0, tall) * 1.04))
@@ -93,6 +93,27 @@ def draw_sizes() -> Picture:
             for size, model in models.items()
         ]
     )
+
+
+def draw_gloves(fits: Sequence[GloveFit], *, columns: int = 4, width: int = 2000) -> Picture:
+    """Gloves on flat hands from the back, each with its name and number of markers, in rows.
+
+    Args:
+        fits: Hands in their gloves, at least one.
+        columns: Gloves per row.
+        width: Width of the picture [px].
+    """
+    spread = join_qpos(gesture("spread")[None])[0]
+    cells = [(f"{fit.layout.name}: {fit.layout.num_markers}", fit, spread) for fit in fits]
+    rows = [
+        draw_row(
+            cells[start : start + columns],
+            covering="glove",
+            width=width * min(columns, len(cells) - start) // columns,
+        )
+        for start in range(0, len(cells), columns)
+    ]
+    return np.concatenate([pad(row, (0, 0), (0, width - row.shape[1])) for row in rows])
 
 
 def draw_gestures(model: HandModel, names: Sequence[str]) -> Picture:

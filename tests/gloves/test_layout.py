@@ -3,23 +3,28 @@
 import dataclasses
 import json
 import math
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gloves.fit import nominal_fit
 from gloves.layout import (
     MarkerLayout,
     MarkerPlace,
     list_layouts,
     load_layout,
     save_layout,
+    shipped_layout,
     starter_layout,
     stored_layout,
 )
 from handsim.errors import LayoutError
+from handsim.hand.shape import SIZES
 from handsim.hand.topology import BONE_NAMES
 
 DENSE19 = (
@@ -29,7 +34,9 @@ DENSE19 = (
 
 
 def test_shipped_layouts() -> None:
-    assert list_layouts() == ("dense19", "sparse13")
+    assert list_layouts() == (
+        *("dense19", "dfki13", "sparse13", "starter10", "starter15", "starter30", "starter6", "tips8"),
+    )
     dense, sparse = load_layout("dense19"), load_layout("sparse13")
     assert list(dense.names) == DENSE19
     assert (dense.num_markers, sparse.num_markers) == (19, 13)
@@ -38,6 +45,54 @@ def test_shipped_layouts() -> None:
     assert dense.radius == sparse.radius == pytest.approx(0.0032)
     # The sparse glove is the dense one with markers taken off, nothing moved.
     assert set(sparse.markers) < set(dense.markers)
+
+
+@pytest.mark.parametrize("name", list_layouts())
+def test_shipped_layouts_fit_every_hand(name: str) -> None:
+    shipped = shipped_layout(name)
+    layout = shipped.layout
+    assert layout == load_layout(name) and layout.name == name
+    assert shipped.description and shipped.source
+    assert str(layout.num_markers) in name and str(layout.num_markers) in shipped.description
+    for size in SIZES:
+        right, left = (nominal_fit(layout, size, side).attachment.points for side in ("right", "left"))
+        np.testing.assert_allclose(left, right * [1.0, -1.0, 1.0], atol=1e-9)
+        distances = np.linalg.norm(right[:, None] - right, axis=-1)
+        np.fill_diagonal(distances, np.inf)
+        assert distances.min() > 2 * layout.radius + 0.003  # a camera sees them apart
+
+
+def test_starters_follow_their_rule() -> None:
+    small, *larger = (load_layout(name) for name in ("starter6", "starter10", "starter15"))
+    assert [marker.bone for marker in small.markers[:3]] == ["palm"] * 3
+    assert all(marker.bone.endswith("distal") for marker in small.markers[3:])
+    for starter in larger:
+        assert starter.markers[: small.num_markers] == small.markers
+        small = starter
+    assert set(small.markers) < set(load_layout("dense19").markers)
+    assert set(load_layout("tips8").markers) == set(small.markers[:8])
+    bones = Counter(marker.bone for marker in load_layout("starter30").markers)
+    assert set(bones) == set(BONE_NAMES) and bones["palm"] == 6
+
+
+def test_an_unknown_shipped_layout() -> None:
+    with pytest.raises(LayoutError, match="unknown glove 'starter7'"):
+        shipped_layout("starter7")
+
+
+def test_a_glove_for_one_hand_is_refused_for_the_other() -> None:
+    layout = dataclasses.replace(load_layout("dense19"), sides=("left",))
+    assert nominal_fit(layout, "M", "left").side == "left"
+    with pytest.raises(LayoutError, match=r"is for a left hand only .* a right hand was asked for"):
+        nominal_fit(layout, "M", "right")
+
+
+def test_sides_have_one_order(tmp_path: Path) -> None:
+    path = tmp_path / "glove.toml"
+    path.write_text(text(head='name = "g"\nradius_mm = 3.2\nsides = ["right", "left"]'))
+    swapped = load_layout(path)
+    path.write_text(text())
+    assert load_layout(path) == swapped
 
 
 def test_markers_sit_on_the_bones_their_names_tell() -> None:

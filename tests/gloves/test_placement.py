@@ -29,14 +29,14 @@ STALKS = dataclasses.replace(
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_a_marker_that_is_put_where_it_is_stays_there(side, layout):
     fit = nominal_fit(layout, "L", side)
-    for index in range(layout.num_markers):
+    for index in range(0, layout.num_markers, 1 if layout is LAYOUT else 5):
         moved = place_marker(layout, index, fit.model, fit.attachment.points[index])
         assert moved.markers[index].bone == layout.markers[index].bone
         assert moved.markers[index].height == layout.markers[index].height
         assert moved.markers[:index] == layout.markers[:index]
         assert moved.markers[index + 1 :] == layout.markers[index + 1 :]
         again = attach_markers(moved, fit.model).points[index]
-        tolerance = 2e-4 if layout is LAYOUT else 5e-4  # a stalk stands on a vertex's normal
+        tolerance = 2e-4 if layout is LAYOUT else 5e-4
         np.testing.assert_allclose(again, fit.attachment.points[index], atol=tolerance)
 
 

@@ -304,7 +304,9 @@ class Problem:
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
         result.shared[:] += heights.T @ heights / HEIGHT_SPREAD**2
-        result.shared_gradient[:] += (estimate.coordinates.heights - self.heights) @ heights / HEIGHT_SPREAD**2
+        result.shared_gradient[:] += (
+            (estimate.coordinates.heights - self.heights) @ heights / HEIGHT_SPREAD**2
+        )
         values, weights = self._joint_angle_residuals(estimate)
         angles = np.arange(6, 26)
         result.pose[:, angles, angles] += weights[:, :20] + weights[:, 20:]

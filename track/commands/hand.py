@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from gloves.fit import GloveFit, attach
+from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.motion import load_any_take
 from gloves.takes.take import Take
@@ -105,9 +105,10 @@ def _chosen_hand(
         millimeters = f"{1e3 * fit.shape.length:.0f} x {1e3 * fit.shape.breadth:.0f} mm"
         return fit.model, fit.attachment.sites(fit.model), f"of {source}, {millimeters}"
     size = size or _USUAL_SIZE
-    model = HandModel.named(size, side=side or "right")
-    sites = () if glove is None else attach(load_layout(glove), model).attachment.sites(model)
-    return model, sites, f"of size {size}"
+    if glove is None:
+        return HandModel.named(size, side=side or "right"), (), f"of size {size}"
+    fit = nominal_fit(load_layout(glove), size, side or "right")
+    return fit.model, fit.attachment.sites(fit.model), f"of size {size}"
 
 
 def _hands_of(take: Path) -> tuple[GloveFit, ...]:

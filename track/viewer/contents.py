@@ -119,7 +119,8 @@ def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector 
 
 
 def _layout(name: str | Path, path: Path | None, out: Path | None, size: str) -> Content:
-    layout, model = load_layout(name), HandModel.named(size)
+    layout = load_layout(name)
+    model = HandModel.named(size, side=layout.sides[-1])
     given = shipped_file(str(name)) if path is None else path
     if out is not None:
         check_outputs((given,), (out,))

@@ -166,7 +166,8 @@ def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
     if labeler is None and glove not in shipped_labelers():
         raise WeightsError(
             f"no labeler comes with glove '{glove}' (shipped: {', '.join(shipped_labelers())}); train one "
-            f"with handsim generate and handsim train, and give its folder as --labeler"
+            f"with handsim generate --glove {glove} --out SET && handsim train SET --out RUN, and give "
+            f"--labeler RUN"
         )
     found = load_labeler(glove if labeler is None else labeler)
     if found.marker_names != layout.names:

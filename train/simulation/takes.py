@@ -97,7 +97,7 @@ def simulate_take(config: TakeConfig) -> Take:
         A take at 120 [Hz]; the same configuration gives the same take.
 
     Raises:
-        LayoutError: The glove is unknown or does not fit.
+        LayoutError: The glove is unknown, does not fit, or is for one hand and the other is simulated too.
         ArgumentError: The rig is unknown, damaged or stands in the hands' way.
         PoseError: None of the people drawn can do what this kind of capture asks for.
     """
@@ -105,6 +105,8 @@ def simulate_take(config: TakeConfig) -> Take:
     key = SIMULATED_KINDS.index(kind), TWINS[kind].draw if kind in TWINS else 0
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=key))
     rig, layout = load_rig(config.rig), load_layout(config.glove)
+    for side in config.hands:
+        layout.check_side(side)
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
     scene = _sample_scene(config, layout, rng)
     optics = config.optics.applied(config.room.optics).worn(layout.radius)

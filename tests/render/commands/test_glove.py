@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from gloves.layout import list_layouts, load_layout
+from gloves.layout import list_layouts, load_layout, starter_layout
 from handsim.app.cli import main
-from render.commands.glove import nearest_pair
+from render.commands.glove import LABELED_GLOVES, nearest_pair
+from train.labelers.storage import shipped_labelers
 
 
 def test_list_names_every_layout(capsys: pytest.CaptureFixture[str]) -> None:
@@ -17,6 +18,36 @@ def test_list_names_every_layout(capsys: pytest.CaptureFixture[str]) -> None:
     for name in list_layouts():
         assert f"{name} " in out
         assert str(load_layout(name).num_markers) in out
+    assert "doi.org/10.1145/3197517.3201399" in out.replace("\n", "")
+
+
+def test_list_says_which_gloves_have_a_labeler_and_draws_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert LABELED_GLOVES == shipped_labelers()
+    assert main(["glove", "list", "--out", str(tmp_path / "gloves.png")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    having = tuple(line.split()[0] for line in lines if "comes with it" in line)
+    assert having == LABELED_GLOVES
+    picture = cv2.imread(str(tmp_path / "gloves.png"))
+    assert picture.shape[1] == 2000
+    assert (picture.min(axis=(1, 2)) < 120).mean() > 0.6
+
+
+def test_show_and_check_a_left_glove_with_a_stalk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "left.toml"
+    stalk = starter_layout().replace("radius_mm", 'sides = ["left"]\nradius_mm', 1) + "height_mm = 12.5\n"
+    file.write_text(stalk)
+    assert main(["glove", "show", str(file)]) == 0
+    out = capsys.readouterr().out
+    assert "12.5" in out and "For a left hand only." in out
+    assert main(["glove", "check", str(file)]) == 0
+    assert main(["hand", "--glove", str(file), "--side", "right", "--out", str(tmp_path / "x.xml")]) == 1
+    assert "is for a left hand only" in capsys.readouterr().err
+    assert (
+        main(["simulate", "--glove", str(file), "--num-frames", "3", "--out", str(tmp_path / "x.c3d")]) == 1
+    )
+    assert "is for a left hand only" in capsys.readouterr().err
 
 
 def test_show_lists_every_marker(capsys: pytest.CaptureFixture[str]) -> None:
