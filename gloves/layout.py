@@ -34,6 +34,10 @@ ACROSS_RANGE: Final = (-1.0, 1.0)
 """Of `MarkerPlace.across`."""
 HEIGHT_RANGE: Final = (0.0, 0.05)
 """Of `MarkerPlace.height` [m]."""
+_ARM: Final = {
+    "wrist": "for a marker that moves with the hand write palm, with along from -0.15 to 0",
+    "forearm": "markers beyond the wrist's joint move against the hand and are not modeled",
+}
 _SHIPPED: Final = Path(__file__).parent / "layouts"
 _LAYOUT_KEYS: Final = ("name", "description", "source", "sides", "radius_mm", "marker")
 _MARKER_KEYS: Final = ("name", "bone", "along", "around", "across", "height_mm")
@@ -49,6 +53,7 @@ radius_mm = 3.2  # of every marker, 0.5 to 15
 #   name    your own; no two alike
 #   bone    one of: BONES
 #   along   0 = the bone's near end, 1 = its far end; -0.3 to 1.3
+#           (markers at the wrist: palm, -0.15 to 0)
 #   around  degrees about the bone: 0 = back of the hand (nail side), 90 = thumb side,
 #           -90 = little-finger side, 180 = palm side
 #   across  palm only: sideways from the middle of the palm, in hand breadths, positive towards the thumb
@@ -81,6 +86,10 @@ class MarkerPlace:
         if not self.name or self.name != self.name.strip() or not self.name.isprintable():
             raise LayoutError(
                 f"marker name {self.name!r}: expected printable characters without outer blanks"
+            )
+        if self.bone in _ARM:
+            raise LayoutError(
+                f"marker '{self.name}': {self.bone} is not a bone of the hand; {_ARM[self.bone]}"
             )
         if self.bone not in BONE_NAMES:
             raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gloves.attachment import _crossings, _ray, attach_markers, vary_layout
-from gloves.layout import load_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import LayoutError
 from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
@@ -106,6 +106,26 @@ def test_sites_stand_where_the_markers_do():
     placed = np.array([data.site(name).xpos for name in attachment.layout.names])
     np.testing.assert_allclose(placed, attachment.points, atol=1e-9)
     assert compiled.nsite == 19
+
+
+@pytest.mark.parametrize("size", ["XS", "M", "XL"])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_markers_at_the_wrist_move_with_the_hand_alone(size, side, rng):
+    angles = {"back": 0.0, "thumb": np.pi / 2, "palm": np.pi, "little": -np.pi / 2}
+    wrist = [
+        MarkerPlace(f"{name}{along}", "palm", along, around)
+        for name, around in angles.items()
+        for along in (-0.15, 0.0)
+    ]
+    model = HandModel.named(size, side=side)
+    glove = attach_markers(MarkerLayout("band", tuple(wrist), 0.004), model)
+    thumbwards, back = glove.normals[:, 1] * (1 if side == "right" else -1), glove.normals[:, 2]
+    assert (thumbwards[[2, 3]] > 0.5).all() and (thumbwards[[6, 7]] < -0.5).all()
+    assert (back[[0, 1]] > 0.5).all() and (back[[4, 5]] < -0.5).all()
+    low, high = model.skeleton.ranges.T
+    bones = model.forward_kinematics(join_qpos(rng.uniform(low, high, size=(5, 20))))
+    centers = glove.centers(model, bones)[:, ::2]  # at 0 the thumb's root pulls at the skin
+    np.testing.assert_allclose(centers, np.broadcast_to(glove.points[::2], centers.shape), atol=5e-4)
 
 
 def test_a_marker_in_the_air_is_told():

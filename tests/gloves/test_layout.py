@@ -168,6 +168,8 @@ def text(*, head: str = 'name = "g"\nradius_mm = 3.2', count: int = 5, **keys: s
 
 BAD = {
     "unknown bone": text(bone='"index_proximl"'),
+    "on the wrist": text(bone='"wrist"'),
+    "on the forearm": text(bone='"forearm"'),
     "two of one name": text(name='"m0"'),
     "too few": text(count=2),
     "too many": text(count=61),
