@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from gloves.attachment import attach_markers
@@ -51,6 +53,17 @@ def test_a_glove_is_found_where_it_sits(rng):
     np.testing.assert_allclose(coordinates.heights, worn.layout.radius, atol=3e-4)
     again = attachment_at(worn.layout, coordinates, shape)
     np.testing.assert_allclose(dense_weights(again), dense_weights(worn), atol=0.03)
+
+
+def test_stalks_are_heights_above_the_skin(rng):
+    shape, layout = sample_shape(rng=rng), load_layout("dense19")
+    stalks = [dataclasses.replace(marker, height=rng.uniform(0.0, 0.012)) for marker in layout.markers]
+    worn = attach_markers(dataclasses.replace(layout, markers=tuple(stalks)), HandModel(shape))
+    coordinates = nearest_coordinates(worn.points, shape)
+    np.testing.assert_allclose(points_of(coordinates, shape)[0], worn.points, atol=1e-9)
+    np.testing.assert_allclose(coordinates.heights, worn.layout.heights, atol=1e-3)
+    moved = displace_markers(worn, shape, 0.0, rng=rng)
+    np.testing.assert_allclose(moved.points, worn.points, atol=1e-3)
 
 
 def test_slides_end_under_their_points(rng):
