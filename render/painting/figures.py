@@ -95,7 +95,7 @@ class HandFigure:
         self.flesh: Float[np.ndarray, "21"] = keypoint_flesh(fit.model)
         """Depth of each keypoint under the back or the palm, whichever is more, markers included [m]."""
         if look.glove is not None:
-            self.flesh = self.flesh + 2.0 * fit.layout.radius
+            self.flesh = self.flesh + fit.layout.heights.max() + fit.layout.radius
 
     def drawn(self, qpos: Float[np.ndarray, "27"], number: int) -> list[Drawn]:
         """Skin, and markers where a glove is worn.
