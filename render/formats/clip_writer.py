@@ -10,7 +10,7 @@ from typing import Final
 
 from handsim.errors import HandSimError
 from handsim.hand.shape import HandShape
-from render.formats.annotations import hands_json
+from render.formats.annotations import hand_crops, hands_json
 from render.formats.annotations.common import shape_record, to_json
 from render.formats.png_depth import encode_pictures
 from render.formats.shards import new_tar, one_sentence, shard_name, shards_in
@@ -74,9 +74,11 @@ def _sample(views: list[RenderedFrame]) -> Iterator[tuple[str, bytes]]:
             kind, _, ending = suffix.rpartition(".")
             yield f"{kind.strip('.') or 'image'}_{view.camera.name}.{ending}", content
     first = views[0]
+    device = first.camera.T_world_camera  # the first camera is the device
     records = {
-        "cameras": {view.camera.name: hands_json.camera_record(view.camera) for view in views},
+        "cameras": {view.camera.name: hands_json.camera_record(view.camera, device) for view in views},
         "hands": hands_json.hands_record(views),
+        "hand_crops": hand_crops.crops_record(views),
         "objects": hands_json.objects_record(first),
         "markers": hands_json.markers_record(first),
         "choices": {view.camera.name: view.choices for view in views},

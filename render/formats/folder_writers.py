@@ -162,8 +162,11 @@ def _coco_file(
     numbered: Callable[[], Iterator[tuple[dict[str, Any], list[dict[str, Any]]]]],
     categories: list[dict[str, Any]],
 ) -> Iterator[str]:
-    """Pieces of a COCO file; the shards are read twice, so that they need not fit into memory."""
-    yield f'{{"categories":{to_json(categories)},\n"images":'
+    """Pieces of a COCO file; the shards are read twice, so that they need not fit into memory.
+
+    Its list of licenses is empty, because pictures belong to who draws them.
+    """
+    yield f'{{"info":{to_json(coco.INFO)},\n"licenses":[],\n"categories":{to_json(categories)},\n"images":'
     yield from json_list(image for image, _ in numbered())
     yield ',\n"annotations":'
     yield from json_list(hand for _, hands in numbered() for hand in hands)

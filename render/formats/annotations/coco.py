@@ -12,11 +12,17 @@ from typing import Any, Final
 
 import numpy as np
 
+from handsim._version import __version__
 from handsim.hand.keypoints import KEYPOINT_NAMES, SKELETON
 from handsim.space.camera import Camera
 from render.formats.annotations.common import CENTER, hand_mask, is_seen, rounded, run_lengths
 from render.frames.frame import HandTruth, RenderedFrame
 
+INFO: Final[dict[str, Any]] = {
+    "description": "Hands drawn by handsim; keypoints count pixels from the first one's center",
+    "version": __version__,
+}
+"""What a file tells of itself. It has no date, so that the same frames give the same bytes."""
 CATEGORY: Final[dict[str, Any]] = {
     "id": 1,
     "name": "hand",

@@ -8,7 +8,7 @@ from the corner.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -27,13 +27,21 @@ from render.formats.annotations.umetrack_hand import umetrack_hand, umetrack_wri
 from render.formats.png_depth import METERS_PER_UNIT
 from render.frames.frame import HandTruth, RenderedFrame
 
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
 HAND_SHAPES: Final = "__hand_shapes.json__"
 """File of a clip with the hand model; webdataset passes over such names."""
 _MODELS: Final = {"pinhole": "PinholePlane", "brown": "OpenCV", "fisheye": "OculusVisionFishEye"}
 
 
-def camera_record(camera: Camera) -> dict[str, Any]:
-    """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them."""
+def camera_record(camera: Camera, T_world_device: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
+    """One stream of a `cameras.json`: calibration and pose; our own record of the camera beside them.
+
+    Args:
+        camera: The stream's camera.
+        T_world_device: Pose of what the sample's cameras are fixed to.
+    """
     K, lens = camera.K, camera.lens
     coefficients = list(lens.coefficients)
     if lens.kind == "brown":
@@ -51,6 +59,7 @@ def camera_record(camera: Camera) -> dict[str, Any]:
             "image_height": camera.size[1],
             "projection_model_type": _MODELS[lens.kind],
             "projection_params": [*focal_center, *coefficients],
+            "T_device_from_camera": rigid_record(np.linalg.inv(T_world_device) @ camera.T_world_camera),
         },
         "T_world_from_camera": rigid_record(camera.T_world_camera),
         "depth_metres_per_unit": METERS_PER_UNIT,

@@ -1,8 +1,9 @@
 """InterHand2.6M: `_data.json` (COCO's fields), `_camera.json` and `_joint_3d.json`, in millimeters.
 
 Its 42 joints are 21 of the right hand and 21 of the left, tip first and wrist last. Projections count pixels
-from the first one's center, boxes from the picture's corner. A dataset is one capture, "0"; its file has one
-pose per camera, so a camera that moves becomes many: `vga`, `vga_1`, `vga_2`...
+from the first one's center, boxes from the picture's corner. A dataset is one capture, "0". Its cameras are
+called by numerals, "0", "1", ..., because its loader takes `int` of them; the file has one pose per camera, so a
+camera that moves becomes many. Each picture has our name of its camera beside the numeral.
 """
 
 from __future__ import annotations
@@ -70,28 +71,25 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
 
 
 class Cameras:
-    """Names of the poses that cameras have: the same pose, the same name."""
+    """Numerals of the poses that cameras have, in the order of their pictures: the same pose, the same one."""
 
     def __init__(self) -> None:
-        self._names: dict[str, str] = {}
-        self._counts: dict[str, int] = {}
+        self._numerals: dict[str, str] = {}
         self._records: dict[str, Any] = {}
 
-    def name(self, record: dict[str, Any]) -> str:
-        """Name of the camera of a record of `picture_record`."""
-        base = record["camera_name"]
-        pose = to_json([base, record["camera"]])
-        if pose not in self._names:
-            count = self._counts.get(base, 0)
-            self._counts[base] = count + 1
-            self._names[pose] = f"{base}_{count}" if count else base
-            self._records[self._names[pose]] = record["camera"]
-        return self._names[pose]
+    def numeral(self, record: dict[str, Any]) -> str:
+        """What the camera of a record of `picture_record` is called."""
+        pose = to_json([record["camera_name"], record["camera"]])
+        numeral = self._numerals.setdefault(pose, str(len(self._numerals)))
+        self._records[numeral] = record["camera"]
+        return numeral
 
     def table(self) -> dict[str, Any]:
         """Content of `_camera.json`."""
         fields = ("campos", "camrot", "focal", "princpt")
-        table = {field: {name: camera[field] for name, camera in self._records.items()} for field in fields}
+        table = {
+            field: {numeral: camera[field] for numeral, camera in self._records.items()} for field in fields
+        }
         return {str(CAPTURE): table}
 
 
@@ -101,7 +99,8 @@ def numbered(
     """Images and their annotations with COCO's numbers; annotations are of pictures, not of hands."""
     annotation_id = 0
     for image_id, record in enumerate(records, start=1):
-        image = {"id": image_id, "camera": cameras.name(record), **record["image"]}
+        names = {"camera": cameras.numeral(record), "camera_name": record["camera_name"]}
+        image = {"id": image_id, **names, **record["image"]}
         annotations = []
         if record["annotation"] is not None:
             annotation_id += 1

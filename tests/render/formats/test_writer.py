@@ -187,7 +187,10 @@ def test_a_tar_holds_samples_and_the_hand(clip) -> None:
             for kind in ("depth", "depth_ideal", "normals", "ids")
             for stream in ("small", "other")
         ),
-        *(f"{kind}.json" for kind in ("cameras", "hands", "objects", "markers", "choices", "info")),
+        *(
+            f"{kind}.json"
+            for kind in ("cameras", "hands", "hand_crops", "objects", "markers", "choices", "info")
+        ),
     }
     assert len(shapes["umetrack"]["mesh_vertices"]) == len(HandModel.named("M").surface.vertices)
 

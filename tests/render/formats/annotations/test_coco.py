@@ -35,6 +35,9 @@ def test_the_file_holds_what_was_in_the_pictures(folder: Path, frames: list[Rend
     assert [hand["side"] for hand in content["annotations"]] == ["right", "left", "right"]
     assert content["categories"][0]["keypoints"] == list(KEYPOINT_NAMES)
     assert [1, 2] in content["categories"][0]["skeleton"]
+    assert list(content) == ["info", "licenses", "categories", "images", "annotations"]
+    assert "handsim" in content["info"]["description"]
+    assert content["licenses"] == []
     for image, frame in zip(content["images"], frames, strict=True):
         picture = cv2.imread(str(folder / "images" / image["file_name"]))
         assert picture.shape == (image["height"], image["width"], 3)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from handsim.space.camera import Camera, camera_from_record
+from handsim.space.cameras import look_at
 from handsim.space.lens import Lens
 from handsim.space.transforms import quaternion_matrix
 from render.formats.annotations.common import to_json
@@ -38,7 +39,8 @@ def polynomial(kind: str, flat: np.ndarray, k: list[float]) -> np.ndarray:
 )
 def test_a_reader_projects_as_we_do(camera: Camera, lens: Lens, rng: np.random.Generator) -> None:
     bent = dataclasses.replace(camera, lens=lens)
-    record = json.loads(to_json(camera_record(bent)))
+    device = look_at(np.array([0.3, -0.4, 0.2]), np.zeros(3))
+    record = json.loads(to_json(camera_record(bent, device)))
     pose, calibration = record["T_world_from_camera"], record["calibration"]
     points = rng.uniform(-0.2, 0.2, (20, 3))
     rotation = quaternion_matrix(np.array(pose["quaternion_wxyz"]))
@@ -52,6 +54,11 @@ def test_a_reader_projects_as_we_do(camera: Camera, lens: Lens, rng: np.random.G
     window = polynomial(kind, flat, rest) * (fx, fy) + (cx, cy)
     np.testing.assert_allclose(window + 0.5, bent.project(points), atol=1e-9)
     assert "rgb" in calibration["label"]
+    on_device = calibration["T_device_from_camera"]
+    turned = device[:3, :3] @ quaternion_matrix(np.array(on_device["quaternion_wxyz"]))
+    np.testing.assert_allclose(turned, rotation, atol=1e-9)
+    eye = device[:3, :3] @ on_device["translation_xyz"] + device[:3, 3]
+    np.testing.assert_allclose(eye, pose["translation_xyz"], atol=1e-9)
     assert camera_from_record(record["camera"]).record() == bent.record()
 
 

@@ -41,7 +41,8 @@ def test_an_interhand_loader_reads_it(moving, tmp_path: Path) -> None:
     writer.finish()
     data, cameras, joints = (load(tmp_path, name) for name in ("data", "camera", "joint_3d"))
     images = {image["id"]: image for image in data["images"]}
-    assert [image["camera"] for image in data["images"]] == ["small", "other", "small_1"]
+    assert [image["camera"] for image in data["images"]] == ["0", "1", "2"]
+    assert [image["camera_name"] for image in data["images"]] == ["small", "other", "small"]
     assert [record["hand_type"] for record in data["annotations"]] == ["interacting", "interacting", "left"]
     for record, frame in zip(data["annotations"], moving, strict=True):
         image = images[record["image_id"]]
