@@ -34,6 +34,7 @@ from train.labelers.kinds import labeler_of
 from train.labelers.set_network import SetLabeler
 from train.labelers.storage import save_network
 from train.matching.prior_learning import learn_pose_prior
+from train.reports.model_card import UNKNOWN_LICENSE, write_model_card
 from train.reports.run_page import write_run_page
 from train.threads import TrainingThreads, check_threads
 from train.training_state import TrainingState, passed
@@ -196,6 +197,7 @@ def _finish(run: _Run, dataset: Dataset, out: Path) -> dict[str, Any]:
         card["curve"] = run.state.history.accuracies
         save_network(out, network, card)
         write_run_page(out, card, run.state.history, report)
+        write_model_card(out, card)
     return card
 
 
@@ -253,6 +255,7 @@ def _card(
         "marker_names": list(dataset.marker_names),
         "trained_on": "simulated frames only",
         "handsim": __version__,
+        "license": UNKNOWN_LICENSE,
         "dataset": dataset.manifest.config,
         "train": dataclasses.asdict(config),
         "held_out_simulated": {

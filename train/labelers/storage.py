@@ -1,4 +1,8 @@
-"""Trained labelers on disk: safetensors for weights and JSON for the model card, or one ONNX file."""
+"""Trained labelers on disk: safetensors for weights and JSON for the model card, or one ONNX file.
+
+The weights' own metadata repeat what others ask of a file that they find alone: what it is, of which layout, who
+wrote it, from what data, under which license. Nothing here reads it back: the card is what counts.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,8 @@ if TYPE_CHECKING:
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
 _PRIOR: Final = "pose_prior."  # in the names of the prior's tensors
+_METADATA: Final = "__metadata__"  # key in the header of a safetensors file
+_LENGTH: Final = 8  # bytes that hold the header's length
 _MOST_CARD: Final = 1 << 24  # bytes
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
@@ -140,15 +146,45 @@ def save_network(folder: Path, network: nn.Module, card: dict[str, Any]) -> None
     import torch
     from safetensors.torch import save
 
+    config: NetworkConfig = network.config  # type: ignore[assignment]
+    kind = "cnn" if isinstance(config, CNNConfig) else "set"
+    card = {"labeler": kind, "network": dataclasses.asdict(config), **card}
     tensors = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     prior = getattr(network, "prior", None)
     if isinstance(prior, PosePrior):
         tensors |= {_PRIOR + name: torch.from_numpy(table) for name, table in prior.tensors().items()}
     with atomic_write(folder / WEIGHTS) as temporary:
-        temporary.write_bytes(save(tensors))  # safetensors' own writing hides that a disk is full
-    config: NetworkConfig = network.config  # type: ignore[assignment]
-    kind = "cnn" if isinstance(config, CNNConfig) else "set"
-    save_json(folder / CARD, {"labeler": kind, "network": dataclasses.asdict(config), **card})
+        # safetensors' own writing hides that a disk is full
+        temporary.write_bytes(_with_metadata(save(tensors), weights_metadata(card)))
+    save_json(folder / CARD, card)
+
+
+def weights_metadata(card: dict[str, Any]) -> dict[str, str]:
+    """What a file of weights tells of itself; all text, as safetensors has it."""
+    dataset = card.get("dataset", {})
+    layout = dataset.get("layout", {}).get("name")
+    known = {
+        "format": "pt",
+        "library_name": "handsim",
+        "handsim_version": card.get("handsim"),
+        "labeler": card.get("labeler"),
+        "layout": layout,
+        "marker_names": json.dumps(card["marker_names"]),
+        "units": "points in meters",
+        "trained_on": card.get("trained_on"),
+        "license": card.get("license"),
+    }
+    return {name: value for name, value in known.items() if value is not None}
+
+
+def _with_metadata(content: bytes, metadata: dict[str, str]) -> bytes:
+    """A safetensors file with metadata in this order; safetensors' own writing shuffles them each time."""
+    end = _LENGTH + int.from_bytes(content[:_LENGTH], "little")
+    tensors = json.loads(content[_LENGTH:end])
+    tensors.pop(_METADATA, None)
+    header = json.dumps({_METADATA: metadata, **tensors}, separators=(",", ":"), ensure_ascii=False).encode()
+    header += b" " * (-len(header) % _LENGTH)  # tensors begin at multiples of eight bytes
+    return len(header).to_bytes(_LENGTH, "little") + header + content[end:]
 
 
 def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:

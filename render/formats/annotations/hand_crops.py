@@ -1,8 +1,8 @@
 """`hand_crops.json` of clips: cameras that look at one hand each, which UmeTrack's and HOT3D's tools cut out.
 
 A crop's camera is a square pinhole camera at the place of the stream's camera. Its axis goes through the
-middle of the hand's keypoints, and its picture has room around them. The tools warp the stream's picture to it,
-which takes the lens out.
+middle of the hand's keypoints, and its picture has room around them. The tools warp the stream's picture to
+it, which takes the lens out.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Its 42 joints are 21 of the right hand and 21 of the left, tip first and wrist last. Projections count pixels
 from the first one's center, boxes from the picture's corner. A dataset is one capture, "0". Its cameras are
-called by numerals, "0", "1", ..., because its loader takes `int` of them; the file has one pose per camera, so a
-camera that moves becomes many. Each picture has our name of its camera beside the numeral.
+called by numerals, "0", "1", ..., because its loader takes `int` of them; the file has one pose per camera,
+so a camera that moves becomes many. Each picture has our name of its camera beside the numeral.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
 
 
 class Cameras:
-    """Numerals of the poses that cameras have, in the order of their pictures: the same pose, the same one."""
+    """Numerals of the poses that cameras have, in the order of pictures: the same pose, the same one."""
 
     def __init__(self) -> None:
         self._numerals: dict[str, str] = {}
