@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from safetensors.numpy import load, save
 
+from handsim._version import __version__
 from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
 from train.config import CNNConfig
@@ -24,6 +25,7 @@ from train.matching.pose_prior import PosePrior
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    import onnx
     from jaxtyping import Float
     from numpy.typing import NDArray
     from torch import nn
@@ -36,6 +38,23 @@ _IMAGES: Final = "images"  # its input
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
 _OPSET: Final = 17
+_DESCRIPTION: Final = (
+    "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose bfloat16 "
+    "by themselves change labels (OpenVINO: INFERENCE_PRECISION_HINT f32)."
+)
+_MEANINGS: Final = {
+    "points": "Points of each frame in meters, less their mean; axes of any direction. Zeros where there is "
+    "none.",
+    "present": "Whether a row of points is one.",
+    "point_scores": "Log-probability for each point of each marker, in the order of handsim.marker_names; "
+    "the last column is a ghost.",
+    "label_scores": "Log-probability for each marker of each point; the last column is that it is not seen.",
+    "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where there "
+    "is none.",
+    "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an image's "
+    "width.",
+}
+"""What inputs and outputs are; in the file's metadata under `handsim.` and their names."""
 _HINT: Final = "install it with: pip install 'handsim[onnx]'"
 
 
@@ -157,7 +176,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         import onnx
     except ImportError as error:
         raise HandSimError(f"exporting needs onnx; {_HINT}") from error
-    properties = {_NAMES: json.dumps(list(marker_names)), _DIGEST: "0" * 64}
+    properties = {_NAMES: json.dumps(list(marker_names)), _DIGEST: "0" * 64, "handsim.version": __version__}
     example: tuple[torch.Tensor, ...]
     if isinstance(network, DeepLabelCNN):
         example, inputs, outputs = (torch.zeros(2, 1, 52, 52),), [_IMAGES], ["positions"]
@@ -186,6 +205,17 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
             dynamo=False,
         )
         model = onnx.load(str(temporary))
-        onnx.helper.set_model_props(model, properties)
+        _describe(model, properties)
         onnx.checker.check_model(model, full_check=True)
         temporary.write_bytes(sign_model(model.SerializeToString()))
+
+
+def _describe(model: onnx.ModelProto, properties: dict[str, str]) -> None:
+    """Say who wrote a model and what goes in and out, and add these properties."""
+    import onnx.helper
+
+    model.producer_name, model.producer_version = "handsim", __version__
+    model.doc_string = model.graph.doc_string = _DESCRIPTION
+    for value in (*model.graph.input, *model.graph.output):
+        value.doc_string = properties[f"handsim.{value.name}"] = _MEANINGS[value.name]
+    onnx.helper.set_model_props(model, properties)

@@ -1,7 +1,7 @@
 """Trained labelers on disk: safetensors for weights and JSON for the model card, or one ONNX file.
 
-The weights' own metadata repeat what others ask of a file that they find alone: what it is, of which layout, who
-wrote it, from what data, under which license. Nothing here reads it back: the card is what counts.
+The weights' own metadata repeat what others ask of a file that they find alone: what it is, of which layout,
+who wrote it, from what data, under which license. Nothing here reads it back: the card is what counts.
 """
 
 from __future__ import annotations

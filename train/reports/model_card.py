@@ -48,7 +48,7 @@ def model_card(card: dict[str, Any]) -> str:
             "",
             f"# Labeler of hand markers: {layout}",
             "",
-            f"{_KINDS[card['labeler']]} of handsim {card['handsim']}. It gets the points of one hand in one frame, in",
+            f"{_KINDS[card['train']['labeler']]} of handsim {card['handsim']}. It gets the points of one hand in one frame, in",
             f"meters, and says for each which of {len(names)} markers it is, or that it is a ghost.",
             "",
             f"Markers: {', '.join(names)}.",
@@ -64,7 +64,15 @@ def model_card(card: dict[str, Any]) -> str:
 
 def _head(license: str) -> list[str]:
     tags = [f"- {tag}" for tag in _TAGS]
-    return ["---", _license_line(license), "library_name: handsim", "pipeline_tag: other", "tags:", *tags, "---"]
+    return [
+        "---",
+        _license_line(license),
+        "library_name: handsim",
+        "pipeline_tag: other",
+        "tags:",
+        *tags,
+        "---",
+    ]
 
 
 def _license_line(license: str) -> str:

@@ -131,3 +131,34 @@ def test_a_file_whose_network_is_of_no_use_is_told(exported, tmp_path, damage):
     path.write_bytes(sign_model(model.SerializeToString()))
     with pytest.raises(WeightsError, match=r"damaged.onnx is damaged or not a labeler's"):
         OnnxLabeler(path)
+
+
+def test_the_file_tells_what_goes_in_and_out(exported):
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(str(exported))
+    told = {entry.key: entry.value for entry in model.metadata_props}
+    ends = [*model.graph.input, *model.graph.output]
+    assert [end.name for end in ends] == ["points", "present", "point_scores", "label_scores"]
+    for end in ends:
+        assert told[f"handsim.{end.name}"] == end.doc_string != ""
+    assert "meters" in told["handsim.points"]
+    assert model.producer_name == "handsim"
+    assert "float32" in model.doc_string
+
+
+def test_what_it_tells_is_so(exported, rng):
+    """Log-probabilities, whatever is in the padding; the last columns are a ghost and not seen."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(exported.read_bytes(), providers=["CPUExecutionProvider"])
+    points = rng.normal(scale=0.04, size=(2, 9, 3)).astype(np.float32)
+    present = np.array([[True] * 9, [True] * 6 + [False] * 3])
+    by_point, by_label = session.run(["point_scores", "label_scores"], {"points": points, "present": present})
+    assert by_point.shape == (2, 9, 20)
+    assert by_label.shape == (2, 19, 10)
+    np.testing.assert_allclose(np.exp(by_point).sum(axis=-1), 1.0, atol=1e-4)
+    np.testing.assert_allclose(np.exp(by_label).sum(axis=-1), 1.0, atol=1e-4)
+    assert np.exp(by_label[1, :, 6:9]).max() < 1e-6  # no marker is a point of the padding
+    points[1, 6:] = 5.0
+    again = session.run(["point_scores", "label_scores"], {"points": points, "present": present})
+    np.testing.assert_allclose(again[0][1, :6], by_point[1, :6], atol=1e-4)
+    np.testing.assert_allclose(again[1], by_label, atol=1e-4)

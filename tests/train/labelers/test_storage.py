@@ -9,7 +9,15 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from handsim.errors import WeightsError
-from train.labelers.storage import _SHIPPED, CARD, WEIGHTS, load_labeler
+from train.labelers.storage import (
+    _SHIPPED,
+    CARD,
+    WEIGHTS,
+    load_labeler,
+    load_network,
+    save_network,
+    weights_metadata,
+)
 
 SHIPPED = json.loads((_SHIPPED / "dense19.json").read_text())
 NETWORK = SHIPPED["network"]
@@ -79,3 +87,47 @@ def test_weights_without_a_pose_prior_are_read(tmp_path):
     tensors = load_file(_SHIPPED / "dense19.safetensors")
     write(tmp_path, SHIPPED, {name: one for name, one in tensors.items() if "pose_prior" not in name})
     assert load_labeler(tmp_path).network.prior is None
+
+
+def header(content: bytes) -> dict:
+    """A safetensors file's header by its published layout: its length, then JSON."""
+    length = int.from_bytes(content[:8], "little")
+    assert length % 8 == 0  # so that tensors are aligned
+    return json.loads(content[8 : 8 + length])
+
+
+@pytest.mark.parametrize("glove", ["dense19", "sparse13"])
+def test_shipped_weights_tell_of_themselves(glove):
+    card = json.loads((_SHIPPED / f"{glove}.json").read_text())
+    told = header((_SHIPPED / f"{glove}.safetensors").read_bytes())["__metadata__"]
+    assert told == weights_metadata(card)
+    assert told["format"] == "pt"
+    assert told["license"] == "apache-2.0"
+    assert told["layout"] == glove
+    assert json.loads(told["marker_names"]) == card["marker_names"]
+    assert told["trained_on"] == "simulated frames only"
+    assert told["handsim_version"] == card["handsim"]
+
+
+def test_saved_weights_are_the_networks_and_the_same_bytes_each_time(tmp_path):
+    network, card = load_network("dense19")
+    for folder in ("one", "other"):
+        save_network(tmp_path / folder, network, card)
+    content = (tmp_path / "one" / WEIGHTS).read_bytes()
+    assert content == (tmp_path / "other" / WEIGHTS).read_bytes()
+    assert next(iter(header(content))) == "__metadata__"
+    tensors, shipped = load_file(tmp_path / "one" / WEIGHTS), load_file(_SHIPPED / "dense19.safetensors")
+    assert tensors.keys() == shipped.keys()
+    for name, tensor in tensors.items():
+        np.testing.assert_array_equal(tensor, shipped[name])
+        assert tensor.dtype == shipped[name].dtype
+
+
+def test_names_beyond_ascii_and_cards_that_say_little(tmp_path):
+    network, _ = load_network("dense19")
+    names = [f"Märker{number}" for number in range(19)]
+    save_network(tmp_path, network, {"marker_names": names})
+    told = header((tmp_path / WEIGHTS).read_bytes())["__metadata__"]
+    assert json.loads(told["marker_names"]) == names
+    assert "license" not in told
+    assert load_labeler(tmp_path).marker_names == tuple(names)

@@ -22,6 +22,7 @@ from train.evaluation.reliability import error_without, expected_calibration_err
 from train.history import History
 from train.labelers.storage import load_labeler
 from train.loop import CHECKPOINT, train_labeler
+from train.reports.model_card import MODEL_CARD
 from train.reports.run_page import PAGE, write_run_page
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import generate_dataset
@@ -63,6 +64,13 @@ def test_the_page_says_what_the_card_says(run):
     for picture in drawn:
         assert len(list(ElementTree.fromstring(picture).iter())) > 100
     assert load_labeler(out).marker_names == tuple(card["marker_names"])
+
+
+def test_a_run_has_a_model_card_of_what_was_trained(run):
+    out, _ = run
+    text = (out / MODEL_CARD).read_text("utf-8")
+    assert text.startswith("---\nlicense: unknown\n")
+    assert "400 of them, from `handsim generate` with seed\n3, of which training saw 2,560 clouds" in text
 
 
 def test_a_stopped_runs_page_is_the_whole_runs(dataset, run, tmp_path):
