@@ -39,8 +39,8 @@ _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
 _OPSET: Final = 17
 _DESCRIPTION: Final = (
-    "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose bfloat16 "
-    "by themselves change labels (OpenVINO: INFERENCE_PRECISION_HINT f32)."
+    "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose "
+    "bfloat16 by themselves change labels (OpenVINO: INFERENCE_PRECISION_HINT f32)."
 )
 _MEANINGS: Final = {
     "points": "Points of each frame in meters, less their mean; axes of any direction. Zeros where there is "
@@ -49,10 +49,10 @@ _MEANINGS: Final = {
     "point_scores": "Log-probability for each point of each marker, in the order of handsim.marker_names; "
     "the last column is a ghost.",
     "label_scores": "Log-probability for each marker of each point; the last column is that it is not seen.",
-    "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where there "
-    "is none.",
-    "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an image's "
-    "width.",
+    "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where "
+    "there is none.",
+    "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "
+    "image's width.",
 }
 """What inputs and outputs are; in the file's metadata under `handsim.` and their names."""
 _HINT: Final = "install it with: pip install 'handsim[onnx]'"

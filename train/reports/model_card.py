@@ -24,7 +24,8 @@ def write_model_card(out: Path, card: dict[str, Any]) -> Path:
     """Write the README of a run's folder, complete or not at all.
 
     Args:
-        out: The run's folder. A README there is replaced, unless somebody has named a license in it: it is theirs.
+        out: The run's folder. A README there is replaced, unless somebody has named a license in it: then it
+            is theirs.
         card: The run's card, see `train.loop.train_labeler`.
 
     Returns:
@@ -48,8 +49,9 @@ def model_card(card: dict[str, Any]) -> str:
             "",
             f"# Labeler of hand markers: {layout}",
             "",
-            f"{_KINDS[card['train']['labeler']]} of handsim {card['handsim']}. It gets the points of one hand in one frame, in",
-            f"meters, and says for each which of {len(names)} markers it is, or that it is a ghost.",
+            f"{_KINDS[card['train']['labeler']]} of handsim {card['handsim']}. It gets the points of one",
+            f"hand in one frame, in meters, and says for each which of {len(names)} markers it is, or that",
+            "it is a ghost.",
             "",
             f"Markers: {', '.join(names)}.",
             "",
@@ -84,8 +86,9 @@ def _data(card: dict[str, Any]) -> list[str]:
     return [
         "## Data",
         "",
-        f"Trained on {card['trained_on']}: {dataset['num_frames']:,} of them, from `handsim generate` with seed",
-        f"{dataset['seed']}, of which training saw {train['samples']:,} clouds. `labeler.json` holds every setting.",
+        f"Trained on {card['trained_on']}: {dataset['num_frames']:,} of them, from `handsim generate` with",
+        f"seed {dataset['seed']}, of which training saw {train['samples']:,} clouds. `labeler.json` holds",
+        "every setting.",
     ]
 
 
@@ -115,8 +118,8 @@ def _use(layout: str) -> list[str]:
         "handsim export THIS_FOLDER --out labeler.onnx",
         "```",
         "",
-        "In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs `labeler.safetensors` and",
-        "`labeler.json`; both are read without unpickling.",
+        "In Python, `train.load_labeler(folder).label_frames([points])`. The folder needs",
+        "`labeler.safetensors` and `labeler.json`; both are read without unpickling.",
         "",
         "## Limits",
         "",

@@ -70,7 +70,7 @@ def test_a_run_has_a_model_card_of_what_was_trained(run):
     out, _ = run
     text = (out / MODEL_CARD).read_text("utf-8")
     assert text.startswith("---\nlicense: unknown\n")
-    assert "400 of them, from `handsim generate` with seed\n3, of which training saw 2,560 clouds" in text
+    assert "400 of them, from `handsim generate` with\nseed 3, of which training saw 2,560 clouds" in text
 
 
 def test_a_stopped_runs_page_is_the_whole_runs(dataset, run, tmp_path):
