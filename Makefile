@@ -19,7 +19,7 @@ help:  ## list the targets (this)
 demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
 
-test: $(INSTALLED) drawing lint docs  ## every check there is: lint, the documents, then the tests
+test: $(INSTALLED) drawing lint  ## every check there is: lint, then the tests (which build the documents)
 	$(BIN)/pytest -n 2
 
 lint: $(INSTALLED)  ## style, format, types and the order of imports
@@ -39,8 +39,8 @@ fuzz-coverage: $(INSTALLED)  ## the same by coverage: MOST=600 seconds of each, 
 	$(BIN)/pip install --quiet --constraint constraints.txt atheris
 	$(BIN)/python -m tests.fuzzing.coverage --seconds $(or $(MOST),600) $(if $(TARGET),--target $(TARGET))
 
-docs: $(INSTALLED)  ## the guide and the API reference, into docs/_build
-	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs docs/_build
+docs: $(INSTALLED)  ## the guide, the commands and the API reference, into build/docs
+	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs build/docs
 
 figures: $(INSTALLED)  ## write docs/figures.toml into the pages; ONLY=table5 runs that command anew
 	$(BIN)/python docs/renew_figures.py $(if $(ONLY),--only $(ONLY))
@@ -53,7 +53,7 @@ truth: $(INSTALLED)  ## the tracker on real hands in motion: DATA=path of Mocap_
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/real_motion.py $(DATA)
 
 clean:  ## remove .venv, caches and what the demo wrote
-	rm -rf $(VENV) demo docs/_build docs/api build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) demo docs/api docs/help build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # setuptools goes in first so that the build needs no isolated environment with versions of its own.

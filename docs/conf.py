@@ -1,12 +1,16 @@
-"""Sphinx: the pages of this folder are the guide; the API reference is read from the packages' `__all__`."""
+"""Sphinx: the pages of this folder are the guide; the API and the commands are read from the code."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import io
+import os
 import re
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest.mock import patch
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -16,14 +20,17 @@ DOCS: Final = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
 
 from handsim import __version__  # noqa: E402
+from handsim.app.cli import main  # noqa: E402
+from handsim.app.command_table import COMMANDS, load  # noqa: E402
 
 PACKAGES: Final = ("handsim", "poses", "gloves", "render", "train", "track")
+COLUMNS: Final = 126  # of the help: lines of docstrings are not wrapped once more
+ESCAPE: Final = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")  # colors of terminals
 
 project = "handsim"
 author = project_copyright = "The handsim authors"
 version = release = __version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"handsim {__version__}"
 html_show_sourcelink = html_copy_source = False
@@ -46,10 +53,40 @@ def write_reference() -> None:
         for public in package.__all__:
             if not public.startswith("__"):
                 lines += [f".. {_directive(getattr(package, public))}:: {name}.{public}", ""]
-        text = "\n".join([*lines, "```", ""])
-        path = folder / f"{name}.md"
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
+        _write(folder / f"{name}.md", [*lines, "```", ""])
+
+
+def write_help() -> None:
+    """Write one page per command, help/COMMAND.md, with what `--help` prints; sub-commands are sections."""
+    folder = DOCS / "help"
+    folder.mkdir(exist_ok=True)
+    for name, (target, what) in COMMANDS.items():
+        lines = [f"# handsim {name}", "", what, "", "```text", help_text(name), "```", ""]
+        command = load(target)
+        for part in command if isinstance(command, dict) else ():
+            lines += [f"## handsim {name} {part}", "", "```text", help_text(name, part), "```", ""]
+        _write(folder / f"{name}.md", lines)
+    for page in folder.glob("*.md"):
+        if page.stem not in COMMANDS:
+            page.unlink()
+
+
+def help_text(*command: str) -> str:
+    """What `handsim COMMAND --help` prints on a terminal without colors."""
+    plain = {"COLUMNS": str(COLUMNS), "NO_COLOR": "1", "TERM": "dumb"}
+    with patch.dict(os.environ, plain), redirect_stdout(io.StringIO()) as out, redirect_stderr(out):
+        try:
+            main([*command, "--help"])
+        except SystemExit as end:
+            if end.code:
+                raise RuntimeError(out.getvalue()) from end
+    return ESCAPE.sub("", out.getvalue()).strip()
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    text = "\n".join(lines)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
 
 
 def _directive(thing: object) -> str:
@@ -68,6 +105,7 @@ def plain_to_rst(_app: Sphinx, _what: str, _name: str, _thing: Any, _options: An
 
 
 def setup(app: Sphinx) -> None:
-    """Write the reference, and read docstrings as plain text before napoleon does."""
+    """Write the reference and the help, and read docstrings as plain text before napoleon does."""
     write_reference()
+    write_help()
     app.connect("autodoc-process-docstring", plain_to_rst, priority=400)

@@ -70,7 +70,9 @@ def values(figures: dict[str, Any]) -> dict[str, str]:
 
 def pages() -> list[Path]:
     """The pages that may quote figures."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    made = {ROOT / "docs" / "api", ROOT / "docs" / "help"}  # by the build of the site
+    pages = sorted((ROOT / "docs").rglob("*.md"))
+    return [ROOT / "README.md", *(page for page in pages if page.parent not in made)]
 
 
 def quotes(text: str) -> Iterator[Quote]:

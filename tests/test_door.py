@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.documents import PAGES
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
 BOOKKEEPING = {"__version__", "ShadowedPackageWarning"}
@@ -72,7 +74,7 @@ def test_name_is_typed(package, name):
 
 def examples() -> str:
     blocks = [path.read_text("utf-8") for path in sorted((ROOT / "examples").glob("*.py"))]
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+    for page in (ROOT / "README.md", *PAGES):
         blocks += re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.S)
     return "\n".join(blocks)
 
