@@ -1,0 +1,61 @@
+"""docs/stored_arrays.md names every array of the files, with its type and shape."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from handsim.app.cli import main
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "stored_arrays.md"
+ROW = re.compile(r"^\| `(\w+)` \| (\S+) \| \(([^)]*)\) \|", re.M)
+ONE_CAPTURE = {"T": 40, "H": 2, "M": 19, "B": 1, "Q": 6}  # two hands and a controller of six markers
+
+
+def stated(after: str, before: str, sizes: dict[str, int]) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Type and shape of each name in the tables between two texts of the page."""
+    text = PAGE.read_text(encoding="utf-8").partition(after)[2].partition(before)[0]
+    return {
+        name: (kind, tuple(sizes[size] if size in sizes else int(size) for size in re.findall(r"\w+", shape)))
+        for name, kind, shape in ROW.findall(text)
+    }
+
+
+def fields(dtype: np.dtype[np.void]) -> dict[str, tuple[str, tuple[int, ...]]]:
+    assert dtype.names is not None
+    return {name: (dtype[name].base.str.lstrip("<|").replace("b1", "?"), dtype[name].shape) for name in dtype.names}
+
+
+def arrays(path: Path) -> dict[str, tuple[str, tuple[int, ...]]]:
+    with np.load(path) as stored:
+        content = {name: stored[name] for name in stored.files if name != "header"}
+    kinds = {name: "record" if array.dtype.names else array.dtype.str.lstrip("<|") for name, array in content.items()}
+    return {name: (kinds[name].replace("b1", "?"), array.shape) for name, array in content.items()}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    take, tracked = str(folder / "take.c3d"), str(folder / "tracked.npz")
+    assert main(["simulate", "--kind", "hand-controller", "--num-frames", "40", "--out", take]) == 0
+    assert main(["track", take, "--size", "M", "--body", "controller", "--out", tracked]) == 0
+    assert main(["generate", "--num-frames", "60", "--workers", "1", "--out", str(folder / "set")]) == 0
+    return folder
+
+
+def test_rows_and_hands_of_a_training_set(folder: Path) -> None:
+    rows, hands = (np.load(folder / "set" / f"{name}-00000.npy") for name in ("rows", "hands"))
+    assert fields(rows.dtype) == stated("A row:", "A hand,", {"M": 19})
+    assert fields(hands.dtype) == stated("A hand,", "## Tracked takes", {})
+
+
+@pytest.mark.parametrize(
+    ("file", "after", "before"),
+    [("tracked.npz", "## Tracked takes", "## Simulated"), ("take.truth.npz", "## Simulated takes", "\0")],
+)
+def test_arrays_of_a_take(file: str, after: str, before: str, folder: Path) -> None:
+    found = arrays(folder / file)
+    assert found == stated(after, before, {**ONE_CAPTURE, "N": found["points"][1][1]})
