@@ -1,7 +1,8 @@
 """The documents: their pages, and the blocks of them that tests run.
 
 A page's blocks of Python and of the shell run in order, in one namespace and one empty folder. A comment
-`<!-- test: CODE -->` is a block of Python that readers do not see; it makes the files that the next block reads.
+`<!-- test: CODE -->` is a block of Python that readers do not see; it makes the files that the next block
+reads.
 """
 
 from __future__ import annotations

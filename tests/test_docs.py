@@ -80,9 +80,7 @@ def test_a_block_that_fails_is_named(tmp_path, commands):
 
 def test_a_line_of_the_shell_that_fails_is_named(tmp_path, commands):
     page = tmp_path / "page.md"
-    page.write_text(
-        "# Page\n\n```sh\nhandsim --version | cut -c 1-7\n```\n\n```sh\nhandsim trian\ntrue\n```\n"
-    )
+    page.write_text("# Page\n\n```sh\nhandsim --version | cut -c 1-7\n```\n\n```sh\nhandsim trian\n```\n")
     right, wrong = blocks_of(page)
     assert run_blocks([right], tmp_path, commands) == ["handsim\n"]
     with pytest.raises(AssertionError, match=r"page\.md:8: exit code 2(.|\n)*did you mean 'train'"):

@@ -24,22 +24,19 @@ def stated(after: str, before: str, sizes: dict[str, int]) -> dict[str, tuple[st
     }
 
 
+def kind_of(dtype: np.dtype[np.generic]) -> str:
+    return "record" if dtype.names else dtype.str.lstrip("<|").replace("b1", "?")
+
+
 def fields(dtype: np.dtype[np.void]) -> dict[str, tuple[str, tuple[int, ...]]]:
     assert dtype.names is not None
-    return {
-        name: (dtype[name].base.str.lstrip("<|").replace("b1", "?"), dtype[name].shape)
-        for name in dtype.names
-    }
+    return {name: (kind_of(dtype[name].base), dtype[name].shape) for name in dtype.names}
 
 
 def arrays(path: Path) -> dict[str, tuple[str, tuple[int, ...]]]:
     with np.load(path) as stored:
         content = {name: stored[name] for name in stored.files if name != "header"}
-    kinds = {
-        name: "record" if array.dtype.names else array.dtype.str.lstrip("<|")
-        for name, array in content.items()
-    }
-    return {name: (kinds[name].replace("b1", "?"), array.shape) for name, array in content.items()}
+    return {name: (kind_of(array.dtype), array.shape) for name, array in content.items()}
 
 
 @pytest.fixture(scope="module")
