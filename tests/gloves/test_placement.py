@@ -40,7 +40,7 @@ def test_a_marker_that_is_put_where_it_is_stays_there(side, layout):
         np.testing.assert_allclose(again, fit.attachment.points[index], atol=tolerance)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     st.sampled_from(["right", "left"]),
     st.integers(0, LAYOUT.num_markers - 1),
