@@ -64,7 +64,12 @@ class PosePrior:
         return int(self.means.shape[1])
 
     def log_density(
-        self, points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], *, mirrored: bool
+        self,
+        points: Float[np.ndarray, "N 3"],
+        labels: Int[np.ndarray, "N"],
+        *,
+        mirrored: bool,
+        among: Int[np.ndarray, "C"] | None = None,
     ) -> float:
         """Logarithm of the density of labeled points; -inf for fewer than four.
 
@@ -72,12 +77,35 @@ class PosePrior:
             points: Points [m].
             labels: Marker of each point, no marker twice.
             mirrored: Whether the hand is a left one.
+            among: The components that count, see `nearest`; all when not given.
         """
         if len(points) < _LEAST_POINTS:
             return -np.inf
-        seen = points * _MIRROR if mirrored else points
+        nearest = self.nearest(points, labels, mirrored=mirrored, count=_NEAREST, among=among)
         tables = self.means, self.directions, self.spreads, self.log_weights
-        return float(_log_density(np.ascontiguousarray(seen), labels, *tables))
+        return float(_log_density(_seen(points, mirrored), labels, nearest, *tables))
+
+    def nearest(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        labels: Int[np.ndarray, "N"],
+        *,
+        mirrored: bool,
+        count: int,
+        among: Int[np.ndarray, "C"] | None = None,
+    ) -> Int[np.ndarray, "K"]:
+        """The components whose mean hands are nearest to labeled points, the nearest first.
+
+        Args:
+            points: Points [m].
+            labels: Marker of each point, no marker twice.
+            mirrored: Whether the hand is a left one.
+            count: How many, at most.
+            among: The components to choose from; all when not given.
+        """
+        chosen = np.arange(len(self.means)) if among is None else among
+        errors = _misses(_seen(points, mirrored), labels, chosen, self.means)
+        return chosen[np.argsort(errors)[:count]]
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
         """The tables by name, for a file; directions in half precision, which is enough for them."""
@@ -96,23 +124,40 @@ class PosePrior:
         return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
 
 
+def _seen(points: NDArray[np.float64], mirrored: bool) -> NDArray[np.float64]:
+    """Centered points (N, 3) of what is a right hand then."""
+    centered: NDArray[np.float64] = points - points.mean(axis=0)
+    return centered * _MIRROR if mirrored else centered
+
+
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _misses(
+    cloud: NDArray[np.float64],
+    labels: NDArray[np.int64],
+    chosen: NDArray[np.int64],
+    means: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Squared distances (C,) of centered points (N, 3) to mean hands (K, M, 3) turned onto them [m^2]."""
+    errors = np.empty(len(chosen))
+    for number in range(len(chosen)):
+        product, size = _product(cloud, labels, means[chosen[number]])
+        errors[number] = size - 2.0 * _largest_root(_quaternion_matrix(product), 0.5 * size)
+    return errors
+
+
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _log_density(
-    points: NDArray[np.float64],
+    cloud: NDArray[np.float64],
     labels: NDArray[np.int64],
+    chosen: NDArray[np.int64],
     means: NDArray[np.float32],
     directions: NDArray[np.float32],
     spreads: NDArray[np.float32],
     log_weights: NDArray[np.float32],
 ) -> float:
-    """See `PosePrior.log_density`; points (N, 3), tables as there."""
-    cloud = points - np.array([points[:, axis].mean() for axis in range(3)])
-    errors = np.empty(len(means))
-    for component in range(len(means)):
-        product, size = _product(cloud, labels, means[component])
-        errors[component] = size - 2.0 * _largest_root(_quaternion_matrix(product), 0.5 * size)
+    """Of centered points (N, 3) by some components (C,); tables as in `PosePrior`."""
     total = -np.inf
-    for component in np.argsort(errors)[:_NEAREST]:
+    for component in chosen:
         residual = _residual(cloud, labels, means[component])
         log = log_weights[component] + _log_normal(
             residual, labels, directions[component], float(spreads[component])

@@ -31,11 +31,10 @@ _WIDTH: Final = 3  # labelings of a round that the next one starts from
 _FARTHEST: Final = 14.0  # cost of a labeling above that of the likeliest [nats, twice]
 _WEIGHT: Final = 2.0  # of the prior's density against the scores, chosen on held-out simulated frames
 _GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
+_NEAR: Final = 80  # components that count for the labelings around the likeliest one
 _TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
 _LEAST: Final = 4  # labeled points of a hand
-_LEAST_DENSITY: Final = (
-    2.5  # log-density of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
-)
+_LEAST_DENSITY: Final = 2.5  # of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,13 +92,14 @@ def _verify(
     table = assignment_costs(probabilities)
     cost, _ = solve_assignment(table)
     known = labels >= 0
-    mirrored = prior.log_density(points[known], labels[known], mirrored=True) > prior.log_density(
-        points[known], labels[known], mirrored=False
+    near, _, mirrored = max(
+        (_nearest_components(points[known], labels[known], prior, mirrored) for mirrored in (False, True)),
+        key=lambda side: side[1],
     )
 
     def scored(cost: float, labels: NDArray[np.int64], without: tuple[tuple[int, int], ...]) -> _Candidate:
         known = labels >= 0
-        density = prior.log_density(points[known], labels[known], mirrored=mirrored)
+        density = prior.log_density(points[known], labels[known], mirrored=mirrored, among=near)
         count = int(known.sum())
         score = _WEIGHT * (density + _GHOST * (len(labels) - count)) - cost
         return _Candidate(score, density / max(1, 3 * count), labels, without)
@@ -116,6 +116,14 @@ def _verify(
                     fresh.append(found[other.tobytes()])
         front = sorted(fresh, key=lambda one: -one.score)
     return _elected(list(found.values()), probabilities)
+
+
+def _nearest_components(
+    points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], prior: PosePrior, mirrored: bool
+) -> tuple[Int[np.ndarray, "C"], float, bool]:
+    """The components that are near to the points of a hand of one side, and their density."""
+    near = prior.nearest(points, labels, mirrored=mirrored, count=_NEAR)
+    return near, prior.log_density(points, labels, mirrored=mirrored, among=near), mirrored
 
 
 def _taken_back(

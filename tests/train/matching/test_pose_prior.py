@@ -60,6 +60,21 @@ def test_density_is_that_of_the_mixture_wherever_the_hand_is(seed, components, c
     assert found == pytest.approx(expected(known, points, labels), rel=1e-4, abs=1e-3)
 
 
+def test_the_nearest_components_are_those_that_scipy_aligns_best(rng):
+    many, labels = prior(rng, 30), np.arange(MARKERS)
+    for left in (False, True):
+        points = rng.normal(scale=0.05, size=(MARKERS, 3))
+        seen = points * ([-1.0, 1.0, 1.0] if left else 1.0)
+        off = seen - seen.mean(axis=0)
+        misses = [
+            Rotation.align_vectors(mean - mean.mean(axis=0), off)[1] for mean in many.means.astype(float)
+        ]
+        near = many.nearest(points, labels, mirrored=left, count=9)
+        np.testing.assert_array_equal(near, np.argsort(misses)[:9])
+        among = many.log_density(points, labels, mirrored=left, among=near)
+        assert among == many.log_density(points, labels, mirrored=left)  # four of them count
+
+
 def test_three_points_fit_any_hand(rng):
     assert prior(rng, 2).log_density(np.zeros((3, 3)), np.arange(3), mirrored=False) == -np.inf
 
