@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 _LOOP_GAP: Final = 0.01
 """Time between the last frame of a recording and its first, when it starts again [s]."""
 _HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
+_UNSURE_EXTENT: Final = 0.12  # of clouds that no labeler is sure of [m]
 _MISSING: Final = {"points": np.nan, "ids": -1, "labels": -1, "confidence": np.nan}
 """The arrays with an entry per point, and what stands where there is no point."""
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
@@ -132,6 +133,9 @@ def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
     for number in range(3):  # initialized, tracked, and labeled again
         ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
         tracker.step(points, ids, 0.01 * number)
+    unsure = np.random.default_rng(0).uniform(0.0, _UNSURE_EXTENT, (4, len(points) // len(hands), 3))
+    for cloud in unsure:  # labels that a pose has to verify
+        labeler.label_frames([cloud])
 
 
 class TakeRecorder:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -200,3 +202,35 @@ def test_bodies_are_kept_beside_the_hands(user, labeler, capture, truth):
     there = truth.labels[2:] >= first
     assert np.mean(take.labels[2:][there] == truth.labels[2:][there]) > 0.99
     assert (take.labels[2:][~there] < first).all()
+
+
+def test_after_the_warm_up_no_kernel_is_compiled_any_more():
+    """A live stream would wait for it: also the kernels of unsure labels are there."""
+    run = """
+import gc
+
+import numpy as np
+from numba.core.registry import CPUDispatcher
+
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from track.capture_tracking import track_capture, warm_up
+from track.tracker import Tracker
+from train.labelers.storage import load_labeler
+from train.simulation.takes import TakeConfig, simulate_take
+
+def ready():
+    kernels = [one for one in gc.get_objects() if isinstance(one, CPUDispatcher)]
+    return {(one.py_func.__qualname__, str(known)) for one in kernels for known in one.signatures}
+
+take = simulate_take(TakeConfig(kind="hand-hand", num_frames=40))
+hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
+labeler = load_labeler("dense19")
+warm_up(hands, labeler)
+before = ready()
+track_capture(take.capture(), Tracker(hands, labeler))
+for cloud in np.random.default_rng(1).uniform(0.0, 0.1, (20, 19, 3)):
+    labeler.label_frames([cloud])
+assert before and ready() == before, ready() - before
+"""
+    subprocess.run([sys.executable, "-c", run], check=True)

@@ -85,11 +85,9 @@ def test_switches_take_things_away_and_names_follow_their_points(server, page_of
     page.press("filled-in markers", False)
     page.press("skin", False)
     page.wait(lambda: "/hands" in page.hidden and "/points/names/0" in page.places)
-    page.settle()
+    page.wait(lambda: (page.nodes["/points"]["batched_scales"] > 0).sum() == 37)  # each switch draws anew
     assert page.nodes["/points/names/0"]["text"] == "ThumbCMC"
     np.testing.assert_allclose(page.places["/points/names/0"], tracked.points[5, 0], atol=1e-6)
-    shown = page.nodes["/points"]["batched_scales"] > 0
-    assert shown.sum() == 37 and "/hands" in page.hidden
     view.show(recording.frame(29))
     page.settle()
     assert "/points/names/19" in page.hidden, "the left hand is lost"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
@@ -56,6 +57,7 @@ class FrameView:
         self.on_pick: Callable[[int], None] = lambda index: None
         """Called with the index of a point of the frame that was clicked."""
         self._frame: ShownFrame | None = None
+        self._lock = threading.RLock()  # switches are pressed in threads of viser's pool
         self._add_switches()
         if recording.rig is not None:
             show_rig(server, recording.rig)
@@ -63,7 +65,7 @@ class FrameView:
 
     def show(self, frame: ShownFrame) -> None:
         """Show a frame; all of it appears at once."""
-        with self._server.atomic():
+        with self._lock, self._server.atomic():
             while len(self.skins) < len(frame.hands):
                 self.skins.append(HandSkin(self._server, f"/hands/{len(self.skins)}"))
             for skin, model, qpos in zip(self.skins, frame.hands, frame.qpos, strict=True):
@@ -110,7 +112,7 @@ class FrameView:
             camera.position = camera.position + points.mean(axis=0) - camera.look_at
 
     def _refresh(self) -> None:
-        with self._server.atomic():
+        with self._lock, self._server.atomic():
             self._update_points()
             self._update_rays()
 
