@@ -82,7 +82,7 @@ def listen_websocket(port: int, times: Times, ready: Synchronized[int], restarts
     """Note when which frame arrives at a WebSocket client."""
     with connect(f"ws://{LOOPBACK}:{port}") as server:
         ready.value += 1
-        _note((json.loads(message) for message in server), times, restarts)
+        _note(((time.monotonic(), json.loads(message)) for message in server), times, restarts)
 
 
 def listen_osc(port: int, times: Times, ready: Synchronized[int], restarts: int) -> None:
@@ -94,18 +94,18 @@ def listen_osc(port: int, times: Times, ready: Synchronized[int], restarts: int)
     _note(_osc_frames(one), times, restarts)
 
 
-def _osc_frames(one: socket.socket) -> Iterator[dict[str, Any]]:
+def _osc_frames(one: socket.socket) -> Iterator[tuple[float, dict[str, Any]]]:
     while True:
-        contents = {message.address: list(message.params) for message in OscBundle(one.recv(1 << 16))}
+        datagram, now = one.recv(1 << 16), time.monotonic()
+        contents = {message.address: list(message.params) for message in OscBundle(datagram)}
         number, _, silent = contents.get("/handsim/frame", (0, 0.0, 1))
-        yield {"type": "frame", "number": number, "silent": silent}
+        yield now, {"type": "frame", "number": number, "silent": silent}
 
 
-def _note(documents: Iterable[dict[str, Any]], times: Times, half: int) -> None:
+def _note(documents: Iterable[tuple[float, dict[str, Any]]], times: Times, half: int) -> None:
     """Numbers begin anew at the restart."""
     first, last = 0, -1
-    for document in documents:
-        now = time.monotonic()
+    for now, document in documents:
         if document["type"] == "frame" and not document["silent"]:
             first = half if document["number"] < last else first
             last = document["number"]
