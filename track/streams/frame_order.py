@@ -1,11 +1,13 @@
 """Order and time of a stream's frames: what came late, twice or with a wild time is left out and counted.
 
 A frame goes on at once when it continues the stream: its time is later than that of the frame before by no
-more than its number or its arrival explains, and its number by no more than its time. Any other frame is held
-until the next one shows what it was:
+more than its number or its arrival explains, and its number by no more than its time. A number alone explains
+at most a second: a damaged header may hold any number and time that agree. Any other frame is held until the
+next one shows what it was:
 
 - after a gap in the numbers the missing frame may still arrive, and goes first;
 - a wild time is followed by frames that continue the stream, and the held frame is left out;
+- a longer gap that only the numbers explain is followed by frames that continue the held one;
 - a recording that starts again, or a restarted server, is followed by frames that continue the held one.
 
 So a doubtful frame waits for one more frame, and all others are not delayed.
@@ -23,6 +25,7 @@ from track.streams.natnet import MarkerFrame
 _REORDERED: Final = 1.0  # [s]: a frame that is older by more belongs to a recording that starts again
 _BURST: Final = 0.5  # [s] from the last frame, within which frames of the same recording may arrive late
 _FIRST_SLACK: Final = 0.05  # [s]: tolerance of a frame's time while the interval is unknown
+_LONGEST_GAP: Final = 1.0  # [s] that a frame's number alone explains
 _SLACK: Final = 0.001  # [s]: tolerance of time stamps beside half an interval
 _FASTEST: Final = 2000.0  # [Hz], of any stream
 _FIRST_WAIT: Final = 0.05  # [s] for which the first frame is held
@@ -175,10 +178,15 @@ class FrameOrder:
         return span == 0.0 or (-_REORDERED < span < 0.0 and new.at - last.at < _BURST)
 
     def _continues(self, last: Arrival, new: Arrival) -> bool:
-        """Whether a frame follows another: time and number go on, by no more than they explain each other.
+        """Whether a frame follows another: its time and number go on, by no more than they explain.
 
-        A longer time may also be explained by when the frame arrived.
+        A time beyond `_LONGEST_GAP` is explained only by when the frame arrived.
         """
+        waited = new.at - last.at
+        return new.frame.time - last.frame.time <= waited + _LONGEST_GAP and self._agrees(last, new)
+
+    def _agrees(self, last: Arrival, new: Arrival) -> bool:
+        """Whether time and number go on by no more than they explain each other, or the arrival the time."""
         span, waited = new.frame.time - last.frame.time, new.at - last.at
         steps = new.frame.number - last.frame.number
         if self._interval is None:
@@ -187,8 +195,12 @@ class FrameOrder:
         return 0.0 < span <= longest and 0 <= steps <= 1.5 * (span + _SLACK) / self._interval + 1.0
 
     def _goes_on(self, new: Arrival) -> bool:
-        """Whether a frame that another confirms goes on with the recording; the last header was wrong."""
-        return self._last is None or 0.0 < new.frame.time - self._last.frame.time <= _REORDERED
+        """Whether a frame that another confirms goes on with the recording.
+
+        Then the last header was wrong, or many frames are missing.
+        """
+        last = self._last
+        return last is None or 0.0 < new.frame.time - last.frame.time <= _REORDERED or self._agrees(last, new)
 
     def _missing(self, last: Arrival, new: Arrival) -> int:
         """The number of frames between two, as far as their times agree with their numbers."""

@@ -48,6 +48,23 @@ def test_missing_frames_are_counted():
     assert (order.missed, order.late, order.wild, order.restarts) == (4, 0, 0, 0)
 
 
+@pytest.mark.parametrize("number", [400, 1000, 11_409_641])
+def test_a_damaged_header_whose_number_and_time_agree_is_left_out(number):
+    packets, order = regular(range(20)), FrameOrder()
+    packets[12] = (number, number * INTERVAL, packets[12][2])
+    assert [told for told, _ in passed(order, packets)] == [told for told in range(20) if told != 12]
+    assert (order.wild, order.missed, order.restarts) == (1, 1, 0)
+
+
+def test_a_reader_that_was_held_up_misses_frames_and_sees_no_restart():
+    """The socket kept the first frames; those that came later were lost, and all are read at once."""
+    order, numbers = FrameOrder(), [*range(600), *range(1200, 1300)]
+    packets = [(number, number * INTERVAL, 10.0 + 1e-4 * at) for at, number in enumerate(numbers)]
+    packets[:10] = regular(range(10))
+    assert [number for number, _ in passed(order, packets)] == numbers
+    assert (order.missed, order.wild, order.late, order.restarts) == (600, 0, 0, 0)
+
+
 def test_a_frame_that_was_overtaken_goes_first():
     order, packets = FrameOrder(), regular(range(30))
     for at in (0, 7, 15):
