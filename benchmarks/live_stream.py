@@ -47,6 +47,7 @@ RARE = 0.002  # of the packets, for junk, wild times and other senders
 AHEAD = 40  # packets that may wait for the reader
 RESTARTS = 4
 WARM = 10.0  # [s] of the stream before memory is measured
+SETTLED = 12.0  # [s] of a recording before it is killed: the size of the hands is measured first
 WILD = (1e17, 1e9, -1e9, np.inf, 7e4, -3.0)
 
 
@@ -231,7 +232,7 @@ def kill(take: Take, rate: float, folder: Path) -> None:
             program = "import sys; from handsim.app.cli import main; sys.exit(main(sys.argv[1:]))"
             command = [sys.executable, "-c", program, "track", "--live", server.url, "--out", str(out)]
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            while process.poll() is None and not (part.exists() and GrownArchive(part).num_frames > 3 * rate):
+            while process.poll() is None and not (part.exists() and GrownArchive(part).num_frames > SETTLED * rate):
                 time.sleep(0.1)
             sent = server.sent
             os.kill(process.pid, number)

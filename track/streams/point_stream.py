@@ -25,7 +25,7 @@ from track.streams.natnet import COMMAND_PORT, DamagedPacket, Kind, MarkerFrame,
 _PATIENCE: Final = 3.0  # [s] to wait for a server
 _RETRY: Final = 0.5  # [s] between requests to a server that does not answer
 _KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
-_DRAIN: Final = 1.0  # [s] for which packets that have arrived are read at the end, at most
+_DRAIN: Final = 1.0  # [s] to read the packets that have arrived at the end, at most: others keep coming
 _STOP: Final = 0.2  # [s] between two looks at whether the stream shall end
 _BUFFER: Final = 1 << 20  # bytes of frames that may wait for the reader
 
@@ -94,7 +94,7 @@ class PointStream(Iterator[StreamedFrame]):
         self._last: StreamedFrame | None = None
         self._ready: deque[Arrival] = deque()
         self._kept_alive = self._heard = time.monotonic()
-        self._drained = math.inf
+        self._drained = False
 
     @property
     def late(self) -> int:
@@ -161,11 +161,12 @@ class PointStream(Iterator[StreamedFrame]):
         return max(0.0, due - now)
 
     def _drain(self) -> bool:
-        """Take another of the packets that have arrived; return whether there may be more frames."""
-        now = time.monotonic()
-        self._drained = min(self._drained, now + _DRAIN)
-        if now < self._drained and self._receive(0.0):
-            return True
+        """Take all packets that have arrived until now, once; return whether there are more frames."""
+        if not self._drained:
+            self._drained = True
+            until = time.monotonic() + _DRAIN
+            while self._receive(0.0) and time.monotonic() < until:
+                pass
         self._ready.extend(self.order.expire(math.inf))
         return bool(self._ready)
 
