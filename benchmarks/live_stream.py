@@ -232,7 +232,8 @@ def kill(take: Take, rate: float, folder: Path) -> None:
             program = "import sys; from handsim.app.cli import main; sys.exit(main(sys.argv[1:]))"
             command = [sys.executable, "-c", program, "track", "--live", server.url, "--out", str(out)]
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            while process.poll() is None and not (part.exists() and GrownArchive(part).num_frames > SETTLED * rate):
+            fewest = SETTLED * rate
+            while process.poll() is None and not (part.exists() and GrownArchive(part).num_frames > fewest):
                 time.sleep(0.1)
             sent = server.sent
             os.kill(process.pid, number)
