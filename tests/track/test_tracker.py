@@ -57,6 +57,16 @@ def test_hands_are_initialized_and_tracked(take, labeler):
         assert np.rad2deg(np.abs(poses[:, 7:] - hand.qpos[:, 7:])).mean() <= 1.0
 
 
+@pytest.mark.parametrize("seed", [0, 2])
+def test_gloves_with_few_markers_far_apart_are_tracked(seed):
+    """Large hands in the sparse glove: stretched fingers are over 85 mm from the markers on the back."""
+    kind = "single-hand" if seed == 0 else "hand-hand"
+    take = simulate_take(TakeConfig(kind=kind, num_frames=60, glove="sparse13", seed=seed))
+    tracked = run(Tracker(users(take), load_labeler("sparse13")), take, range(60))
+    right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
+    assert np.mean(right) > 0.95
+
+
 def test_hands_are_initialized_again_after_a_second_without_points(take, labeler):
     tracker = Tracker(users(take), labeler)
     run(tracker, take, range(60))

@@ -9,21 +9,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from scipy.cluster.hierarchy import fclusterdata
 
+from gloves.fit import GloveFit
+from handsim.hand.model import join_qpos
+from poses.shapes.library import LIBRARIES, gestures_of
 from track.association.hand_state import HandState
 from track.association.label_consistency import targets_of
 from track.association.point_matching import match_log_odds, match_points, peak_log_odds
 from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseFit
+from train.hands.measures import longest_link
 from train.labelers.protocol import Labeler, Labeling
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int
     from numpy.typing import NDArray
+
+_LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +65,7 @@ class HandInitializer:
         self._labeler = labeler
         self._config = config.initialization
         self._stray_density = config.association.stray_density
+        self._link_distance = max([self._config.link_distance, *(_link_distance(one.hand) for one in states)])
         self._attempts = np.zeros(len(states), dtype=np.int64)
         cuts = self._config.num_cuts
         spread = np.arange(cuts) + 0.5
@@ -111,7 +118,7 @@ class HandInitializer:
         least = min((self._least(index) for index in hands), default=0)
         if len(points) < max(least, 2):
             return []
-        cluster = fclusterdata(points, self._config.link_distance, criterion="distance", method="single")
+        cluster = fclusterdata(points, self._link_distance, criterion="distance", method="single")
         groups = [np.flatnonzero(cluster == number) for number in np.unique(cluster)]
         groups = [group for group in groups if least <= len(group) <= self._config.most_points]
         return sorted(groups, key=len, reverse=True)
@@ -205,3 +212,10 @@ class HandInitializer:
             and best.score >= self._config.least_score
         )
         return best if accepted else None
+
+
+def _link_distance(hand: GloveFit) -> float:
+    """Distance within which the neighboring markers of a hand are, while all are seen [m]."""
+    gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
+    markers, _ = hand.markers(join_qpos(gestures))
+    return float(np.quantile([longest_link(one) for one in markers], _LINKED))

@@ -108,7 +108,12 @@ def _sample_markers(layout: MarkerLayout, rng: np.random.Generator) -> NDArray[n
 def _longest_link(markers: Float[np.ndarray, "M 3"], rng: np.random.Generator) -> float:
     """The least distance at which the markers are linked while some are hidden [m]."""
     seen = rng.permutation(len(markers))[int(_HIDDEN * len(markers)) :]
-    return float(minimum_spanning_tree(squareform(pdist(markers[seen]))).max())
+    return longest_link(markers[seen])
+
+
+def longest_link(points: Float[np.ndarray, "N 3"]) -> float:
+    """The least distance at which points are linked to one group [m]."""
+    return float(minimum_spanning_tree(squareform(pdist(points))).max())
 
 
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
