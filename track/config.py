@@ -249,7 +249,7 @@ class InitializationConfig(_Settings):
     """Track initialization: hands among points without any history (`track.association.initialization`)."""
 
     link_distance: float = 0.085
-    """Largest distance between neighboring markers of one hand [m], unless its glove has them further apart."""
+    """Largest distance between neighboring markers of one hand [m], or more where its glove asks for it."""
     least_share: float = _share(0.45)
     """Least share of a hand's markers that must be labeled."""
     fewest_points: int = 4
