@@ -36,6 +36,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "track.commands.reproduce:REPRODUCE",
         "Print a table of the paper with our figures beside.",
     ),
+    "benchmark": (
+        "track.commands.benchmark:BENCHMARK_COMMANDS",
+        "Make the public benchmark, run a tracker on it, score anybody's results.",
+    ),
     "doctor": ("handsim.commands.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, RigError, choices
-from handsim.space.rig_file import read_rig_file
+from handsim.files.atomic import atomic_write
+from handsim.space.rig_file import read_rig_file, rig_lines
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, Float
@@ -144,6 +145,18 @@ def load_rig(name_or_path: str | Path) -> CameraRig:
         unknown = choices(str(name_or_path), list_rigs(), noun="camera rig")
         raise RigError(f"{unknown}, or the path of a .toml file")
     return _read(path)
+
+
+def save_rig(path: Path, rig: CameraRig) -> None:
+    """Write a rig's `.toml` file, numbers to nine decimals; `load_rig` gives the same cameras again.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    degrees = float(np.rad2deg(rig.field_of_view))
+    lines = rig_lines(rig.name, degrees, rig.resolution, rig.T_world_camera)
+    with atomic_write(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _read(path: Path) -> CameraRig:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from handsim.errors import HandSimError, RigError
 from handsim.files.atomic import read_toml
-from handsim.files.toml_values import check_keys, number_of, numbers, shown, tables_of
+from handsim.files.toml_values import check_keys, number_of, numbers, quoted, shown, tables_of, written
 
 if TYPE_CHECKING:
     import numpy as np
+    from jaxtyping import Float
     from numpy.typing import NDArray
 
 _RIG_KEYS: Final = ("name", "description", "field_of_view", "resolution", "camera")
@@ -61,6 +62,25 @@ def _parse(table: Mapping[str, object]) -> RigTable:
     angle = number_of(table, "field_of_view")
     cameras = [parse_place(entry, f"camera {number}") for number, entry in enumerate(tables, 1)]
     return RigTable(name, angle, resolution, cameras)
+
+
+def rig_lines(
+    name: str, field_of_view: float, resolution: int, poses: Float[np.ndarray, "C 4 4"]
+) -> list[str]:
+    """The lines of a rig's file.
+
+    Args:
+        name: The rig's name.
+        field_of_view: Full opening of the view cone [deg].
+        resolution: Pixels across it.
+        poses: `T_world_camera` of each camera [m].
+    """
+    lines = [f"name = {quoted(name)}", f"field_of_view = {written(field_of_view)}"]
+    lines.append(f"resolution = {resolution}")
+    for pose in poses.tolist():
+        rows = [f"    [{', '.join(map(written, row))}]," for row in pose]
+        lines += ["", "[[camera]]", "T_world_camera = [", *rows, "]"]
+    return lines
 
 
 def parse_place(

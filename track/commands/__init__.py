@@ -10,5 +10,6 @@
 `replay`: `handsim replay`, a NatNet server that plays a capture.
 `view`: `handsim view`, files and live trackers in the browser.
 `reproduce`: `handsim reproduce`, the paper's tables.
+`benchmark`: `handsim benchmark`, the public benchmark.
 `demo`: the step of `handsim demo` that tracks.
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -55,6 +56,21 @@ class SceneMotion:
     def num_frames(self) -> int:
         """Number of frames, T."""
         return len(self.hands[0].qpos)
+
+    def faster(self, times: int) -> SceneMotion:
+        """The same motion this many times as fast: of so many frames only the first is kept.
+
+        Displacements by the skin are not kept: they belong to single frames.
+
+        Args:
+            times: Whole number from 1.
+        """
+        hands = tuple(GlovedHand(hand.fit, hand.qpos[::times]) for hand in self.hands)
+        held = self.moving_object
+        if held is not None:
+            motion = BodyMotion(held.motion.T_world_body[::times], held.motion.rate)
+            held = dataclasses.replace(held, motion=motion)
+        return SceneMotion(hands, held, self.rate)
 
 
 def sample_scene_motion(
