@@ -27,6 +27,8 @@ from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive
+from track.benchmark.manifest import label_names, load_benchmark
+from track.benchmark.results import read_result
 from track.bodies.body_file import load_body
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
@@ -100,6 +102,10 @@ def _read_checkpoint(path: Path) -> None:
     state(path.parent).restore(path)
 
 
+def _read_result(path: Path) -> None:
+    read_result(path, seeds.benchmark_capture(), label_names())
+
+
 _ALL: Final = (
     Target("c3d", seeds.c3d, read_capture),
     Target("trc", seeds.trc, read_capture),
@@ -115,6 +121,10 @@ _ALL: Final = (
     Target("tracked", seeds.tracked, load_tracked_take, mutate_archive),
     Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
+    Target("benchmark", seeds.benchmark, lambda path: load_benchmark(path.parent)),
+    Target("result_table", seeds.result_table, _read_result),
+    Target("result_arrays", seeds.result_arrays, _read_result, mutate_archive),
+    Target("result_points", seeds.result_points, _read_result),
     Target("weights", seeds.weights, _read_weights),
     Target("onnx", seeds.onnx, _read_onnx),
     Target("dataset", seeds.dataset, _read_dataset),

@@ -71,6 +71,16 @@ handsim benchmark score THIS_FOLDER RESULTS
 
 With results name the benchmark, its size, and whether users were calibrated. Do not train on these captures.
 
+## How it was made
+
+```
+handsim benchmark make --size {size} --out THIS_FOLDER
+```
+
+Every number is seeded, and positions are rounded to 0.01 mm, so that the same command gives the same bytes on
+most machines; on others single numbers differ in their last digit, and the command names the files. handsim's
+docs/benchmark.md defines difficulties and figures.
+
 ## Limits
 
 - Simulated: no real person was recorded, flesh moves in `real-like` captures alone, and no ID passes from
@@ -136,7 +146,7 @@ def data_card(plan: Plan, counts: dict[str, Counts]) -> str:
             glove=GLOVE,
         )
         + "\n".join(_difficulties(counts))
-        + _WORDS
+        + _WORDS.format(size=plan.size)
     )
 
 

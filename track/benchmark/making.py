@@ -52,8 +52,8 @@ CAPTURES: Final = "captures/captures.csv"
 _LICENSE_FILE: Final = "LICENSE.txt"
 _GLOVE_FILE: Final = "captures/glove.toml"
 _BYTES_PER_FRAME: Final = 2500
-_POINT_DECIMALS: Final = 5  # of a point [m]: a hundredth of a millimeter, below the noise of the cameras
-_TRUTH_DECIMALS: Final = 6  # [m], [rad]
+_POINT_DECIMALS: Final = 5  # of a point or joint [m]: 0.01 mm, below the noise of the cameras
+_ANGLE_DECIMALS: Final = 4  # of a true joint angle [rad]
 _HAND_DECIMALS: Final = 9  # of hands and gloves [m]
 
 
@@ -96,7 +96,7 @@ def make_capture(plan: Plan, out: Path, number: int) -> int:
     capture, labels = _published_points(take)
     hands = tuple(_rounded(hand.fit) for hand in take.hands)
     joints, angles = poses_of(hands, np.stack([hand.qpos for hand in take.hands], axis=1))
-    rounded = (_round(array, _TRUTH_DECIMALS) for array in (joints, angles))
+    rounded = _round(joints, _POINT_DECIMALS), _round(angles, _ANGLE_DECIMALS)
     write_capture(out / capture_path(planned.name), capture)
     notes = "The true hands and gloves of this capture, as a perfect calibration finds them."
     save_user(out / user_path(planned.name), hands, notes)

@@ -103,7 +103,7 @@ def test_points_that_were_moved_or_labels_without_a_side_are_told(capture, tmp_p
     ):
         read_result(path, capture, LABELS)
     write_capture(path, Capture(("ThumbTip", *capture.names[1:]), capture.positions, capture.rate))
-    with pytest.raises(BenchmarkError, match="unknown label 'ThumbTip'.*valid names: right:ThumbCMC,"):
+    with pytest.raises(BenchmarkError, match=r"unknown label 'ThumbTip'.*valid names: right:ThumbCMC,"):
         read_result(path, capture, LABELS)
     write_capture(path, Capture(names, capture.positions[:-1], capture.rate))
     with pytest.raises(BenchmarkError, match="has 29 frames, expected the capture's 30"):
