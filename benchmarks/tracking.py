@@ -48,7 +48,7 @@ from track.evaluation.take_evaluation import (
     seen_frame,
     true_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times, without_body
+from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times
 from track.tracker import Tracker
 from track.user import load_user
 from train.labelers.protocol import Labeler
@@ -70,7 +70,7 @@ HANDS = {
 
 @cache
 def twin(kind: SimulatedKind, frames: int | None, seed: int) -> Take:
-    return without_body(simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)))
+    return simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)).without_body()
 
 
 @cache

@@ -1,10 +1,10 @@
-"""The tracker's output for one frame: one pose per hand, one label per point, and their status."""
+"""A tracker's output for one frame: one pose per hand, one label per point, and their status."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -76,3 +76,11 @@ class TrackedFrame:
     bodies: tuple[TrackedBody, ...] = ()
     notes: tuple[str, ...] = ()
     """What was wrong with the frame itself, in words; empty for most frames."""
+
+
+class FrameTracker(Protocol):
+    """Anything that tracks a capture frame by frame."""
+
+    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
+        """Track the next frame: points [m], their IDs, and the time [s]."""
+        ...

@@ -110,6 +110,17 @@ class Take:
         names = tuple(f"*{column}" for column in range(self.points.shape[1]))
         return Capture(names, self.points, self.rate)
 
+    def without_body(self) -> Take:
+        """The take without the points of its body, which many optical systems track themselves."""
+        gone = self.labels >= self.hand_labels[-1].stop
+        return dataclasses.replace(
+            self,
+            points=np.where(gone[..., None], np.nan, self.points),
+            ids=np.where(gone, -1, self.ids),
+            labels=np.where(gone, -1, self.labels),
+            body=None,
+        )
+
     def save(self, path: Path) -> None:
         """Write a `.truth.npz`, whole or not at all; `load_take` reads it.
 

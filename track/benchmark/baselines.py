@@ -24,7 +24,7 @@ from track.benchmark.difficulties import BENCHMARK, GLOVE
 from track.benchmark.manifest import Benchmark
 from track.calibration.hand_size import fit_size, sample_frames
 from track.capture_tracking import capture_frames
-from track.evaluation.take_evaluation import FrameTracker
+from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 from train.labelers.storage import labeler_for_glove

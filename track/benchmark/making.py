@@ -36,7 +36,6 @@ from track.benchmark.manifest import (
     user_path,
     write_manifest,
 )
-from track.evaluation.trials import without_body
 from track.user import load_user, save_user
 from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room import record_take
@@ -115,7 +114,7 @@ def simulate_capture(planned: PlannedCapture) -> Take:
     optics = difficulty.room.optics.worn(layout.radius)
     room = dataclasses.replace(difficulty.room, optics=optics)
     take = record_take(scene, load_rig(difficulty.rig), room, {"glove": GLOVE}, rng=planned.rng("optics"))
-    return without_body(take)
+    return take.without_body()
 
 
 def _published_points(take: Take) -> tuple[Capture, np.ndarray]:

@@ -29,7 +29,8 @@ from train.simulation.motion import RATE
 MANIFEST: Final = "manifest.json"
 LICENSE: Final = "CC-BY-4.0"
 _SCHEMA: Final = 1
-_PUBLISHED: Final = Path(__file__).with_name("published.json")
+PUBLISHED: Final = Path(__file__).with_name("published.json")
+"""Checksums of the published files; benchmarks/publish_benchmark.py writes them."""
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9-]{0,79}")
 _MOST_FRAMES, _MOST_CAPTURES = 100_000, 10_000
 
@@ -211,5 +212,5 @@ def differing_files(benchmark: Benchmark) -> list[str] | None:
 
 def published_files() -> dict[str, dict[str, str]]:
     """SHA-256 of every file of the published benchmark, by size and path."""
-    content: dict[str, dict[str, str]] = json.loads(_PUBLISHED.read_text("utf-8"))["files"]
+    content: dict[str, dict[str, str]] = json.loads(PUBLISHED.read_text("utf-8"))["files"]
     return content

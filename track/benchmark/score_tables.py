@@ -15,13 +15,13 @@ from track.benchmark.difficulties import BENCHMARK, DIFFICULTIES
 from track.benchmark.scoring import Score
 
 _FIGURES: Final = {
-    "frame_accuracy": "frames right [%]",
-    "slot_accuracy": "slots right [%]",
-    "point_accuracy": "points right [%]",
-    "macro_f1": "macro F1 [%]",
+    "frame_accuracy": "frames [%]",
+    "slot_accuracy": "slots [%]",
+    "point_accuracy": "points [%]",
+    "macro_f1": "F1 [%]",
     "posed": "posed [%]",
     "mpjpe": "MPJPE [mm]",
-    "within_5mm": "in 5 mm [%]",
+    "within_5mm": "5 mm [%]",
     "angle_error": "angles [deg]",
 }
 """Columns of the first table."""
@@ -33,7 +33,7 @@ ALL: Final = "all"
 def score_tables(score: Score) -> list[Table]:
     """By difficulty; frames right by kind and difficulty; errors of each joint, if there are any."""
     difficulties = difficulties_of(score)
-    title = f"{BENCHMARK}, {score.benchmark.size}: means over captures"
+    title = f"{BENCHMARK}, {score.benchmark.size}: right labels, joints found, errors"
     first = _table(title, "difficulty", _FIGURES.values())
     for name in (*difficulties, ALL):
         means = score.mean(difficulty=None if name == ALL else name)

@@ -111,7 +111,6 @@ def _measure_on(
 ) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
     from track.evaluation.comparison import USERS, compare_trackers, trackers
-    from track.evaluation.trials import without_body
 
     network = labeler_for_glove(config.glove, config.labeler)
     takes: dict[str, Take] = {}
@@ -120,7 +119,7 @@ def _measure_on(
         for kind, twin in twins.items():
             takes[kind] = simulate_take(twin)
             bar.advance(task)
-    bare = {kind: without_body(take) for kind, take in takes.items()}
+    bare = {kind: take.without_body() for kind, take in takes.items()}
     frames = sum(take.num_frames for take in takes.values())
     with progress_bar("frames") as (bar, task):
         bar.update(task, total=frames * len(USERS) * len(trackers(network, config.seed)))

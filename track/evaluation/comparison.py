@@ -16,7 +16,6 @@ from track.baselines.assignment_trackers import HungarianTracker, NearestNeighbo
 from track.baselines.paper_tracker import PaperTracker
 from track.bodies.rigid_body import RigidTemplate
 from track.evaluation.take_evaluation import (
-    FrameTracker,
     TrackingReport,
     evaluate_tracker,
     measured_users,
@@ -24,6 +23,7 @@ from track.evaluation.take_evaluation import (
     true_users,
 )
 from track.evaluation.trials import FEWEST_FRAMES, cut_take, initialization_times, recovery_times
+from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 

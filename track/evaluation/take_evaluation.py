@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from handsim.hand.topology import NUM_QPOS
 from track.baselines.plain_hand import MOST_RMS
 from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame
+from track.tracked_frame import FrameTracker, TrackedFrame
 from train.labelers.protocol import Labeler
 
 if TYPE_CHECKING:
@@ -27,14 +27,6 @@ if TYPE_CHECKING:
 
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))
 """Classes of a hand's number of missing markers, from and to, for pose errors."""
-
-
-class FrameTracker(Protocol):
-    """Anything that tracks a capture frame by frame."""
-
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
-        """Track the next frame: points [m], their IDs, and the time [s]."""
-        ...
 
 
 class SeenFrame(NamedTuple):

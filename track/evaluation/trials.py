@@ -10,7 +10,8 @@ import numpy as np
 
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
-from track.evaluation.take_evaluation import FrameTracker, is_right, is_valid, seen_frame
+from track.evaluation.take_evaluation import is_right, is_valid, seen_frame
+from track.tracked_frame import FrameTracker
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -51,22 +52,6 @@ def hide_points(take: Take, first: int, frames: int) -> Take:
     points[hidden], ids[hidden], labels[hidden] = np.nan, -1, -1
     after[after >= 0] += take.ids.max() + 1
     return dataclasses.replace(take, points=points, ids=ids, labels=labels)
-
-
-def without_body(take: Take) -> Take:
-    """A take without the points of its body, which an optical system tracks itself.
-
-    The paper's system tracked such bodies beside the hands (its figure 1);
-    `train.evaluation.labeler_evaluation.hand_clouds` leaves them out as well.
-    """
-    gone = take.labels >= take.hand_labels[-1].stop
-    return dataclasses.replace(
-        take,
-        points=np.where(gone[..., None], np.nan, take.points),
-        ids=np.where(gone, -1, take.ids),
-        labels=np.where(gone, -1, take.labels),
-        body=None,
-    )
 
 
 def initialization_times(

@@ -12,7 +12,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.baselines.assignment_trackers import GATE, NEAR, HungarianTracker, NearestNeighborTracker
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
-from track.evaluation.trials import cut_take, hide_points, without_body
+from track.evaluation.trials import cut_take, hide_points
 from track.tracked_frame import Status
 from train.simulation.takes import TakeConfig, simulate_take
 
@@ -21,7 +21,7 @@ BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return without_body(simulate_take(TakeConfig(kind="single-hand", num_frames=300)))
+    return simulate_take(TakeConfig(kind="single-hand", num_frames=300)).without_body()
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from gloves.takes.take import Take
 from handsim.hand.topology import JOINT_NAMES
 from track.baselines.paper_tracker import GATE, PaperTracker
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
-from track.evaluation.trials import cut_take, hide_points, without_body
+from track.evaluation.trials import cut_take, hide_points
 from track.tracked_frame import Status, TrackedFrame
 from train.labelers.protocol import Labeling
 from train.labelers.storage import load_labeler
@@ -39,7 +39,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return without_body(simulate_take(TakeConfig(kind="hand-controller", num_frames=240)))
+    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240)).without_body()
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from track.evaluation.comparison import (
 )
 from track.evaluation.paper import CAMERAS, FRAMES, HAN, TABLE5, TABLE7
 from track.evaluation.tables import print_errors, print_trials
-from track.evaluation.trials import FEWEST_FRAMES, without_body
+from track.evaluation.trials import FEWEST_FRAMES
 from train.labelers.storage import load_labeler
 from train.simulation.room_settings import KINDS, TWINS
 from train.simulation.takes import TakeConfig, simulate_take
@@ -132,7 +132,7 @@ def test_the_paper_has_no_figures_of_other_gloves(capsys):
 
 def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     monkeypatch.setattr(comparison, "USERS", {"calibrated": USERS["calibrated"]})
-    take = without_body(simulate_take(TakeConfig(kind="single-hand", num_frames=FEWEST_FRAMES)))
+    take = simulate_take(TakeConfig(kind="single-hand", num_frames=FEWEST_FRAMES)).without_body()
     measured = compare_trackers({"single-hand": take}, load_labeler("dense19"), seed=0, trials=1)
     by_name = {one.method: one for one in measured}
     assert by_name[OURS].initialization[0] <= 3 and by_name[OURS].recovery[0] <= 3
@@ -164,7 +164,7 @@ def test_a_body_that_is_followed_must_have_its_labels():
     wrong = measure_with_body("controller", other, labeler)[0].report.right
     assert np.flatnonzero(~wrong).tolist() == [7]
     with pytest.raises(ArgumentError, match="controller: the take has no body"):
-        measure_with_body("controller", without_body(take), labeler)
+        measure_with_body("controller", take.without_body(), labeler)
 
 
 def test_every_tracker_has_a_maker():

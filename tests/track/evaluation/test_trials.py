@@ -14,7 +14,6 @@ from track.evaluation.trials import (
     hide_points,
     initialization_times,
     recovery_times,
-    without_body,
 )
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.tracker import Tracker
@@ -67,7 +66,7 @@ def test_what_comes_back_from_the_dark_has_other_ids(take):
 
 
 def test_a_take_without_its_body_has_only_points_of_hands_and_ghosts(take):
-    bare = without_body(take)
+    bare = take.without_body()
     hands = take.labels >= 0
     hands &= take.labels < 38
     assert (take.labels >= 38).any() and not (bare.labels >= 38).any()
