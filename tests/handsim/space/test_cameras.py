@@ -27,6 +27,7 @@ from handsim.space.cameras import (
     load_rig,
     look_at,
     named_rig,
+    save_rig,
 )
 
 ROOT = Path(__file__).parents[3]
@@ -74,6 +75,16 @@ def test_a_file_of_ones_own(tmp_path):
     np.testing.assert_allclose(load_rig(str(path)).T_world_camera, rig.T_world_camera, atol=1e-15)
     assert load_rig(path).resolution == 1280
     np.testing.assert_array_equal(load_rig("six").T_world_camera, named_rig("six").T_world_camera)
+
+
+def test_a_saved_rig_has_the_same_cameras(tmp_path):
+    for name in list_rigs():
+        rig = named_rig(name)
+        save_rig(tmp_path / "rig.toml", rig)
+        again = load_rig(tmp_path / "rig.toml")
+        np.testing.assert_allclose(again.T_world_camera, rig.T_world_camera, atol=1e-9)
+        assert (again.name, again.resolution) == (rig.name, rig.resolution)
+        assert again.field_of_view == pytest.approx(rig.field_of_view)
 
 
 def test_the_documented_file_says_what_the_document_says(capsys):
