@@ -55,6 +55,7 @@ CASES = {
         )
     ),
     "simulate": Case(("simulate", "--num-frames", "240", "--out", "OUT/take.c3d")),
+    "benchmark": Case(("benchmark", "make", "--workers", "2", "--out", "OUT")),
     "track": Case(("track", "WORK/take.c3d", "--out", "OUT/tracked.npz")),
     "calibrate": Case(("calibrate", "WORK/long.c3d", "--hands", "right", "--out", "OUT/user.json")),
 }
@@ -179,7 +180,7 @@ def finish(args: tuple[str, ...]) -> None:
 
 
 def program(args: tuple[str, ...]) -> list[str]:
-    """The command with small shards, so that there are several."""
+    """The command with small shards, so that there are several, and a small benchmark."""
     return [sys.executable, __file__, "--run", *args]
 
 
@@ -198,9 +199,11 @@ def contents(folder: Path, files: str) -> dict[str, str]:
 
 
 if sys.argv[1:2] == ["--run"]:  # also in worker processes, which read this file first
+    from track.benchmark.difficulties import SIZES, Plan
     from train.simulation import generation
 
     generation.ROWS_PER_SHARD = 150
+    SIZES["small"] = Plan("small", people=1, num_frames=100)
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--run"]:

@@ -182,6 +182,10 @@ CASES = {
     "no folder of photographs": ["render", "good.truth.npz", "--photos", "missing", "--out", "out"],
     "a folder of broken photographs": ["render", "good.truth.npz", "--photos", "photos", "--out", "out"],
     "pictures into a file": ["render", "good.truth.npz", "--out", "good.trc"],
+    "no benchmark to score": ["benchmark", "score", ".", "photos", "--json", "out.json"],
+    "no benchmark to track": ["benchmark", "run", "good.trc", "--out", "out"],
+    "a benchmark among other files": ["benchmark", "make", "--out", "."],
+    "a benchmark by nobody": ["benchmark", "make", "--workers", "0", "--out", "out"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }
 
