@@ -7,7 +7,7 @@ import functools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -39,10 +39,11 @@ from track.benchmark.manifest import (
 from track.user import load_user, save_user
 from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room import record_take
+from train.simulation.room_settings import Kind
 from train.simulation.takes import sample_scene
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames expected."""
@@ -109,15 +110,15 @@ def simulate_capture(planned: PlannedCapture) -> Take:
     if planned.kind == "real-like":
         scene = sample_real_like_scene(layout, planned.num_frames, rng=rng)
     else:
-        frames = difficulty.speed * planned.num_frames
-        scene = sample_scene(planned.kind, layout, frames, rng=rng).faster(difficulty.speed)  # type: ignore[arg-type]
+        kind, frames = cast("Kind", planned.kind), difficulty.speed * planned.num_frames
+        scene = sample_scene(kind, layout, frames, rng=rng).faster(difficulty.speed)
     optics = difficulty.room.optics.worn(layout.radius)
     room = dataclasses.replace(difficulty.room, optics=optics)
     take = record_take(scene, load_rig(difficulty.rig), room, {"glove": GLOVE}, rng=planned.rng("optics"))
     return take.without_body()
 
 
-def _published_points(take: Take) -> tuple[Capture, np.ndarray]:
+def _published_points(take: Take) -> tuple[Capture, Int[np.ndarray, "T N"]]:
     """The points (T, N, 3) as they are written, and their labels (T, N), without columns that are empty."""
     used = np.isfinite(take.points[..., 0]).any(axis=0)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(int(used.sum())))

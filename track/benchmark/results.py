@@ -48,7 +48,7 @@ _MOST_SHOWN: Final = 60  # characters of a cell
 
 
 def find_results(folder: Path, names: Sequence[str]) -> tuple[dict[str, Path], list[str]]:
-    """The files of results by the capture's name, and names of captures that no benchmark of these has.
+    """The files of results by the name of their capture, and the names of files of no capture.
 
     Raises:
         BenchmarkError: No such folder, nothing in it, or two files for one capture.
