@@ -38,7 +38,7 @@ class Difficulty:
 DIFFICULTIES: Final[dict[str, Difficulty]] = {
     "easy": Difficulty(
         "figure5",
-        RoomConfig(OpticsConfig(dropout=0.0), StrayConfig(number=0.0), reflectance=0.0),
+        RoomConfig(OpticsConfig(dropout=0.0, min_rays_to_start=2), StrayConfig(number=0.0), reflectance=0.0),
         speed=1,
     ),
     "medium": Difficulty(
