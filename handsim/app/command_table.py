@@ -5,15 +5,18 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final
 
-# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy
-# loads for --help and no package below names one above in an import.
+# "module:function", or "module:TABLE" for a dict of functions: sub-commands; tables of several modules are
+# joined by "+". Strings, so that nothing heavy loads for --help and no package names one above in an import.
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "demo": (
         "handsim.commands.demo:demo",
         "Run the whole chain on a built-in example; ends with a page of pictures.",
     ),
     "hand": ("track.commands.hand:hand", "Write a hand as a MuJoCo model, a URDF or a rigged mesh."),
-    "glove": ("render.commands.glove:GLOVE", "List, show, start and check marker layouts."),
+    "glove": (
+        "render.commands.glove:GLOVE+track.commands.glove_advice:GLOVE",
+        "List, show, start and check marker layouts; score and improve one before it is worn.",
+    ),
     "generate": ("train.commands.generate:generate", "Make a training set; goes on where it was stopped."),
     "train": (
         "train.commands.train:train",
@@ -60,6 +63,9 @@ VIDEO_WRITER: Final = "render.illustrations.clip:write_clip"
 
 
 def load(target: str) -> Any:
-    """What "module:name" stands for, imported now and not before."""
-    module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    """What "module:name" stands for, imported now and not before; tables joined by "+" are one."""
+    found = []
+    for part in target.split("+"):
+        module, _, attribute = part.partition(":")
+        found.append(getattr(importlib.import_module(module), attribute))
+    return found[0] if len(found) == 1 else {name: one for table in found for name, one in table.items()}

@@ -61,8 +61,15 @@ def right_hands(
 ) -> Float[np.ndarray, "B M 3"]:
     """All markers of each row [m], of left hands mirrored; each hand is stretched around its center."""
     centered = rows["markers"] - rows["markers"].mean(axis=1, keepdims=True)
-    markers: NDArray[np.float64] = centered @ _mirrors(rows["hand"]) @ _stretches(len(rows), anisotropy, rng)
-    return markers
+    return stretched(centered @ _mirrors(rows["hand"]), anisotropy, rng=rng)
+
+
+def stretched(
+    markers: Float[np.ndarray, "B M 3"], anisotropy: float, *, rng: np.random.Generator
+) -> Float[np.ndarray, "B M 3"]:
+    """Hands stretched at random around the origin, by this standard deviation of the logarithm."""
+    result: NDArray[np.float64] = markers @ _stretches(len(markers), anisotropy, rng)
+    return result
 
 
 def _stretches(count: int, anisotropy: float, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take
 from handsim.errors import CaptureError
-from train.data.augmentation import Corruption, corrupt
+from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.batches import paper_corruption
 from train.evaluation.metrics import LabelCounts
 from train.evaluation.reliability import error_without, expected_calibration_error
@@ -67,11 +67,19 @@ def evaluate_labeler(
     """
     count = _Count(labeler)
     for first in range(0, len(markers), _CHUNK):
-        cloud = corrupt(markers[first : first + _CHUNK], corruption, rng=rng)
-        count.add(
-            [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
-            [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
-        )
+        count.add_cloud(corrupt(markers[first : first + _CHUNK], corruption, rng=rng))
+    return count.report()
+
+
+def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> Report:
+    """Label clouds whose truth is known, and count errors.
+
+    Args:
+        labeler: The labeler to evaluate.
+        cloud: Clouds of hands [m].
+    """
+    count = _Count(labeler)
+    count.add_cloud(cloud)
     return count.report()
 
 
@@ -150,6 +158,12 @@ class _Count:
         self.right_by_marker = np.zeros(self.num_labels)
         self.confidences: list[NDArray[np.float64]] = [np.zeros(0)]
         self.right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
+
+    def add_cloud(self, cloud: Cloud) -> None:
+        self.add(
+            [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
+            [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
+        )
 
     def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
         for labeling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from gloves.layout import load_layout
 from handsim._plugins import is_plugin, list_plugins
-from handsim.errors import HandSimError, WeightsError, choices
+from handsim.errors import HandSimError, HandSimWarning, WeightsError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
+_ANY_LAYOUT: Final = "any_layout"  # weights of the network for any layout
+ANY_LAYOUT: Final = "any-layout"
+"""Name of the labeler that needs no training."""
 _PRIOR: Final = "pose_prior."  # in the names of the prior's tensors
 _METADATA: Final = "__metadata__"  # key in the header of a safetensors file
 _LENGTH: Final = 8  # bytes that hold the header's length
@@ -36,7 +40,7 @@ _SHIPPED: Final = Path(__file__).parents[1] / "weights"
 
 def shipped_labelers() -> tuple[str, ...]:
     """Gloves whose trained labeler comes with the package."""
-    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.safetensors")))
+    return tuple(sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if path.stem != _ANY_LAYOUT))
 
 
 def load_labeler(name_or_path: str | Path) -> Labeler:
@@ -192,7 +196,8 @@ def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
 
     Args:
         glove: Marker layout: a shipped name or the path of a .toml file.
-        labeler: Anything that `load_labeler` reads; the shipped one of the glove when None.
+        labeler: Anything that `load_labeler` reads, or `any-layout`. When None the shipped one of the glove
+            or, where none was trained on it, the one for any layout, with a warning.
 
     Raises:
         LayoutError: The glove is unknown.
@@ -200,11 +205,18 @@ def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
     """
     layout = load_layout(glove)
     if labeler is None and glove not in shipped_labelers():
-        raise WeightsError(
-            f"no labeler comes with glove '{glove}' (shipped: {', '.join(shipped_labelers())}); train one "
-            f"with handsim generate --glove {glove} --out SET && handsim train SET --out RUN, and give "
-            f"--labeler RUN"
+        warnings.warn(
+            f"no labeler was trained on glove '{glove}', so that the one for any layout labels it; a better "
+            f"one takes handsim generate --glove {glove} --out SET && handsim train SET --out RUN, and "
+            "--labeler RUN",
+            HandSimWarning,
+            stacklevel=2,
         )
+        labeler = ANY_LAYOUT
+    if labeler == ANY_LAYOUT:
+        from train.labelers.layout_labeler import LayoutLabeler
+
+        return LayoutLabeler(layout)
     found = load_labeler(glove if labeler is None else labeler)
     if found.marker_names != layout.names:
         raise WeightsError(

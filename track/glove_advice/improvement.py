@@ -1,0 +1,211 @@
+"""A search for a better layout near a given one: markers are moved, added and dropped, one at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from gloves.attachment import attach_markers
+from gloves.layout import MarkerLayout, MarkerPlace
+from handsim.errors import LayoutError
+from handsim.hand.model import HandModel
+from handsim.hand.topology import BONE_NAMES, BONES, PALM
+from handsim.space.cameras import CameraRig
+from track.glove_advice.layout_worth import Worth, judge
+from track.glove_advice.worn_places import Columns, WornPlaces
+from train.simulation.skin_bank import sample_places
+
+_PEOPLE, _POSES_EACH = 40, 40
+_CANDIDATES: Final = 10  # places that are tried at once
+_LOCAL: Final = 6  # of them near the marker's own
+_ADDED: Final = 24  # places that are tried for a new marker
+_STEP: Final = (0.15, float(np.deg2rad(20.0)), 0.1)  # standard deviations: along, around, across
+_CLEAR: Final = 0.006  # between two markers' surfaces on the flat hand [m]
+_FOLDS: Final = (0.12, 0.9)  # of a finger's bone: beyond these the skin folds and stretches
+_PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
+_PADS: Final = float(np.deg2rad(100.0))  # beyond this angle a finger's marker is on its pad
+_GAIN: Final = 0.05  # of a better layout, at least [points]
+_TRIES: Final = 20  # draws of a place
+
+
+class Improvement:
+    """A layout that gets better step by step.
+
+    Args:
+        layout: Where to begin.
+        rig: The cameras.
+        keep: Names of markers that stay where they are.
+        rng: Source of all randomness.
+
+    Raises:
+        LayoutError: A marker misses the skin of somebody, or a name to keep is none of the layout's.
+    """
+
+    def __init__(
+        self, layout: MarkerLayout, rig: CameraRig, keep: Collection[str], *, rng: np.random.Generator
+    ) -> None:
+        unknown = sorted(set(keep) - set(layout.names))
+        if unknown:
+            raise LayoutError(
+                f"to be kept are {', '.join(unknown)}, expected markers of the layout: "
+                f"{', '.join(layout.names)}"
+            )
+        self._start, self._keep, self._rng = layout, frozenset(keep), rng
+        self._model = HandModel.named("M")
+        self._people = WornPlaces(_PEOPLE, _POSES_EACH, layout.radius, rig, rng=rng)
+        self._seed = int(rng.integers(2**31))
+        self._columns = self._people.put_on(layout.markers)
+        self.worth = self._judge(self._columns)
+        """How good the layout so far is."""
+
+    @property
+    def layout(self) -> MarkerLayout:
+        """The layout so far."""
+        return dataclasses.replace(self._start, markers=self._columns.places)
+
+    def resize(self, num_markers: int) -> None:
+        """Add the best of some places, or drop the least useful marker, until there are so many.
+
+        Raises:
+            LayoutError: More markers than that are to be kept.
+        """
+        while len(self._columns.places) < num_markers:
+            self._take(self._grown())
+        while len(self._columns.places) > num_markers:
+            self._take(self._shrunk())
+
+    def search(self, seconds: float, told: Callable[[Worth], None]) -> None:
+        """Move markers while time lasts.
+
+        Args:
+            seconds: How long [s].
+            told: Called after every step.
+        """
+        places, until = self._columns.places, time.monotonic() + seconds
+        free = [number for number, place in enumerate(places) if place.name not in self._keep]
+        while free and time.monotonic() < until:
+            wrong = 1.02 - self.worth.by_marker[free]
+            worth, columns = self._best(self._moved(int(self._rng.choice(free, p=wrong / wrong.sum()))))
+            if columns is not None and worth.cost < self.worth.cost - _GAIN:
+                self.worth, self._columns = worth, columns
+            told(self.worth)
+
+    def smaller(self, fewest: int) -> list[tuple[int, Worth]]:
+        """How good the layout is without its least useful markers, one after the other; it stays as it is."""
+        kept, found = (self.worth, self._columns), []
+        while len(self._columns.places) > fewest:
+            self._take(self._shrunk())
+            found.append((len(self._columns.places), self.worth))
+        self.worth, self._columns = kept
+        return found
+
+    def _judge(self, columns: Columns) -> Worth:
+        return judge(self._people, columns, seed=self._seed)
+
+    def _take(self, layouts: Sequence[Columns]) -> None:
+        """Go on with the best of some layouts."""
+        worth, columns = self._best(layouts)
+        if columns is None:
+            raise LayoutError("no place for another marker was found, expected a hand with free skin")
+        self.worth, self._columns = worth, columns
+
+    def _best(self, layouts: Sequence[Columns]) -> tuple[Worth, Columns | None]:
+        judged = [(self._judge(layout), layout) for layout in layouts]
+        return min(judged, key=lambda one: one[0].cost) if judged else (self.worth, None)
+
+    def _shrunk(self) -> list[Columns]:
+        """The layout without each of its markers."""
+        places = self._columns.places
+        free = [number for number, place in enumerate(places) if place.name not in self._keep]
+        if not free:
+            raise LayoutError(f"all {len(places)} markers are to be kept, expected fewer than are left")
+        everything = range(len(places))
+        return [self._columns.chosen([one for one in everything if one != number]) for number in free]
+
+    def _grown(self) -> list[Columns]:
+        """The layout with another marker at some places."""
+        count = len(self._columns.places)
+        fresh = self._put_on(self._anywhere(_ADDED, self._columns.places))
+        if fresh is None:
+            return []
+        both = self._columns.joined(fresh)
+        added = [both.chosen([*range(count), count + one]) for one in range(len(fresh.places))]
+        return [one.renamed(count, self._new_name(one.places[count].bone)) for one in added]
+
+    def _moved(self, number: int) -> list[Columns]:
+        """The layout with one marker at some other places."""
+        places = self._columns.places
+        others = places[:number] + places[number + 1 :]
+        near = [place for _ in range(_LOCAL) for place in self._near(places[number], others)]
+        fresh = self._put_on([*near, *self._anywhere(_CANDIDATES - _LOCAL, others)])
+        if fresh is None:
+            return []
+        both, count = self._columns.joined(fresh), len(places)
+        moved = [
+            both.chosen([*range(number), count + one, *range(number + 1, count)])
+            for one in range(len(fresh.places))
+        ]
+        return [one.renamed(number, self._name_after(places[number], one.places[number])) for one in moved]
+
+    def _put_on(self, places: Sequence[MarkerPlace]) -> Columns | None:
+        try:
+            return self._people.put_on(places) if places else None
+        except LayoutError:  # it misses the skin of somebody's hand
+            return None
+
+    def _near(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> Iterator[MarkerPlace]:
+        """A place near another one, if one is found."""
+        for _ in range(_TRIES):
+            along, around, across = self._rng.standard_normal(3) * _STEP
+            palm = place.bone == BONE_NAMES[PALM]
+            moved = dataclasses.replace(
+                place,
+                along=float(np.clip(place.along + along, *(_PALM_ALONG if palm else _FOLDS))),
+                around=place.around if palm else float(np.clip(place.around + around, -_PADS, _PADS)),
+                across=float(np.clip(place.across + across, -_PALM_ACROSS, _PALM_ACROSS)) if palm else 0.0,
+            )
+            if self._is_clear(moved, others):
+                yield moved
+                return
+
+    def _anywhere(self, count: int, others: Sequence[MarkerPlace]) -> list[MarkerPlace]:
+        """Places anywhere on the back and the sides of the hand, clear of the folds and of other markers."""
+        found: list[MarkerPlace] = []
+        for place in sample_places(_TRIES + 4 * count, rng=self._rng):
+            folds = place.bone != BONE_NAMES[PALM] and not _FOLDS[0] <= place.along <= _FOLDS[1]
+            if len(found) < count and not folds and self._is_clear(place, others):
+                found.append(place)
+        return found
+
+    def _is_clear(self, place: MarkerPlace, others: Sequence[MarkerPlace]) -> bool:
+        """Whether a place is on the skin and not too near to the other markers of the flat hand."""
+        names = [str(number) for number in range(len(others) + 1)]
+        markers = [
+            dataclasses.replace(one, name=name) for one, name in zip((*others, place), names, strict=True)
+        ]
+        try:
+            points = attach_markers(
+                dataclasses.replace(self._start, markers=tuple(markers)), self._model
+            ).points
+        except LayoutError:
+            return False
+        apart = np.linalg.norm(points[:-1] - points[-1], axis=1).min()
+        return bool(apart > 2.0 * self._start.radius + _CLEAR)
+
+    def _name_after(self, old: MarkerPlace, new: MarkerPlace) -> str:
+        """The name of a marker that was moved: a new one if it went to another digit."""
+        return old.name if _digit(old) == _digit(new) else self._new_name(new.bone)
+
+    def _new_name(self, bone: str) -> str:
+        """A name for a marker on a bone, as IndexMiddle2."""
+        stem = "".join(word.capitalize() for word in bone.split("_"))
+        taken = {place.name for place in self._columns.places}
+        return next(name for number in range(1, 100) if (name := f"{stem}{number}") not in taken)
+
+
+def _digit(place: MarkerPlace) -> int:
+    return BONES[BONE_NAMES.index(place.bone)].digit

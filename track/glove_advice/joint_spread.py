@@ -1,0 +1,76 @@
+"""What the markers that are seen leave open of each joint: the solver's information matrix, inverted.
+
+Beside the markers counts what hands usually do (`track.kinematics.joint_prior`): a joint of which no marker
+tells anything keeps the spread of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from gloves.fit import GloveFit
+from handsim.hand.topology import DIGITS, NUM_JOINTS
+from track.glove_advice.observed_hands import ObservedHand
+from track.kinematics.joint_prior import resting_covariance, resting_prior
+from track.kinematics.marker_kinematics import hand_arrays
+from track.kinematics.marker_prediction import empty_prediction, predict_markers
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+
+NOISE: Final = 0.0015
+"""Standard deviation of a marker around a calibrated hand's [m]: optics, and the skin that moves."""
+_ANYWHERE: Final = (10.0, 10.0)  # standard deviations of the wrist before any marker is seen [m, rad]
+_FEWEST: Final = 4  # markers of a pose
+
+
+def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) -> Float[np.ndarray, "20"]:
+    """Standard deviation of each joint's error [rad], its root mean square over the frames.
+
+    Args:
+        hands: Hands in their poses; frames with fewer than four markers are left out.
+        without: A marker that counts as never seen.
+    """
+    parts = []
+    for hand in hands:
+        seen = np.isfinite(hand.frames.observed[..., 0])
+        if without is not None:
+            seen[:, without] = False
+        parts.append((hand.fit, hand.qpos, seen))
+    return pose_spreads(parts)
+
+
+def pose_spreads(
+    poses: Iterable[tuple[GloveFit, Float[np.ndarray, "T 27"], Bool[np.ndarray, "T M"]]],
+) -> Float[np.ndarray, "20"]:
+    """`joint_spreads` of hands in their gloves, their poses, and which markers are seen."""
+    squares, count = np.zeros(NUM_JOINTS), 0
+    for fit, qpos, seen in poses:
+        good = seen.sum(axis=1) >= _FEWEST
+        squares += _variances(fit, qpos[good], seen[good]).sum(axis=0)
+        count += int(good.sum())
+    spreads: Float[np.ndarray, "20"] = np.sqrt(squares / max(1, count))
+    return spreads if count else resting_spreads()
+
+
+def resting_spreads() -> Float[np.ndarray, "20"]:
+    """Standard deviation of each joint where nothing is seen [rad]."""
+    spreads: Float[np.ndarray, "20"] = np.sqrt(np.diag(resting_covariance()))
+    return spreads
+
+
+def _variances(
+    fit: GloveFit, qpos: Float[np.ndarray, "T 27"], seen: Bool[np.ndarray, "T M"]
+) -> Float[np.ndarray, "T 20"]:
+    """Variance of each joint [rad^2]."""
+    arrays, prior, out = hand_arrays(fit), resting_prior(), empty_prediction(seen.shape[1])
+    on_part = np.array([(arrays.digits == part).sum() for part in (*range(len(DIGITS)), -1)])
+    markers = np.where(seen[..., None], fit.markers(qpos)[0], np.nan)
+    nothing, variances = np.zeros(seen.shape[1]), np.empty((len(qpos), NUM_JOINTS))
+    for frame, (pose, target) in enumerate(zip(np.ascontiguousarray(qpos), markers, strict=True)):
+        predict_markers(arrays, on_part, pose, target, prior, _ANYWHERE, nothing, NOISE, out)
+        variances[frame] = np.diag(out.joint_covariance)
+    return variances

@@ -1,0 +1,133 @@
+"""The page of a layout's score: advice, figures, the hand with confusions, and its joints."""
+
+from __future__ import annotations
+
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from handsim.app.page import Section, write_page
+from handsim.hand.topology import DIGITS, JOINTS
+from track.glove_advice.advice import advice
+from track.glove_advice.joint_picture import SIZE, draw_joints
+from track.glove_advice.layout_score import LayoutScore
+from train.evaluation.metrics import percent
+from train.reports import hand_plot
+from train.reports.flat_hand import flat_hand
+from train.reports.plot_style import picture
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+_NOTHING: Final = "-"
+
+
+def write_score_page(path: Path, score: LayoutScore, *, seen_by: str, trained: bool = False) -> None:
+    """Write the page: one HTML file with its pictures inside.
+
+    Args:
+        path: The file.
+        score: What is known of the layout.
+        seen_by: Whose motion was seen by which rig, in words.
+        trained: Whether the labeler was trained on the layout.
+    """
+    layout, frames = score.layout, score.observed.num_frames
+    sections = [
+        _advice_section(score),
+        _labels_section(score),
+        _markers_section(score),
+        _joints_section(score),
+    ]
+    network = (
+        "a labeler trained on it" if trained else "the network for any layout, without training on this one"
+    )
+    lead = (
+        f"{layout.num_markers} markers of {1e3 * layout.radius:.1f} mm, on {frames:,} frames of {seen_by}. "
+        f"Points were labeled by {network}."
+    )
+    write_page(path, sections, title=f"Layout {layout.name}", lead=lead)
+
+
+def _advice_section(score: LayoutScore) -> Section:
+    sentences = advice(score)
+    items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
+    text = f"<ol>{items}</ol>" if sentences else "Nothing stands out: no marker is in anybody's way."
+    return Section("What to do", text)
+
+
+def _labels_section(score: LayoutScore) -> Section:
+    columns = (score.observed, score.clean, score.corrupted)
+    table = [["labels [%]", "as the rig sees them", "every marker seen", "the paper's drops and ghosts"]]
+    table += [
+        [title, *(percent(report.figures[name]) for report in columns)]
+        for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy"))
+    ]
+    arrows = hand_plot.mistakes(score.observed.confusion)
+    draw = partial(
+        hand_plot.draw_hand, hand=flat_hand(score.layout), names=score.layout.names,
+        accuracy=score.observed.slot_accuracy_by_marker, arrows=arrows,
+    )  # fmt: skip
+    caption = (
+        "A right hand of size M at rest, from the back; rings are markers that look to the palm's side. "
+        "Arrows lead from what points are to what they are called, wider the more often."
+    )
+    text = f"Left and right are told apart in {percent(score.sides_right)} % of the frames."
+    drawn = picture(hand_plot.HAND_SIZE, draw)
+    return Section("Labels", text, table=table, pictures=[(drawn, caption)])
+
+
+def _markers_section(score: LayoutScore) -> Section:
+    names = score.layout.names
+    worst = {
+        mistake.truth: mistake for mistake in reversed(hand_plot.mistakes(score.observed.confusion, 200))
+    }
+    lost = np.rad2deg((score.joints_without - score.joints).max(axis=1))
+    table = [["marker", "seen [%]", "slots right [%]", "taken for", "of its points [%]", "joints lose [deg]"]]
+    for number, name in enumerate(names):
+        mistake = worst.get(number)
+        table.append(
+            [
+                name,
+                percent(score.seen[number]),
+                percent(score.observed.slot_accuracy_by_marker[number]),
+                names[mistake.called] if mistake else _NOTHING,
+                percent(mistake.share) if mistake else _NOTHING,
+                f"{lost[number]:.1f}",
+            ]
+        )
+    text = (
+        "Seen: the marker becomes a point. Joints lose: by how much the worst-hit joint is known less well "
+        "without it."
+    )
+    near = [
+        f"{names[first]} and {names[second]}: {percent(score.near[first, second])} %"
+        for first, second in _nearest_pairs(score.near)
+    ]
+    notes = [f"Pairs that touch or nearly do, in shares of the frames: {'; '.join(near)}."] if near else []
+    return Section("Markers", text, table=table, notes=notes)
+
+
+def _nearest_pairs(near: Float[np.ndarray, "M M"], most: int = 5) -> list[tuple[int, int]]:
+    upper = np.triu(near)
+    order = np.argsort(-upper, axis=None, kind="stable")[:most]
+    pairs = zip(*np.unravel_index(order, upper.shape), strict=True)
+    return [(int(first), int(second)) for first, second in pairs if upper[first, second] > 0.0]
+
+
+def _joints_section(score: LayoutScore) -> Section:
+    draw = partial(draw_joints, hand=flat_hand(score.layout), joints=score.joints)
+    caption = (
+        "Markers are small rings, joints disks: the standard deviation of the worst angle there, in degrees."
+    )
+    kinds = ("abduction", "first flexion", "second flexion", "last flexion")
+    table = [["joints [deg]", *kinds]]
+    degrees = np.rad2deg(score.joints).reshape(len(DIGITS), -1)
+    table += [[digit, *(f"{one:.1f}" for one in row)] for digit, row in zip(DIGITS, degrees, strict=True)]
+    text = (
+        "Standard deviation of each joint's angle, from the information that the markers give the solver "
+        f"frame by frame, and from what hands usually do; {len(JOINTS)} joints."
+    )
+    return Section("Joints", text, table=table, pictures=[(picture(SIZE, draw), caption)])
