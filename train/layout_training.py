@@ -39,6 +39,7 @@ _GAP: Final = (0.006, 0.014)  # least distance of two markers [m]
 _HIDDEN: Final = 0.3  # share of batches in which neighbors are lost together
 _HIDDEN_RADIUS: Final = 0.05  # [m]
 _LEAST_SEEN: Final = 4  # markers
+_CONFIG: Final = LayoutNetworkConfig()
 _FEATURE_POSES: Final = 3000
 _SAVED_EVERY, _TOLD_EVERY = 500, 100  # steps
 
@@ -105,10 +106,9 @@ class LayoutBatches:
 def _mean_features(bank: SkinBank) -> Float[np.ndarray, "C C K"]:
     """Mean distance features between all places."""
     some = bank.positions[:: max(1, len(bank.positions) // _FEATURE_POSES)].astype(np.float32)
-    config = LayoutNetworkConfig()
-    total = torch.zeros(len(bank.places), len(bank.places), config.num_distances)
+    total = torch.zeros(len(bank.places), len(bank.places), _CONFIG.num_distances)
     for points in some:
-        total += distance_features(torch.from_numpy(points)[None], config)[0]
+        total += distance_features(torch.from_numpy(points)[None], _CONFIG)[0]
     return (total / len(some)).numpy().astype(np.float16)
 
 
@@ -117,12 +117,13 @@ class LayoutTraining:
 
     Args:
         steps: Steps of the run.
+        config: Size of the network.
     """
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, config: LayoutNetworkConfig = _CONFIG) -> None:
         torch.manual_seed(0)
         self.steps, self.done = steps, 0
-        self.network = LayoutNetwork(LayoutNetworkConfig())
+        self.network = LayoutNetwork(config)
         self.optimizer = torch.optim.AdamW(
             self.network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True
         )
@@ -132,7 +133,7 @@ class LayoutTraining:
         progress = self.done / self.steps
         rate = min(1.0, (self.done + 1) / _WARM_UP) * (0.01 + 0.495 * (1.0 + np.cos(np.pi * progress)))
         for group in self.optimizer.param_groups:
-            group["lr"] = _PEAK_RATE * rate
+            group["lr"] = float(_PEAK_RATE * rate)
         points = torch.from_numpy(cloud.points.astype(np.float32))
         present, truth = torch.from_numpy(cloud.present), torch.from_numpy(cloud.truth)
         found = self.network(points, present, torch.from_numpy(layouts))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from handsim.hand.topology import BONES, DIGITS, JOINTS
-from track.glove_advice.joint_spread import resting_spreads
+from track.glove_advice.joint_spread import untold_spreads
 from track.glove_advice.layout_score import LayoutScore
 from train.reports.hand_plot import mistakes
 
@@ -59,8 +59,8 @@ def _confusions(score: LayoutScore) -> Iterator[Advice]:
 
 
 def _untold_joints(score: LayoutScore) -> Iterator[Advice]:
-    """A digit of which some joints follow from what hands usually do, and the bone that lacks a marker."""
-    share = score.joints / resting_spreads()
+    """A digit of whose joints some are hardly told of, and the bone that lacks a marker."""
+    share = score.joints / untold_spreads()
     carried = {marker.bone for marker in score.layout.markers}
     for digit, name in enumerate(DIGITS):
         joints = [number for number, joint in enumerate(JOINTS) if BONES[joint.bone].digit == digit]
@@ -76,8 +76,7 @@ def _untold_joints(score: LayoutScore) -> Iterator[Advice]:
         )
         yield Advice(
             float(share[untold].max()) * 0.1,
-            f"Add a marker on {bone}: the markers tell little of the {name}'s {listed}, which then follows "
-            "from what hands usually do.",
+            f"Add a marker on {bone}: the markers tell little of the {name}'s {listed}.",
         )
 
 

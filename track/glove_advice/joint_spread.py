@@ -1,7 +1,7 @@
 """What the markers that are seen leave open of each joint: the solver's information matrix, inverted.
 
-Beside the markers counts what hands usually do (`track.kinematics.joint_prior`): a joint of which no marker
-tells anything keeps the spread of that.
+Beside the markers count the limits of the joints alone, as in the solver: a joint of which no marker tells
+anything may be anywhere in its range. What hands usually do narrows that further when a hand is tracked.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from gloves.fit import GloveFit
-from handsim.hand.topology import DIGITS, NUM_JOINTS
+from handsim.hand.topology import DIGITS, JOINTS, NUM_JOINTS
 from track.glove_advice.observed_hands import ObservedHand
-from track.kinematics.joint_prior import resting_covariance, resting_prior
+from track.kinematics.joint_prior import JointPrior, resting_angles
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.marker_prediction import empty_prediction, predict_markers
 
@@ -31,7 +31,7 @@ def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) 
     """Standard deviation of each joint's error [rad], its root mean square over the frames.
 
     Args:
-        hands: Hands in their poses; frames with fewer than four markers are left out.
+        hands: Hands in their poses; of frames with fewer than four markers nothing is known.
         without: A marker that counts as never seen.
     """
     parts = []
@@ -51,22 +51,31 @@ def pose_spreads(
     for fit, qpos, seen in poses:
         good = seen.sum(axis=1) >= _FEWEST
         squares += _variances(fit, qpos[good], seen[good]).sum(axis=0)
-        count += int(good.sum())
+        squares += np.count_nonzero(~good) * untold_spreads() ** 2
+        count += len(good)
     spreads: Float[np.ndarray, "20"] = np.sqrt(squares / max(1, count))
-    return spreads if count else resting_spreads()
-
-
-def resting_spreads() -> Float[np.ndarray, "20"]:
-    """Standard deviation of each joint where nothing is seen [rad]."""
-    spreads: Float[np.ndarray, "20"] = np.sqrt(np.diag(resting_covariance()))
     return spreads
+
+
+def untold_spreads() -> Float[np.ndarray, "20"]:
+    """Standard deviation of each joint where nothing is seen: anywhere in its range [rad]."""
+    spreads: Float[np.ndarray, "20"] = np.deg2rad([joint.high - joint.low for joint in JOINTS]) / np.sqrt(
+        12.0
+    )
+    return spreads
+
+
+def _limits() -> JointPrior:
+    """The limits of the joints, as a normal distribution of the same spread."""
+    variance = untold_spreads() ** 2
+    return JointPrior(resting_angles(), np.diag(variance), np.diag(1.0 / variance))
 
 
 def _variances(
     fit: GloveFit, qpos: Float[np.ndarray, "T 27"], seen: Bool[np.ndarray, "T M"]
 ) -> Float[np.ndarray, "T 20"]:
     """Variance of each joint [rad^2]."""
-    arrays, prior, out = hand_arrays(fit), resting_prior(), empty_prediction(seen.shape[1])
+    arrays, prior, out = hand_arrays(fit), _limits(), empty_prediction(seen.shape[1])
     on_part = np.array([(arrays.digits == part).sum() for part in (*range(len(DIGITS)), -1)])
     markers = np.where(seen[..., None], fit.markers(qpos)[0], np.nan)
     nothing, variances = np.zeros(seen.shape[1]), np.empty((len(qpos), NUM_JOINTS))

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from handsim.app.page import Section, write_page
-from handsim.hand.topology import DIGITS, JOINTS
+from handsim.hand.topology import DIGITS
 from track.glove_advice.advice import advice
 from track.glove_advice.joint_picture import SIZE, draw_joints
+from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore
 from train.evaluation.metrics import percent
 from train.reports import hand_plot
@@ -127,7 +128,8 @@ def _joints_section(score: LayoutScore) -> Section:
     degrees = np.rad2deg(score.joints).reshape(len(DIGITS), -1)
     table += [[digit, *(f"{one:.1f}" for one in row)] for digit, row in zip(DIGITS, degrees, strict=True)]
     text = (
-        "Standard deviation of each joint's angle, from the information that the markers give the solver "
-        f"frame by frame, and from what hands usually do; {len(JOINTS)} joints."
+        "Standard deviation of each joint's angle, from the information that the markers give the solver frame "
+        f"by frame where they lie within {1e3 * NOISE:g} mm of a calibrated hand's, and from the limits of the "
+        "joints. Tracking knows more: what the hand did before, and what hands usually do."
     )
     return Section("Joints", text, table=table, pictures=[(picture(SIZE, draw), caption)])

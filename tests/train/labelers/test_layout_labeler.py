@@ -1,0 +1,70 @@
+"""The labeler that needs no training, on gloves that it has never seen."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.layout import load_layout, save_layout
+from handsim.errors import HandSimWarning, WeightsError
+from train.data.augmentation import Corruption
+from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.labelers import layout_labeler
+from train.labelers.layout_labeler import LayoutLabeler, save_layout_network, shipped_network
+from train.labelers.storage import labeler_for_glove, shipped_labelers
+from train.simulation.worn_markers import sample_worn_markers
+
+
+@pytest.fixture(scope="module")
+def labeler():
+    return LayoutLabeler(load_layout("starter15"), num_poses=8000)
+
+
+@pytest.mark.parametrize(("corruption", "least"), [(Corruption(0, 0), 0.93), (Corruption(4, 2), 0.80)])
+def test_a_glove_of_no_training_is_labeled(labeler, corruption, least):
+    markers = sample_worn_markers(load_layout("starter15"), 300, rng=np.random.default_rng(5))
+    report = evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(6))
+    assert report.figures["slot_accuracy"] > least
+
+
+def test_labels_follow_the_order_of_the_layout(labeler):
+    """The same glove with its markers listed backwards: the same names."""
+    layout = load_layout("starter15")
+    backwards = dataclasses.replace(layout, markers=layout.markers[::-1])
+    other = LayoutLabeler(backwards, num_poses=8000)
+    assert other.marker_names == layout.names[::-1]
+    clouds = list(sample_worn_markers(layout, 60, rng=np.random.default_rng(7)))
+    names = [
+        [known.marker_names[label] if label >= 0 else None for label in labeling.labels]
+        for known in (labeler, other)
+        for labeling in known.label_frames(clouds)
+    ]
+    equal = np.array(names[:60]) == np.array(names[60:])
+    assert equal.mean() > 0.97  # the two know the layout from other poses
+
+
+def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path):
+    layout = load_layout("starter6")
+    save_layout(tmp_path / "mine.toml", layout)
+    with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):
+        found = labeler_for_glove(str(tmp_path / "mine.toml"), None)
+    assert isinstance(found, LayoutLabeler) and found.marker_names == layout.names
+    assert "any_layout" not in shipped_labelers()
+
+
+def test_the_network_is_saved_and_read_again(tmp_path, monkeypatch):
+    network = shipped_network()
+    save_layout_network(tmp_path, network, 1)
+    monkeypatch.setattr(layout_labeler, "_SHIPPED", tmp_path)
+    shipped_network.cache_clear()
+    try:
+        for name, tensor in shipped_network().state_dict().items():
+            assert np.array_equal(tensor.numpy(), network.state_dict()[name].numpy()), name
+        (tmp_path / layout_labeler.WEIGHTS).write_bytes(b"nothing")
+        shipped_network.cache_clear()
+        with pytest.raises(WeightsError, match="missing or damaged"):
+            shipped_network()
+    finally:
+        shipped_network.cache_clear()
