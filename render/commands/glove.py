@@ -37,13 +37,13 @@ def list_gloves(out: Path | None = None) -> None:
     table = Table("name", "markers", "labeler", "description and source", box=None, pad_edge=False)
     for name in list_layouts():
         shipped = shipped_layout(name)
-        labeler = "comes with it" if name in LABELED_GLOVES else "train one"
+        labeler = "comes with it" if name in LABELED_GLOVES else "for any layout"
         text = Text(shipped.description).append(f"\n{shipped.source}", "dim")
         table.add_row(name, str(shipped.layout.num_markers), labeler, text)
     Console().print(table)
     print_line(
-        "A labeler for NAME: handsim generate --glove NAME --out SET && handsim train SET --out RUN, "
-        "then give --labeler RUN."
+        "A labeler of its own for NAME: handsim generate --glove NAME --out SET && handsim train SET "
+        "--out RUN, then give --labeler RUN."
     )
     if out is not None:
         from render.illustrations.captions import write_png

@@ -9,6 +9,7 @@
 `live`: its live part.
 `replay`: `handsim replay`, a NatNet server that plays a capture.
 `view`: `handsim view`, files and live trackers in the browser.
+`glove_advice`: `handsim glove score` and `improve`, advice on a layout.
 `reproduce`: `handsim reproduce`, the paper's tables.
 `benchmark`: `handsim benchmark`, the public benchmark.
 `demo`: the step of `handsim demo` that tracks.

@@ -113,7 +113,8 @@ def _tell(score: LayoutScore) -> None:
     print_line(f"{percent(score.seen.mean())} % of the markers seen; {percent(score.sides_right)} % of the "
                "hands told left from right")  # fmt: skip
     print_line(
-        f"joints, frame by frame: standard deviation {np.sqrt((joints**2).mean()):.1f} deg, the worst {joints.max():.1f} deg"
+        f"joints, frame by frame: standard deviation {np.sqrt((joints**2).mean()):.1f} deg, the worst "
+        f"{joints.max():.1f} deg"
     )
 
 

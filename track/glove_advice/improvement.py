@@ -17,7 +17,7 @@ from handsim.hand.topology import BONE_NAMES, BONES, PALM
 from handsim.space.cameras import CameraRig
 from track.glove_advice.layout_worth import Worth, judge
 from track.glove_advice.worn_places import Columns, WornPlaces
-from train.simulation.skin_bank import sample_places
+from train.any_layout.skin_bank import sample_places
 
 _PEOPLE, _POSES_EACH = 40, 40
 _CANDIDATES: Final = 10  # places that are tried at once

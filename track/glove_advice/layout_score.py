@@ -57,7 +57,7 @@ def score_layout(
     Args:
         layout: The glove.
         hands: Hands that wear it.
-        labeler: A labeler of this layout; `train.labelers.layout_labeler.LayoutLabeler` needs no training.
+        labeler: A labeler of this layout; `train.any_layout.layout_labeler.LayoutLabeler` needs no training.
         rng: Order of points, and the random parts of the paper's recipe.
     """
     observed = np.concatenate([hand.frames.observed for hand in hands])

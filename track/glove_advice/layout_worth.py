@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from track.glove_advice.worn_places import Columns, WornPlaces
+from train.any_layout.layout_labeler import mean_features, shipped_network
 from train.data.augmentation import Corruption, corrupt
 from train.evaluation.metrics import LabelCounts
-from train.labelers.layout_labeler import mean_features, shipped_network
 from train.matching.assignment import match_probabilities, pair_probabilities
 from train.threads import labeling_threads
 

@@ -128,8 +128,8 @@ def _joints_section(score: LayoutScore) -> Section:
     degrees = np.rad2deg(score.joints).reshape(len(DIGITS), -1)
     table += [[digit, *(f"{one:.1f}" for one in row)] for digit, row in zip(DIGITS, degrees, strict=True)]
     text = (
-        "Standard deviation of each joint's angle, from the information that the markers give the solver frame "
-        f"by frame where they lie within {1e3 * NOISE:g} mm of a calibrated hand's, and from the limits of the "
-        "joints. Tracking knows more: what the hand did before, and what hands usually do."
+        "Standard deviation of each joint's angle, from the information that the markers give the solver "
+        f"frame by frame where they lie within {1e3 * NOISE:g} mm of a calibrated hand's, and from the "
+        "limits of the joints. Tracking knows more: what the hand did before, and what hands usually do."
     )
     return Section("Joints", text, table=table, pictures=[(picture(SIZE, draw), caption)])

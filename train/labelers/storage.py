@@ -214,7 +214,7 @@ def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
         )
         labeler = ANY_LAYOUT
     if labeler == ANY_LAYOUT:
-        from train.labelers.layout_labeler import LayoutLabeler
+        from train.any_layout.layout_labeler import LayoutLabeler
 
         return LayoutLabeler(layout)
     found = load_labeler(glove if labeler is None else labeler)

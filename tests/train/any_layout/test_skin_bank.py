@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from train.simulation.skin_bank import sample_places, sample_skin_bank
+from train.any_layout.skin_bank import sample_places, sample_skin_bank
 
 
 @pytest.fixture(scope="module")

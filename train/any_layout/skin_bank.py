@@ -21,7 +21,7 @@ from train.simulation.people import sample_hands
 if TYPE_CHECKING:
     from jaxtyping import Float, Float16, Int
 
-_APART: Final = 0.0025  # [m] between two places, at least
+_APART: Final = 0.0025  # [m] between two places of a bank, at least
 _PALM_SHARE: Final = 5.0  # of places, against a finger's bone
 _PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
 _FINGER_ALONG, _TIP_ALONG = (0.1, 1.05), (0.1, 0.9)
@@ -74,8 +74,16 @@ def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generat
     return SkinBank(places, np.concatenate(parts))
 
 
-def sample_places(num_places: int, *, rng: np.random.Generator) -> tuple[MarkerPlace, ...]:
-    """Random places on the skin, none next to another."""
+def sample_places(
+    num_places: int, *, rng: np.random.Generator, apart: float = _APART
+) -> tuple[MarkerPlace, ...]:
+    """Random places on the skin of the back and the sides of the hand.
+
+    Args:
+        num_places: Number of places.
+        rng: Source of all randomness.
+        apart: Least distance between two of them on the flat hand [m].
+    """
     model = HandModel.named("M")
     share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
     places: list[MarkerPlace] = []
@@ -91,7 +99,7 @@ def sample_places(num_places: int, *, rng: np.random.Generator) -> tuple[MarkerP
             around, across = np.clip(_AROUND * rng.standard_normal(), -_MOST_AROUND, _MOST_AROUND), 0.0
         place = MarkerPlace(f"place{len(places)}", name, along, float(np.deg2rad(around)), across)
         point = _point_of(place, model)
-        if point is not None and all(np.linalg.norm(point - other) > _APART for other in points):
+        if point is not None and all(np.linalg.norm(point - other) > apart for other in points):
             places.append(place)
             points.append(point)
     return tuple(places)

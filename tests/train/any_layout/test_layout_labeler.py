@@ -9,12 +9,12 @@ import pytest
 
 from gloves.layout import load_layout, save_layout
 from handsim.errors import HandSimWarning, WeightsError
+from train.any_layout import layout_labeler
+from train.any_layout.layout_labeler import LayoutLabeler, save_layout_network, shipped_network
+from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
 from train.evaluation.labeler_evaluation import evaluate_labeler
-from train.labelers import layout_labeler
-from train.labelers.layout_labeler import LayoutLabeler, save_layout_network, shipped_network
 from train.labelers.storage import labeler_for_glove, shipped_labelers
-from train.simulation.worn_markers import sample_worn_markers
 
 
 @pytest.fixture(scope="module")

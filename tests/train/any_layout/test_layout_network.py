@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from train.labelers.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
+from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
 
 CONFIG = LayoutNetworkConfig(width=32, gates=8, first_rounds=1, match_rounds=2)
 

@@ -21,11 +21,11 @@ from handsim._version import __version__
 from handsim.errors import WeightsError
 from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
-from train.labelers.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features
+from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features
+from train.any_layout.worn_markers import sample_worn_markers
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
 from train.matching.pose_prior import PosePrior
 from train.matching.prior_learning import learn_pose_prior
-from train.simulation.worn_markers import sample_worn_markers
 from train.threads import labeling_threads
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from train.labelers.layout_network import LayoutNetworkConfig
-from train.layout_training import LayoutBatches, LayoutTraining
-from train.simulation.skin_bank import sample_skin_bank
+from train.any_layout.layout_network import LayoutNetworkConfig
+from train.any_layout.layout_training import LayoutBatches, LayoutTraining
+from train.any_layout.skin_bank import sample_skin_bank
 
 SMALL = LayoutNetworkConfig(width=32, gates=8, first_rounds=1, match_rounds=1)
 

@@ -1,6 +1,6 @@
 """Training of the network for any layout: every batch holds new random layouts, none of them twice.
 
-python -m train.layout_training FOLDER [--steps N]
+python -m train.any_layout.layout_training FOLDER [--steps N]
 
 It writes `any_layout.safetensors` and its card `any_layout.json` into the folder, and goes on from the
 checkpoint there. The figures of the shipped weights are in train/weights/README.md.
@@ -19,11 +19,11 @@ import torch
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.topology import PALM
+from train.any_layout.layout_labeler import save_layout_network
+from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
+from train.any_layout.skin_bank import SkinBank, sample_skin_bank
 from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.batches import stretched
-from train.labelers.layout_labeler import save_layout_network
-from train.labelers.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
-from train.simulation.skin_bank import SkinBank, sample_skin_bank
 from train.threads import torch_threads
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gloves.layout import load_layout
-from train.simulation.worn_markers import sample_worn_markers
+from train.any_layout.worn_markers import sample_worn_markers
 
 
 def test_the_back_of_the_hand_is_rigid_and_fingers_bend():

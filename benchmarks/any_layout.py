@@ -1,0 +1,113 @@
+"""The labeler for any layout beside trained ones: slots right, clean and with drops and ghosts; its time.
+
+Simulated people and poses that no training saw. Beside the shipped layouts come random ones of 6 to 30
+markers, some even over the hand, some crowded on few bones; their markers were in no training either.
+
+python benchmarks/any_layout.py [--frames 1000] [--random 10] [--captures FOLDER]
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from machine import describe
+
+from gloves.captures.collection import read_markers
+from gloves.layout import MarkerLayout, list_layouts, load_layout
+from train.any_layout.layout_labeler import LayoutLabeler
+from train.any_layout.skin_bank import sample_places
+from train.any_layout.worn_markers import sample_worn_markers
+from train.data.augmentation import Corruption
+from train.data.batches import paper_corruption
+from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler, shipped_labelers
+
+CAPTURE_FRAMES = 3000
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=1000, help="of each layout")
+    parser.add_argument("--random", type=int, default=10, help="random layouts")
+    parser.add_argument("--captures", type=Path, help="real captures in dense19, for it and sparse13")
+    options = parser.parse_args()
+    print(describe("torch", "numpy"))
+    print("slots right [%], clean / with the paper's drops and ghosts")
+    rng = np.random.default_rng(2026)
+    layouts = [load_layout(name) for name in list_layouts()]
+    layouts += [random_layout(number, rng) for number in range(options.random)]
+    unseen = []
+    for layout in layouts:
+        began = time.perf_counter()
+        labeler = LayoutLabeler(layout)
+        seconds = time.perf_counter() - began
+        markers = sample_worn_markers(layout, options.frames, rng=np.random.default_rng(77))
+        found = accuracies(labeler, markers)
+        trained = load_labeler(layout.name) if layout.name in shipped_labelers() else None
+        beside = f"; trained {told(accuracies(trained, markers))}" if trained else ""
+        speed = f"known after {seconds:.0f} s, {per_cloud(labeler, markers):.1f} ms a cloud"
+        print(
+            f"{layout.name}: {layout.num_markers} markers, any layout {told(found)}{beside}; {speed}",
+            flush=True,
+        )
+        if layout.name not in list_layouts():
+            unseen.append(found)
+        if options.captures and trained:
+            real = real_markers(options.captures, layout)
+            print(f"{layout.name}, real captures: any layout {told(accuracies(labeler, real))}; trained "
+                  f"{told(accuracies(trained, real))}", flush=True)  # fmt: skip
+    mean, worst = np.mean(unseen, axis=0), np.min(unseen, axis=0)
+    print(f"random layouts: mean {told(mean)}; worst {told(worst)}")
+
+
+def random_layout(number: int, rng: np.random.Generator) -> MarkerLayout:
+    """A random layout, the markers at least 10 mm apart on the flat hand."""
+    count = int(rng.integers(6, 31))
+    places = sample_places(200, rng=rng, apart=0.010)
+    share = rng.dirichlet(np.full(16, rng.choice([0.5, 2.0])))
+    bones = sorted({place.bone for place in places})
+    weight = np.array([share[bones.index(place.bone)] for place in places]) + 1e-9
+    chosen = rng.choice(len(places), size=count, replace=False, p=weight / weight.sum())
+    markers = tuple(dataclasses.replace(places[one], name=f"M{n}") for n, one in enumerate(chosen))
+    return MarkerLayout(f"random{number}", markers, 0.0032)
+
+
+def accuracies(labeler: Labeler, markers: np.ndarray) -> tuple[float, float]:
+    """Slot accuracy, clean and with the paper's recipe [%]."""
+    recipe = paper_corruption(markers.shape[1])
+    reports = [
+        evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(3))
+        for corruption in (Corruption(0, 0), recipe)
+    ]
+    clean, both = (100.0 * report.figures["slot_accuracy"] for report in reports)
+    return clean, both
+
+
+def real_markers(captures: Path, layout: MarkerLayout) -> np.ndarray:
+    """Frames of real captures whose markers are those of a layout [m]."""
+    markers = read_markers(sorted(captures.rglob("*.trc")), layout.names)
+    return markers[:: max(1, len(markers) // CAPTURE_FRAMES)]
+
+
+def told(pair: Sequence[float]) -> str:
+    return f"{pair[0]:.2f} / {pair[1]:.2f}"
+
+
+def per_cloud(labeler: Labeler, markers: np.ndarray) -> float:
+    """Median time of a cloud that comes alone [ms]."""
+    times = []
+    for cloud in markers[:60]:
+        began = time.perf_counter()
+        labeler.label_frames([cloud])
+        times.append(time.perf_counter() - began)
+    return 1e3 * float(np.median(times))
+
+
+if __name__ == "__main__":
+    main()
