@@ -97,16 +97,7 @@ CASES = {
     "another kind of file": ["label", "takes.docx", "--out", "out.trc"],
     "another kind of output": ["label", "good.trc", "--out", "out.xlsx"],
     "no such file": ["label", "missing.c3d", "--out", "out.trc"],
-    "a labeler of another glove": [
-        "label",
-        "good.trc",
-        "--glove",
-        "copy.toml",
-        "--labeler",
-        "sparse13",
-        "--out",
-        "out.trc",
-    ],  # fmt: skip
+    "a labeler of another glove": ["label", "good.trc", "--labeler", "sparse13", "--out", "out.trc"],
     "no frames": ["generate", "--num-frames", "0", "--out", "out"],
     "an existing layout": ["glove", "new", "copy.toml"],
     "a rig with one camera": ["generate", "--rig", "one_camera.toml", "--out", "out"],

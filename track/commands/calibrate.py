@@ -26,8 +26,8 @@ from track.capture_tracking import capture_frames, track_capture
 from track.commands.user_options import BOTH, Size, measured_users, users_of
 from track.tracker import Tracker
 from track.user import save_user
+from train.glove_labeler import labeler_for_glove
 from train.labelers.protocol import Labeler
-from train.labelers.storage import labeler_for_glove
 
 if TYPE_CHECKING:
     from jaxtyping import Bool

@@ -16,7 +16,7 @@ from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.space.cameras import CameraRig, load_rig
-from train.labelers.storage import ANY_LAYOUT, labeler_for_glove
+from train.glove_labeler import ANY_LAYOUT, labeler_for_glove
 
 if TYPE_CHECKING:
     from track.glove_advice.layout_score import LayoutScore

@@ -13,7 +13,7 @@ from rich.console import Console
 from handsim.app.progress import progress_bar
 from handsim.files.json_files import save_json
 from train.commands.labeling_tables import LABELING_TABLES
-from train.labelers.storage import labeler_for_glove
+from train.glove_labeler import labeler_for_glove
 from train.simulation.room_settings import KINDS
 from train.simulation.takes import TakeConfig, simulate_take
 

@@ -40,8 +40,8 @@ from track.sinks.sink_group import SinkGroup
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
+from train.glove_labeler import labeler_for_glove
 from train.labelers.protocol import Labeler
-from train.labelers.storage import labeler_for_glove
 
 if TYPE_CHECKING:
     from jaxtyping import Float, Int

@@ -27,7 +27,7 @@ from track.viewer.contents import Content, first_look, open_content
 from track.viewer.live_view import LiveView
 from track.viewer.server import LOOPBACK, address_of, opened_server
 from track.viewer.video import write_video
-from train.labelers.storage import labeler_for_glove
+from train.glove_labeler import labeler_for_glove
 
 
 def view(

@@ -14,7 +14,7 @@ from gloves.takes.take import load_take
 from handsim.errors import CaptureError, HandSimError
 from handsim.files.json_files import save_json
 from handsim.files.outputs import check_outputs
-from train.labelers.storage import labeler_for_glove
+from train.glove_labeler import labeler_for_glove
 from train.reports.figures_table import print_figures
 from train.threads import label_on
 

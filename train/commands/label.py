@@ -18,9 +18,9 @@ from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
 from handsim.files.outputs import check_outputs
+from train.glove_labeler import labeler_for_glove
 from train.hands.frame_hands import HandFinder
 from train.hands.labeling import FrameLabels, label_hands
-from train.labelers.storage import labeler_for_glove
 from train.threads import label_on
 
 if TYPE_CHECKING:

@@ -26,7 +26,8 @@ from train.evaluation.tables import (
     print_tests,
     simulate_takes,
 )
-from train.labelers.storage import labeler_for_glove, shipped_labelers
+from train.glove_labeler import labeler_for_glove
+from train.labelers.storage import shipped_labelers
 from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
 

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from gloves.layout import load_layout
 from handsim._plugins import is_plugin, list_plugins
-from handsim.errors import HandSimError, HandSimWarning, WeightsError, choices
+from handsim.errors import HandSimError, WeightsError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
@@ -28,8 +26,6 @@ if TYPE_CHECKING:
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
 _ANY_LAYOUT: Final = "any_layout"  # weights of the network for any layout
-ANY_LAYOUT: Final = "any-layout"
-"""Name of the labeler that needs no training."""
 _PRIOR: Final = "pose_prior."  # in the names of the prior's tensors
 _METADATA: Final = "__metadata__"  # key in the header of a safetensors file
 _LENGTH: Final = 8  # bytes that hold the header's length
@@ -189,38 +185,3 @@ def _with_metadata(content: bytes, metadata: dict[str, str]) -> bytes:
     header = json.dumps({_METADATA: metadata, **tensors}, separators=(",", ":"), ensure_ascii=False).encode()
     header += b" " * (-len(header) % _LENGTH)  # tensors begin at multiples of eight bytes
     return len(header).to_bytes(_LENGTH, "little") + header + content[end:]
-
-
-def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
-    """The given labeler, or the glove's shipped one; checked against the glove's markers.
-
-    Args:
-        glove: Marker layout: a shipped name or the path of a .toml file.
-        labeler: Anything that `load_labeler` reads, or `any-layout`. When None the shipped one of the glove
-            or, where none was trained on it, the one for any layout, with a warning.
-
-    Raises:
-        LayoutError: The glove is unknown.
-        WeightsError: The labeler is unknown, damaged, or knows other markers.
-    """
-    layout = load_layout(glove)
-    if labeler is None and glove not in shipped_labelers():
-        warnings.warn(
-            f"no labeler was trained on glove '{glove}', so that the one for any layout labels it; a better "
-            f"one takes handsim generate --glove {glove} --out SET && handsim train SET --out RUN, and "
-            "--labeler RUN",
-            HandSimWarning,
-            stacklevel=2,
-        )
-        labeler = ANY_LAYOUT
-    if labeler == ANY_LAYOUT:
-        from train.any_layout.layout_labeler import LayoutLabeler
-
-        return LayoutLabeler(layout)
-    found = load_labeler(glove if labeler is None else labeler)
-    if found.marker_names != layout.names:
-        raise WeightsError(
-            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{glove}' has "
-            f"{', '.join(layout.names)}"
-        )
-    return found

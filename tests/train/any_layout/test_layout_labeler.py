@@ -14,7 +14,8 @@ from train.any_layout.layout_labeler import LayoutLabeler, save_layout_network, 
 from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
 from train.evaluation.labeler_evaluation import evaluate_labeler
-from train.labelers.storage import labeler_for_glove, shipped_labelers
+from train.glove_labeler import labeler_for_glove
+from train.labelers.storage import shipped_labelers
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,50 @@
+"""The labeler of a glove: a given one, the one that was trained on it, or the one for any layout."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Final
+
+from gloves.layout import load_layout
+from handsim.errors import HandSimWarning, WeightsError
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler, shipped_labelers
+
+ANY_LAYOUT: Final = "any-layout"
+"""Name of the labeler that needs no training."""
+
+
+def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
+    """The given labeler, or the glove's shipped one; checked against the glove's markers.
+
+    Args:
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        labeler: Anything that `load_labeler` reads, or `any-layout`. When None the shipped one of the glove
+            or, where none was trained on it, the one for any layout, with a warning.
+
+    Raises:
+        LayoutError: The glove is unknown.
+        WeightsError: The labeler is unknown, damaged, or knows other markers.
+    """
+    layout = load_layout(glove)
+    if labeler is None and glove not in shipped_labelers():
+        warnings.warn(
+            f"no labeler was trained on glove '{glove}', so that the one for any layout labels it; a better "
+            f"one takes handsim generate --glove {glove} --out SET && handsim train SET --out RUN, and "
+            "--labeler RUN",
+            HandSimWarning,
+            stacklevel=2,
+        )
+        labeler = ANY_LAYOUT
+    if labeler == ANY_LAYOUT:
+        from train.any_layout.layout_labeler import LayoutLabeler  # torch
+
+        return LayoutLabeler(layout)
+    found = load_labeler(glove if labeler is None else labeler)
+    if found.marker_names != layout.names:
+        raise WeightsError(
+            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{glove}' has "
+            f"{', '.join(layout.names)}"
+        )
+    return found
