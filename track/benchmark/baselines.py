@@ -26,8 +26,8 @@ from track.calibration.hand_size import fit_size, sample_frames
 from track.capture_tracking import capture_frames
 from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
+from train.glove_labeler import labeler_for_glove
 from train.labelers.protocol import Labeler
-from train.labelers.storage import labeler_for_glove
 
 if TYPE_CHECKING:
     from jaxtyping import Int
