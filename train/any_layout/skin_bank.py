@@ -21,6 +21,7 @@ from train.simulation.people import sample_hands
 if TYPE_CHECKING:
     from jaxtyping import Float, Float16, Int
 
+_MOST_MISSED: Final = 500  # draws in a row without a free place
 _APART: Final = 0.0025  # [m] between two places of a bank, at least
 _PALM_SHARE: Final = 5.0  # of places, against a finger's bone
 _PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
@@ -64,7 +65,7 @@ def sample_skin_bank(num_places: int, num_people: int, *, rng: np.random.Generat
     places = sample_places(num_places, rng=rng)
     gloves = [
         MarkerLayout("places", places[first : first + MOST_MARKERS], _RADIUS)
-        for first in range(0, num_places, MOST_MARKERS)
+        for first in range(0, len(places), MOST_MARKERS)
     ]
     parts: list[Float16[np.ndarray, "T C 3"]] = []
     while len(parts) < num_people:
@@ -80,7 +81,7 @@ def sample_places(
     """Random places on the skin of the back and the sides of the hand.
 
     Args:
-        num_places: Number of places.
+        num_places: Number of places; there are fewer where no more fit.
         rng: Source of all randomness.
         apart: Least distance between two of them on the flat hand [m].
     """
@@ -88,7 +89,8 @@ def sample_places(
     share = np.where(np.arange(len(BONE_NAMES)) == PALM, _PALM_SHARE, 1.0)
     places: list[MarkerPlace] = []
     points: list[Float[np.ndarray, "3"]] = []
-    while len(places) < num_places:
+    missed = 0
+    while len(places) < num_places and missed < _MOST_MISSED:
         bone = int(rng.choice(len(BONE_NAMES), p=share / share.sum()))
         name = BONE_NAMES[bone]
         if bone == PALM:
@@ -102,6 +104,9 @@ def sample_places(
         if point is not None and all(np.linalg.norm(point - other) > apart for other in points):
             places.append(place)
             points.append(point)
+            missed = 0
+        else:
+            missed += 1
     return tuple(places)
 
 

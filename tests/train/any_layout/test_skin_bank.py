@@ -37,3 +37,8 @@ def test_mean_distances_are_those_of_the_positions(bank):
 def test_the_palm_has_more_places_than_a_finger(rng):
     bones = [place.bone for place in sample_places(150, rng=rng)]
     assert bones.count("palm") > 2 * bones.count("index_middle")
+
+
+def test_places_that_do_not_fit_are_left_out() -> None:
+    places = sample_places(60, rng=np.random.default_rng(0), apart=0.03)
+    assert 5 <= len(places) < 60
