@@ -1,7 +1,8 @@
 """The labeler for any layout beside trained ones: slots right, clean and with drops and ghosts; its time.
 
-Simulated people and poses that no training saw. Beside the shipped layouts come random ones of 6 to 30
-markers, some even over the hand, some crowded on few bones; their markers were in no training either.
+Without any training of the glove (at once), after `train.any_layout.fine_tuning` (after a minute), and with
+the labeler that was trained on it. Simulated people and poses that no training saw. Beside the shipped layouts
+come random ones of 6 to 30 markers, some even over the hand, some crowded on few bones.
 
 python benchmarks/any_layout.py [--frames 1000] [--random 10] [--captures FOLDER]
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from machine import describe
 
 from gloves.captures.collection import read_markers
 from gloves.layout import MarkerLayout, list_layouts, load_layout
+from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.any_layout.skin_bank import sample_places
 from train.any_layout.worn_markers import sample_worn_markers
@@ -44,26 +46,27 @@ def main() -> None:
     layouts += [random_layout(number, rng) for number in range(options.random)]
     unseen = []
     for layout in layouts:
+        labelers: dict[str, Labeler] = {"at once": LayoutLabeler(layout)}
         began = time.perf_counter()
-        labeler = LayoutLabeler(layout)
+        labelers["after a minute"] = fine_tuned_labeler(layout)
         seconds = time.perf_counter() - began
+        if layout.name in shipped_labelers():
+            labelers["trained"] = load_labeler(layout.name)
         markers = sample_worn_markers(layout, options.frames, rng=np.random.default_rng(77))
-        found = accuracies(labeler, markers)
-        trained = load_labeler(layout.name) if layout.name in shipped_labelers() else None
-        beside = f"; trained {told(accuracies(trained, markers))}" if trained else ""
-        speed = f"known after {seconds:.0f} s, {per_cloud(labeler, markers):.1f} ms a cloud"
+        found = {name: accuracies(labeler, markers) for name, labeler in labelers.items()}
         print(
-            f"{layout.name}: {layout.num_markers} markers, any layout {told(found)}{beside}; {speed}",
+            f"{layout.name}: {layout.num_markers} markers, {told(found)}; known after {seconds:.0f} s, "
+            f"{per_cloud(labelers['at once'], markers):.1f} ms a cloud",
             flush=True,
         )
         if layout.name not in list_layouts():
-            unseen.append(found)
-        if options.captures and trained:
+            unseen.append([found["at once"], found["after a minute"]])
+        if options.captures and "trained" in labelers:
             real = real_markers(options.captures, layout)
-            print(f"{layout.name}, real captures: any layout {told(accuracies(labeler, real))}; trained "
-                  f"{told(accuracies(trained, real))}", flush=True)  # fmt: skip
-    mean, worst = np.mean(unseen, axis=0), np.min(unseen, axis=0)
-    print(f"random layouts: mean {told(mean)}; worst {told(worst)}")
+            found = {name: accuracies(labeler, real) for name, labeler in labelers.items()}
+            print(f"{layout.name}, real captures: {told(found)}", flush=True)
+    for name, (at_once, tuned) in (("mean", np.mean(unseen, axis=0)), ("worst", np.min(unseen, axis=0))):
+        print(f"random layouts, {name}: {told({'at once': at_once, 'after a minute': tuned})}")
 
 
 def random_layout(number: int, rng: np.random.Generator) -> MarkerLayout:
@@ -95,8 +98,8 @@ def real_markers(captures: Path, layout: MarkerLayout) -> np.ndarray:
     return markers[:: max(1, len(markers) // CAPTURE_FRAMES)]
 
 
-def told(pair: Sequence[float]) -> str:
-    return f"{pair[0]:.2f} / {pair[1]:.2f}"
+def told(found: Mapping[str, Sequence[float]]) -> str:
+    return "; ".join(f"{name} {clean:.2f} / {both:.2f}" for name, (clean, both) in found.items())
 
 
 def per_cloud(labeler: Labeler, markers: np.ndarray) -> float:

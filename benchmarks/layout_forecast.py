@@ -13,7 +13,9 @@ import argparse
 import dataclasses
 import json
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from any_layout import random_layout
@@ -27,11 +29,13 @@ from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
 from track.kinematics.pose_solver import PoseSolver
-from train.glove_labeler import ANY_LAYOUT, labeler_for_glove
+from train.any_layout.fine_tuning import fine_tuned_labeler
+from train.glove_labeler import labeler_for_glove
 
 SCORED_FRAMES = 1500  # as `handsim glove score`
 MEASURED_FRAMES = 3000
 FEWEST_MARKERS = 4  # of a pose
+Figures = dict[str, Any]
 
 
 def main() -> None:
@@ -44,20 +48,22 @@ def main() -> None:
     found = []
     for layout in chosen_layouts():
         folder = options.folder / layout.name
-        result = folder / "result.json"
-        if not result.exists():
-            folder.mkdir(parents=True, exist_ok=True)
-            result.write_text(json.dumps(compare(layout, folder, options.frames, options.samples)))
-        found.append(json.loads(result.read_text()))
-        print_layout(layout, found[-1])
+        folder.mkdir(parents=True, exist_ok=True)
+        told = stored(folder / "forecast.json", lambda layout=layout: forecast(layout))
+        measured = stored(
+            folder / "measured.json",
+            lambda layout=layout, folder=folder: measure(layout, folder, options.frames, options.samples),
+        )
+        found.append((told, measured))
+        print_layout(layout, told, measured)
     for name in ("observed", "corrupted", "clean"):
-        pairs = 100.0 * np.array([one[name] for one in found])
+        pairs = 100.0 * np.array([[told[name], measured[name]] for told, measured in found])
         error = pairs[:, 0] - pairs[:, 1]
         print(
             f"{name}: rank correlation {spearmanr(pairs[:, 0], pairs[:, 1]).statistic:.3f}, mean error "
             f"{np.abs(error).mean():.2f} points, bias {error.mean():+.2f}, largest {np.abs(error).max():.2f}"
         )
-    ratios = [one["joint_ratio"] for one in found]
+    ratios = [joint_ratio(told, measured) for told, measured in found]
     print(f"joints: measured to forecast, median over layouts {np.median(ratios):.2f}, "
           f"from {min(ratios):.2f} to {max(ratios):.2f}")  # fmt: skip
 
@@ -76,52 +82,54 @@ def chosen_layouts() -> list[MarkerLayout]:
     return [*layouts, dataclasses.replace(rows, name="alike", markers=alike)]
 
 
-def compare(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> dict[str, object]:
-    """Forecast and measured figures of a layout."""
-    rig = load_rig("figure5")
-    glove = folder / "glove.toml"
-    save_layout(glove, layout)
-    rng = np.random.default_rng(0)
+def stored(path: Path, make: Callable[[], Figures]) -> Figures:
+    """Figures from a file; made and stored where there is none."""
+    if not path.exists():
+        path.write_text(json.dumps(make()))
+    figures: Figures = json.loads(path.read_text())
+    return figures
+
+
+def forecast(layout: MarkerLayout) -> Figures:
+    """What `handsim glove score` says."""
+    rig, rng = load_rig("figure5"), np.random.default_rng(0)
     begin = time.perf_counter()
     hands = observe_poses(layout, rig, SCORED_FRAMES, rng=rng)
-    forecast = score_layout(layout, hands, labeler_for_glove(str(glove), ANY_LAYOUT), rng=rng)
-    scored = time.perf_counter() - begin
-    data, run = folder / "data", folder / "run"
+    score = score_layout(layout, hands, fine_tuned_labeler(layout, rig), rng=rng)
+    return {**slots(score), "joints": score.joints.tolist(), "seconds": time.perf_counter() - begin}
+
+
+def measure(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> Figures:
+    """What a labeler that was trained on the layout does, and errors of solved joints."""
+    glove, data, run = folder / "glove.toml", folder / "data", folder / "run"
+    save_layout(glove, layout)
     if not data.exists():
-        handsim(
-            [
-                "generate",
-                "--glove",
-                str(glove),
-                "--num-frames",
-                str(frames),
-                "--seed",
-                "5",
-                "--out",
-                str(data),
-            ]
-        )
+        command = ["generate", "--glove", str(glove), "--num-frames", str(frames), "--seed", "5"]
+        assert handsim([*command, "--out", str(data)]) == 0
     begin = time.perf_counter()
     assert handsim(["train", str(data), "--samples", str(samples), "--threads", "1", "--out", str(run)]) == 0
-    trained = time.perf_counter() - begin
+    seconds = time.perf_counter() - begin
     rng = np.random.default_rng(99)
-    hands = observe_poses(layout, rig, MEASURED_FRAMES, rng=rng)
-    measured = score_layout(layout, hands, labeler_for_glove(str(glove), run), rng=rng)
-    pairs = {
-        name: [slots(forecast, name), slots(measured, name)] for name in ("observed", "corrupted", "clean")
-    }
-    errors = solved_errors(hands, rng)
+    hands = observe_poses(layout, load_rig("figure5"), MEASURED_FRAMES, rng=rng)
+    score = score_layout(layout, hands, labeler_for_glove(str(glove), run), rng=rng)
+    return {**slots(score), "joints": solved_errors(hands, rng).tolist(), "seconds": seconds}
+
+
+def slots(score: LayoutScore) -> Figures:
+    """Share of slots that are right: as the rig sees them, with the paper's recipe, and clean."""
     return {
-        **pairs,
-        "joints": [np.rad2deg(forecast.joints).tolist(), np.rad2deg(errors).tolist()],
-        "joint_ratio": float(np.median(errors / forecast.joints)),
-        "seconds": [scored, trained],
-        "markers": layout.num_markers,
+        name: float(report.figures["slot_accuracy"])
+        for name, report in (
+            ("observed", score.observed),
+            ("corrupted", score.corrupted),
+            ("clean", score.clean),
+        )
     }
 
 
-def slots(score: LayoutScore, name: str) -> float:
-    return float(getattr(score, name).figures["slot_accuracy"])
+def joint_ratio(told: Figures, measured: Figures) -> float:
+    """Median over the joints of measured to forecast error."""
+    return float(np.median(np.array(measured["joints"]) / np.array(told["joints"])))
 
 
 def solved_errors(hands: list[ObservedHand], rng: np.random.Generator) -> np.ndarray:
@@ -138,15 +146,15 @@ def solved_errors(hands: list[ObservedHand], rng: np.random.Generator) -> np.nda
     return np.sqrt(squares / count)
 
 
-def print_layout(layout: MarkerLayout, found: dict[str, object]) -> None:
-    told = ", ".join(
-        f"{name} {100 * found[name][0]:.2f} / {100 * found[name][1]:.2f}"
+def print_layout(layout: MarkerLayout, told: Figures, measured: Figures) -> None:
+    shares = ", ".join(
+        f"{name} {100 * told[name]:.2f} / {100 * measured[name]:.2f}"
         for name in ("observed", "corrupted", "clean")
     )
-    scored, trained = found["seconds"]
     print(
-        f"{layout.name}: {layout.num_markers} markers, forecast / measured: {told}; joints measured to "
-        f"forecast {found['joint_ratio']:.2f}; scored in {scored:.0f} s, trained in {trained:.0f} s",
+        f"{layout.name}: {layout.num_markers} markers, forecast / measured: {shares}; joints measured to "
+        f"forecast {joint_ratio(told, measured):.2f}; forecast in {told['seconds']:.0f} s, trained in "
+        f"{measured['seconds']:.0f} s",
         flush=True,
     )
 

@@ -30,17 +30,17 @@ def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
     layout = load_layout(glove)
     if labeler is None and glove not in shipped_labelers():
         warnings.warn(
-            f"no labeler was trained on glove '{glove}', so that the one for any layout labels it; a better "
-            f"one takes handsim generate --glove {glove} --out SET && handsim train SET --out RUN, and "
-            "--labeler RUN",
+            f"no labeler was trained on glove '{glove}', so that the one for any layout learns it within a "
+            f"minute; a better one takes handsim generate --glove {glove} --out SET && handsim train SET "
+            "--out RUN, and --labeler RUN",
             HandSimWarning,
             stacklevel=2,
         )
         labeler = ANY_LAYOUT
     if labeler == ANY_LAYOUT:
-        from train.any_layout.layout_labeler import LayoutLabeler  # torch
+        from train.any_layout.fine_tuning import fine_tuned_labeler  # torch
 
-        return LayoutLabeler(layout)
+        return fine_tuned_labeler(layout)
     found = load_labeler(glove if labeler is None else labeler)
     if found.marker_names != layout.names:
         raise WeightsError(

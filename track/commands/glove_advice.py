@@ -16,7 +16,7 @@ from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.space.cameras import CameraRig, load_rig
-from train.glove_labeler import ANY_LAYOUT, labeler_for_glove
+from train.glove_labeler import labeler_for_glove
 
 if TYPE_CHECKING:
     from track.glove_advice.layout_score import LayoutScore
@@ -62,12 +62,13 @@ def score_glove(
     from track.glove_advice.advice import advice
     from track.glove_advice.layout_score import score_layout
     from track.glove_advice.score_page import write_score_page
+    from train.any_layout.fine_tuning import fine_tuned_labeler
 
     rng = np.random.default_rng(seed)
     with Console(stderr=True).status("simulating hands") as status:
         hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
-        status.update("learning the layout")
-        known = labeler_for_glove(glove, ANY_LAYOUT if labeler is None else labeler)
+        status.update("learning the layout, about a minute")
+        known = fine_tuned_labeler(layout, cameras) if labeler is None else labeler_for_glove(glove, labeler)
         status.update("labeling")
         score = score_layout(layout, hands, known, rng=rng)
     _tell(score)

@@ -66,7 +66,8 @@ class LayoutLabeler:
         self.marker_names = layout.names
         self.prior: PosePrior | None = learn_pose_prior(markers, rng=rng)
         """What it knows of hands as wholes."""
-        self._distances = mean_features(markers, self.network.config)[None]
+        self.distances = mean_features(markers, self.network.config)[None]
+        """What the network gets of the layout."""
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
@@ -76,7 +77,7 @@ class LayoutLabeler:
     def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
         points, present = pad_clouds(clouds)
         with labeling_threads():
-            scores = self.network(torch.from_numpy(points), torch.from_numpy(present), self._distances)[-1]
+            scores = self.network(torch.from_numpy(points), torch.from_numpy(present), self.distances)[-1]
         return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy(), self.prior)
 
 

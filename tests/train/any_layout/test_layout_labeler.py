@@ -10,6 +10,7 @@ import pytest
 from gloves.layout import load_layout, save_layout
 from handsim.errors import HandSimWarning, WeightsError
 from train.any_layout import layout_labeler
+from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler, save_layout_network, shipped_network
 from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
@@ -46,7 +47,8 @@ def test_labels_follow_the_order_of_the_layout(labeler):
     assert equal.mean() > 0.97  # the two know the layout from other poses
 
 
-def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path):
+def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 192, "seed": 0})
     layout = load_layout("starter6")
     save_layout(tmp_path / "mine.toml", layout)
     with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):
