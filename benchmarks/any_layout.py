@@ -1,8 +1,8 @@
 """The labeler for any layout beside trained ones: slots right, clean and with drops and ghosts; its time.
 
 Without any training of the glove (at once), after `train.any_layout.fine_tuning` (after a minute), and with
-the labeler that was trained on it. Simulated people and poses that no training saw. Beside the shipped layouts
-come random ones of 6 to 30 markers, some even over the hand, some crowded on few bones.
+the labeler that was trained on it. People and poses are simulated, and in no training. Random layouts of 6 to
+30 markers come beside the shipped ones, some even over the hand, some crowded on few bones.
 
 python benchmarks/any_layout.py [--frames 1000] [--random 10] [--captures FOLDER]
 """

@@ -27,7 +27,7 @@ _STEP: Final = (0.15, float(np.deg2rad(20.0)), 0.1)  # standard deviations: alon
 _CLEAR: Final = 0.006  # between two markers' surfaces on the flat hand [m]
 _FOLDS: Final = (0.12, 0.9)  # of a finger's bone: beyond these the skin folds and stretches
 _PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
-_PADS: Final = float(np.deg2rad(100.0))  # beyond this angle a finger's marker is on its pad
+_PADS: Final = float(np.deg2rad(80.0))  # beyond this angle a finger's marker touches what is held
 _GAIN: Final = 0.05  # of a better layout, at least [points]
 _TRIES: Final = 20  # draws of a place
 
@@ -176,8 +176,10 @@ class Improvement:
         """Places anywhere on the back and the sides of the hand, clear of the folds and of other markers."""
         found: list[MarkerPlace] = []
         for place in sample_places(_TRIES + 4 * count, rng=self._rng):
-            folds = place.bone != BONE_NAMES[PALM] and not _FOLDS[0] <= place.along <= _FOLDS[1]
-            if len(found) < count and not folds and self._is_clear(place, others):
+            free = place.bone == BONE_NAMES[PALM] or (
+                _FOLDS[0] <= place.along <= _FOLDS[1] and abs(place.around) <= _PADS
+            )
+            if len(found) < count and free and self._is_clear(place, others):
                 found.append(place)
         return found
 
