@@ -20,7 +20,7 @@ demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
 
 test: $(INSTALLED) drawing lint  ## every check there is: lint, then the tests (which build the documents)
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadgroup --durations 20
 
 lint: $(INSTALLED)  ## style, format, types and the order of imports
 	$(BIN)/ruff check .

@@ -4,7 +4,7 @@ Without any training of the glove (at once), after `train.any_layout.fine_tuning
 the labeler that was trained on it. People and poses are simulated, and in no training. Random layouts of 6 to
 30 markers come beside the shipped ones, some even over the hand, some crowded on few bones.
 
-python benchmarks/any_layout.py [--frames 1000] [--random 10] [--captures FOLDER]
+python benchmarks/any_layout.py [--frames 1000] [--random 4] [--captures FOLDER]
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ CAPTURE_FRAMES = 3000
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=1000, help="of each layout")
-    parser.add_argument("--random", type=int, default=10, help="random layouts")
+    parser.add_argument("--random", type=int, default=4, help="random layouts")
     parser.add_argument("--captures", type=Path, help="real captures in dense19, for it and sparse13")
     options = parser.parse_args()
     print(describe("torch", "numpy"))

@@ -20,9 +20,9 @@ from machine import describe
 from train.config import default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
+from train.devices.fabric_start import start_fabric
 from train.labelers.cnn_network import DeepLabelCNN, position_loss
 from train.labelers.depth_image import depth_images
-from train.loop import start_fabric
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import generate_dataset
 from train.training_state import TrainingState

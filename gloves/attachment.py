@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import numba
 import numpy as np
 
 from gloves.layout import MarkerLayout, MarkerPlace
@@ -23,6 +24,7 @@ _MOST_FITTINGS: Final = 20
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
 _LARGEST: Final = 100.0  # [m], of a direction and a bone's number too; far more than any hand has
 _SUM_TOLERANCE: Final = 1e-6
+_SLACK: Final = 1e-9  # of barycentric weights: a ray through an edge meets a face
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,52 +188,66 @@ def _first_exits(
     origins: NDArray[np.float64], directions: NDArray[np.float64], surface: HandSurface
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """First exits from the skin along rays: rays that have one, faces, barycentric weights, distances [m]."""
-    vertices, faces = surface.vertices, surface.faces
-    first, second, third = (vertices.take(faces[:, corner], axis=0) for corner in range(3))
-    edges1, edges2 = second - first, third - first
-    # A line that meets a triangle comes nearer to its first corner than the longer edge from there.
-    reach = 1.01 * np.maximum(_dot(edges1, edges1), _dot(edges2, edges2))
-    along = vertices @ directions.T - _dot(origins, directions)
-    off = _dot(vertices, vertices)[:, None] - vertices @ (2.0 * origins.T) + _dot(origins, origins) - along**2
-    near = np.flatnonzero(off.take(faces[:, 0], axis=0) <= reach[:, None])
-    face, ray = np.divmod(near, len(origins))
-    weights, distance, outwards = _crossings(
-        origins[ray], directions[ray], first[face], edges1[face], edges2[face]
-    )
-    hits = np.flatnonzero(outwards)
-    hits = hits[np.lexsort((distance[hits], ray[hits]))]
-    rays, nearest = np.unique(ray[hits], return_index=True)
-    hits = hits[nearest]
-    return rays, face[hits], weights[hits], distance[hits]
+    exits = _exits(origins, directions, surface.vertices, np.ascontiguousarray(surface.faces))
+    rays = np.flatnonzero(exits[0] >= 0)
+    faces, weights, distances = (each[rays] for each in exits)
+    return rays, faces, weights, distances
 
 
-def _crossings(
-    origins: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    edges1: NDArray[np.float64],
-    edges2: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Intersections of rays and triangles, by pairs: barycentric weights, distance, whether on the way out.
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
+    """First exits along rays: faces (R,), -1 for none, barycentric weights (R, 3), distances (R,) [m].
 
     Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997).
+
+    Args:
+        origins: Where rays begin (R, 3) [m].
+        directions: Their unit directions (R, 3).
+        vertices: Of the skin (V, 3) [m].
+        faces: Triangles (F, 3), counter-clockwise from outside.
     """
-    across = np.cross(directions, edges2)
-    determinant = _dot(edges1, across)
-    offset = origins - corners
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = _dot(offset, across) / determinant
-        q = np.cross(offset, edges1)
-        v = _dot(q, directions) / determinant
-        distance = _dot(edges2, q) / determinant
-    slack = 1e-9
-    outwards = (determinant < 0) & (u >= -slack) & (v >= -slack) & (u + v <= 1 + slack) & (distance > 0)
-    return np.stack([1 - u - v, u, v], axis=1), distance, outwards
+    found, weights = np.full(len(origins), -1), np.empty((len(origins), 3))
+    nearest = np.full(len(origins), np.inf)
+    first, second, offset, across, turned = np.empty((5, 3))
+    for f in range(len(faces)):
+        corner = vertices[faces[f, 0]]
+        for i in range(3):
+            first[i] = vertices[faces[f, 1], i] - corner[i]
+            second[i] = vertices[faces[f, 2], i] - corner[i]
+        # A line that meets a triangle comes nearer to its first corner than the longer edge from there.
+        reach = 1.01 * max(_dot(first, first), _dot(second, second))
+        for r in range(len(origins)):
+            for i in range(3):
+                offset[i] = origins[r, i] - corner[i]
+            if _dot(offset, offset) - _dot(offset, directions[r]) ** 2 > reach:
+                continue
+            _cross(directions[r], second, across)
+            determinant = _dot(first, across)
+            if determinant >= 0.0:  # on the way in, or along the face
+                continue
+            _cross(offset, first, turned)
+            u, v = _dot(offset, across) / determinant, _dot(turned, directions[r]) / determinant
+            distance = _dot(second, turned) / determinant
+            if min(u, v, 1.0 - u - v) >= -_SLACK and 0.0 < distance < nearest[r]:
+                found[r], nearest[r] = f, distance
+                weights[r] = (1.0 - u - v, u, v)
+    return found, weights, nearest
 
 
-def _dot(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    products: NDArray[np.float64] = np.einsum("ni,ni->n", first, second)
-    return products
+@numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+def _dot(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> float:
+    """Scalar product of two vectors (3,)."""
+    return float(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
+
+
+@numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+def _cross(
+    first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"], product: Float[np.ndarray, "3"]
+) -> None:
+    """Write the vector product (3,) of two vectors (3,)."""
+    product[0] = first[1] * second[2] - first[2] * second[1]
+    product[1] = first[2] * second[0] - first[0] * second[2]
+    product[2] = first[0] * second[1] - first[1] * second[0]
 
 
 def _normals_at(corners: NDArray[np.int64], surface: HandSurface) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
+from gloves.takes.tracked_take import label_names
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular
@@ -105,7 +106,7 @@ def load_poses(file: PoseFile, *, seed: int = 0) -> ShownTake:
         bodies=(),
         points=np.empty((len(qpos), 0, 3)),
         labels=np.empty((len(qpos), 0), dtype=np.int64),
-        label_names=tuple(f"{hand.side}:{name}" for hand in hands for name in hand.layout.names),
+        label_names=label_names([hand.fit for hand in hands], ()),
         cast=cast,
         is_motion=times is not None,
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -15,17 +14,21 @@ import numpy as np
 
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import TrackedTake
+from handsim.app.executors.executor import Executor, executor_of
+from handsim.app.executors.output import FolderOutput, Make, Output, open_output
 from handsim.app.interrupts import Stopped
-from handsim.app.workers import check_workers, in_processes
 from handsim.errors import HandSimError, HandSimWarning, choices
 from handsim.files.atomic import remove_leftovers
 from handsim.files.disk import check_free
-from handsim.files.json_files import claim, load_json, save_json
+from handsim.files.inputs import checksum
+from handsim.files.json_files import load_json, save_json
+from handsim.files.object_folder import ObjectFolder
 from render.cameras.own_cameras import check_hands_in_view
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.formats.annotations.common import without_colors
 from render.formats.merging import CONFIG
+from render.formats.shards import INDEX
 from render.formats.writer import FORMATS, NEED_COLORS, open_writer
 from render.frames.frame import RenderedFrame
 from render.illustrations.captions import write_png
@@ -49,6 +52,7 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 """Called with the numbers of finished pictures and of all pictures."""
 SHEET: Final = "contact_sheet.png"
+_RENAMES: Final = "freihand"
 _LEFT_OUT: Final = "left_out-{}.json"
 _ON_SHEET: Final = 9
 _PATHS: Final = 1  # spawn keys of choices for the whole take, and for one shard
@@ -58,21 +62,21 @@ _MOST_STUDIOS: Final = 32  # of people with painted skins that are kept, some 5 
 
 def render_take(
     path: Path | PoseFile,
-    out: Path,
+    out: Path | ObjectFolder,
     formats: Sequence[str],
     config: RenderConfig,
     *,
-    workers: int | None = None,
+    workers: int | Executor | None = None,
     progress: Progress | None = None,
 ) -> int:
     """Draw a take; a second call resumes where the first was stopped.
 
     Args:
         path: A tracked take (`.npz`), the truth of a simulated one (`.truth.npz`), or poses of your own.
-        out: Folder; each of several formats has a folder of its own in it.
+        out: Folder, or a folder of an object store; each of several formats has a folder of its own in it.
         formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
-        workers: Processes; all cores when not given.
+        workers: Processes, all cores when not given; or who else draws the shards.
         progress: Called after every shard.
 
     Returns:
@@ -84,7 +88,12 @@ def render_take(
             shards are kept.
     """
     _check_formats(formats, config)
-    processes = check_workers(workers)
+    if isinstance(out, ObjectFolder) and _RENAMES in formats:
+        raise HandSimError(
+            f"{out}: {_RENAMES} renames its pictures at the end, which no object store can; render into a "
+            "folder and copy it"
+        )
+    executor = executor_of(workers)
     config = config.settled()
     take = _load(path, config)
     if config.background.photo > 0.0:
@@ -95,34 +104,48 @@ def render_take(
     if config.view.cameras is not None:
         check_hands_in_view(config.view.cameras, viewpoints.cameras(0), take)
     settings = _settings(path, take, viewpoints, config) | {"formats": list(formats)}
-    claim(out / CONFIG, settings, noun="rendering", error=HandSimError)
-    job = functools.partial(_render_shard, path, out, tuple(formats), config)
-    done = _finished(out, formats)
-    count = views * sum(len(shards[number]) for number in done if number < len(shards))
-    total = views * sum(map(len, shards))
-    todo = [number for number in range(len(shards)) if number not in done]
+    make = functools.partial(_render_shard, path, tuple(formats), config)
+    with open_output(out) as output:
+        output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
+        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], executor, progress)
+        output.collect(INDEX, _LEFT_OUT.format("*"))
+        for name in formats:
+            open_writer(name, _folder(output.folder, formats, name)).finish()
+        lost = frozenset(left_out_frames(output.folder))
+        kept = [[frame for frame in shard if frame not in lost] for shard in shards]
+        if not any(kept):
+            raise HandSimError(
+                f"{out}: no pictures: in all {len(lost)} frames a camera would be inside a hand or an "
+                "object; give another placement, distance or seed"
+            )
+        _write_sheet(output.folder, take, config, kept)
+        output.publish(SHEET)
+    return views * sum(map(len, kept))
+
+
+def _draw_shards(
+    output: Output,
+    formats: Sequence[str],
+    make: Make,
+    counts: Sequence[int],
+    executor: Executor,
+    progress: Progress | None,
+) -> None:
+    """Have the shards drawn that are not there; each has a count of pictures."""
+    done, total = _finished(output, formats), sum(counts)
+    count = sum(counts[number] for number in done if number < len(counts))
+    todo = [number for number in range(len(counts)) if number not in done]
     try:
-        for drawn, number in enumerate(in_processes(job, todo, processes)):
-            count += views * len(shards[number])
+        for drawn, number in enumerate(executor.run(output.job(make), todo)):
+            count += counts[number]
             if progress is not None:
                 progress(count, total)
-            if drawn == 0:
-                _check_space(out, len(done) + 1, len(todo) - 1)
+            if drawn == 0 and isinstance(output, FolderOutput):
+                _check_space(output.folder, len(done) + 1, len(todo) - 1)
     except KeyboardInterrupt as stop:
-        remove_leftovers(out)  # of workers that had no time to
-        drawn_so_far = f"{count} of {total} images are in {out}, and the same command goes on after them"
+        remove_leftovers(output.folder)  # of workers that had no time to
+        drawn_so_far = f"{count} of {total} images are in {output}, and the same command goes on after them"
         raise Stopped.again(stop, drawn_so_far) from stop
-    for name in formats:
-        open_writer(name, _folder(out, formats, name)).finish()
-    lost = frozenset(left_out_frames(out))
-    kept = [[frame for frame in shard if frame not in lost] for shard in shards]
-    if not any(kept):
-        raise HandSimError(
-            f"{out}: no pictures: in all {len(lost)} frames a camera would be inside a hand or an object; "
-            "give another placement, distance or seed"
-        )
-    _write_sheet(out, take, config, kept)
-    return total - views * len(lost)
 
 
 def _load(path: Path | PoseFile, config: RenderConfig) -> ShownTake:
@@ -146,10 +169,8 @@ def _settings(
     else:
         settings["view"]["cameras"] = [camera.record() for camera in viewpoints.cameras(0)]
     if isinstance(path, PoseFile):
-        with path.path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
         settings["poses"] = {
-            "sha256": digest,
+            "sha256": checksum(path.path),
             "sides": list(path.sides),
             "people": path.people,
             "glove": path.glove,
@@ -157,10 +178,12 @@ def _settings(
     return settings
 
 
-def left_out_frames(out: Path) -> list[int]:
+def left_out_frames(out: Path | ObjectFolder) -> list[int]:
     """Numbers of the frames that a rendering left out: a camera would be inside a hand or an object."""
-    files = sorted(out.glob(_LEFT_OUT.format("*")))
-    return sorted(frame for file in files for frame in load_json(file)["frames"])
+    with open_output(out) as output:
+        output.collect(_LEFT_OUT.format("*"))
+        files = sorted(output.folder.glob(_LEFT_OUT.format("*")))
+        return sorted(frame for file in files for frame in load_json(file)["frames"])
 
 
 def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
@@ -183,8 +206,10 @@ def _folder(out: Path, formats: Sequence[str], name: str) -> Path:
     return out if len(formats) == 1 else out / name
 
 
-def _finished(out: Path, formats: Sequence[str]) -> frozenset[int]:
-    done = [open_writer(name, _folder(out, formats, name)).done() for name in formats]
+def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
+    if not isinstance(output, FolderOutput):
+        return frozenset(output.receipts)
+    done = [open_writer(name, _folder(output.folder, formats, name)).done() for name in formats]
     return frozenset.intersection(*done)
 
 
@@ -212,7 +237,7 @@ def _opened(path: Path | PoseFile, config: RenderConfig) -> tuple[ShownTake, Vie
 
 
 def _render_shard(
-    path: Path | PoseFile, out: Path, formats: tuple[str, ...], config: RenderConfig, shard: int
+    path: Path | PoseFile, formats: tuple[str, ...], config: RenderConfig, out: Path, shard: int
 ) -> int:
     take, viewpoints = _opened(path, config)
     lost: list[int] = []

@@ -155,6 +155,12 @@ def test_a_bad_argument_is_never_control_flow():
                 assert "ArgumentError" not in ast.unparse(node), f"{relative(path)}:{node.lineno}"
 
 
+def test_kernels_have_no_fast_math():
+    """Their last digits would depend on whether they were compiled or read from the cache."""
+    found = [relative(path) for path in SOURCES if "fastmath" in path.read_text("utf-8")]
+    assert found == []
+
+
 def test_no_identifier_of_the_old_words():
     names: dict[str, set[str]] = defaultdict(set)
     for path in SOURCES:

@@ -55,6 +55,9 @@ def folder(tmp_path, monkeypatch):
         "unknown_bone.toml": layout(*FIVE, ("e", "indx_middle")),
         "twice.toml": layout(*FIVE, ("a", "index_middle")),
         "two_markers.toml": layout(*FIVE[:2]),
+        "dense91.toml": 'gloves = ["dense91"]',
+        "sample.toml": "[train]\nsample = 3",
+        "lonely.toml": "[simulate]\nnum_frames = 10",
         "one_camera.toml": rig([1.5, 0.0, 2.0]),
         "in_the_way.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.1, 0.0, 1.3]),
         "at_the_hands.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.0, 0.65, 1.1]),
@@ -71,6 +74,9 @@ def folder(tmp_path, monkeypatch):
         "wand.toml": body("[0, 0, 0]", "[50, 0, 0]", "[0, 80, 0]"),
         "in_meters.toml": body("[0, 0, 0]", "[0.05, 0, 0]", "[0, 0.08, 0]"),
         "flat_marker.toml": body("[0, 0]", "[50, 0]", "[0, 80]"),
+        "lab.cal": "closed",
+        "page.xml": "<html/>",
+        "bomb.xcp": '<!DOCTYPE c [<!ENTITY a "b">]><Cameras>&a;</Cameras>',
     }
     for name, content in files.items():
         (tmp_path / name).write_text(content)
@@ -129,6 +135,11 @@ CASES = {
     "a tracking table without frames": ["reproduce", "table7", "--num-frames", "0", "--json", "out.json"],
     "a labeler of another glove in a tracking table": ["reproduce", "table5", "--labeler", "sparse13"],
     "an unknown rig of fewer cameras": ["reproduce", "cameras", "--rig", "figure6", "--json", "out.json"],
+    "a sweep that is not there": ["sweep", "none.toml", "--out", "out"],
+    "a sweep without lists": ["sweep", "two_markers.toml", "--out", "out"],
+    "a sweep of an unknown glove": ["sweep", "dense91.toml", "--out", "out"],
+    "a sweep of an unknown setting": ["sweep", "sample.toml", "--out", "out"],
+    "a sweep into a folder of something else": ["sweep", "lonely.toml", "--out", "."],
     "nothing to track": ["track", "--out", "out.npz"],
     "a capture and a stream": ["track", "good.trc", "--live", "natnet://localhost", "--out", "out.npz"],
     "a time for a capture": ["track", "good.trc", "--seconds", "3", "--out", "out.npz"],
@@ -186,6 +197,11 @@ CASES = {
     "no benchmark to track": ["benchmark", "run", "good.trc", "--out", "out"],
     "a benchmark among other files": ["benchmark", "make", "--out", "."],
     "a benchmark by nobody": ["benchmark", "make", "--workers", "0", "--out", "out"],
+    "a calibration in a closed format": ["rig", "import", "lab.cal", "--out", "out.toml"],
+    "a page for a calibration": ["rig", "import", "page.xml", "--out", "out.toml"],
+    "a calibration with entities": ["rig", "import", "bomb.xcp", "--out", "out.toml"],
+    "a capture for a calibration": ["rig", "import", "good.trc", "--out", "out.toml"],
+    "a rig in another kind of file": ["rig", "import", "lab.xcp", "--out", "out.json"],
     "an unfinished training set": ["train", ".", "--out", "out"],
 }
 

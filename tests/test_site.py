@@ -12,6 +12,7 @@ import pytest
 
 from handsim.app.command_table import COMMANDS, load
 
+pytestmark = pytest.mark.xdist_group("site")  # what they share is made once
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -1,7 +1,7 @@
 """Settings of the online tracker: one frozen dataclass per concern, all of them in `TrackerConfig`.
 
 Lengths are in meters, times in seconds, angles in radians; log-odds are natural. The defaults made every
-published figure. Constants of fast-math kernels are not here but beside their kernels
+published figure. Constants of compiled kernels are not here but beside their kernels
 (`track.kinematics.levenberg_marquardt`, `track.association.digit_fit`), because they are compiled in.
 """
 

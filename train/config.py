@@ -115,7 +115,8 @@ class TrainConfig:
     """Precision of the forward pass; bf16 is faster on hardware that has it, and less accurate. `auto` takes
     it there."""
     devices: int = 1
-    """GPUs to share each batch, where there are any."""
+    """GPUs of this machine, or processes where there are none, that share each batch; under torchrun and srun
+    these say it."""
     jitter: float = 0.005
     """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
     rig_share: float = 0.5

@@ -3,61 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
+import functools
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
-from lightning_fabric.loggers.tensorboard import TensorBoardLogger
-from torch import nn
 
-from handsim._version import __version__
 from handsim.app.interrupts import Stopped, interrupt_flag
-from handsim.errors import DatasetError, WeightsError
+from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
 from train.config import Kind, TrainConfig
-from train.data.augmentation import Corruption
-from train.data.batches import Batch, draw_batch, paper_corruption, right_hands
+from train.data.batches import Batch, draw_batch
+from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import check_corruption
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler, paper_report
-from train.evaluation.matching_costs import choose_costs
-from train.labelers.cnn_network import DeepLabelCNN
-from train.labelers.kinds import labeler_of
-from train.labelers.set_network import SetLabeler
-from train.labelers.storage import save_network
-from train.matching.prior_learning import learn_pose_prior
-from train.reports.model_card import UNKNOWN_LICENSE, write_model_card
-from train.reports.run_page import write_run_page
+from train.devices.agreement import Agreement, PeerError
+from train.devices.fabric_start import check_devices, start_fabric
+from train.devices.local_processes import Progress, in_local_processes
+from train.devices.world import world_of
+from train.run_result import MOST_HELD_OUT, few, finish_run
 from train.threads import TrainingThreads, check_threads
 from train.training_state import TrainingState, passed
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 CHECKPOINT: Final = "checkpoint.pt"
 _CONFIG: Final = "train.json"
 _HELD_OUT: Final = 0.02  # share of rows, from the end, that training never sees
-_MAX_HELD_OUT: Final = 8192
 _NUM_EVALUATIONS: Final = 10  # on held-out frames in the course of a run
 _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # of each of these evaluations
-_CARD_FRAMES: Final[dict[Kind, int]] = {"set": _MAX_HELD_OUT, "cnn": 1024}  # of the last one
-_PRIOR_STRETCH: Final = 0.03  # anisotropy of the hands of the pose prior: people differ more than simulated
-_COST_FRAMES: Final = 400  # for the costs of the paper's network
-
-Progress = Callable[[int, int, float], None]
-"""Called with samples done, samples expected, and the loss."""
 
 
 def train_labeler(
-    dataset: Dataset,
+    dataset: Dataset | Path,
     config: TrainConfig,
     out: Path,
     *,
@@ -67,14 +49,18 @@ def train_labeler(
 ) -> dict[str, Any]:
     """Train a labeler and write weights, card, curves and a page to `out`; continues from a checkpoint there.
 
-    A run there may have had fewer samples. The learning rate then goes on as in a run of the new length.
+    A run there may have had fewer samples. The learning rate then goes on as in a run of the new length. It
+    may have had another number of devices.
+
+    With `config.devices` above one this starts a process for each, so a script must call it below
+    `if __name__ == "__main__"`. In a process that torchrun or srun started it takes its part in their run.
 
     Args:
-        dataset: The training set.
+        dataset: The training set, or its folder.
         config: How to train.
         out: Folder of the run.
-        threads: Threads on a CPU; one or all when not given, whichever a few steps show to be faster. Weights
-            differ in their last bits with it.
+        threads: Threads of each process on a CPU; one or all when not given, whichever a few steps show to be
+            faster, and one on several devices. Weights differ in their last bits with it.
         progress: Called after every step.
         save_every: Time between checkpoints [s].
 
@@ -84,47 +70,135 @@ def train_labeler(
     Raises:
         DatasetError: The set is too small to train on.
         WeightsError: `out` holds a run of other settings.
+        ArgumentError: There are fewer devices than `config.devices`, or than processes.
         TrainingError: The loss is not finite.
+        PeerError: Another process of the run failed, and tells why.
         Stopped: A signal came; the last step is kept in the checkpoint.
     """
-    config = _for_labels(config, len(dataset.marker_names))
+    if config.devices == 1 or world_of().size > 1:
+        return _train(dataset, config, out, threads=threads, progress=progress, save_every=save_every)
     check_threads(threads)
-    rows, held_out = _split(dataset, config.batch)
-    fabric = start_fabric(config, out)
+    check_devices(config, config.devices, config.devices)
+    checked = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+    job = functools.partial(_train, checked, config, out, threads=threads, save_every=save_every)
+    card: dict[str, Any] = in_local_processes(job, config.devices, progress=progress)
+    return card
+
+
+def _train(
+    dataset: Dataset | Path,
+    config: TrainConfig,
+    out: Path,
+    *,
+    threads: int | None,
+    progress: Progress | None,
+    save_every: float,
+) -> dict[str, Any]:
+    """Train on the device of this process, together with those of the others."""
+    fabric = _started(config, out, threads)
+    ranks = Agreement(fabric)
+    with _curves_closed(fabric), ranks.losses_told():
+        with ranks.signals_noted():
+            run = _prepare(dataset, config, out, fabric, ranks)
+            chosen = TrainingThreads(_threads(threads, fabric), run.try_step)
+            with chosen.in_use(), run.kept(out / CHECKPOINT):
+                _do_steps(run, chosen, out / CHECKPOINT, progress, save_every)
+        with chosen.in_use(), run.kept(out / CHECKPOINT):
+            card: dict[str, Any] = {}
+            if fabric.is_global_zero:
+                card = finish_run(run.state, run.rows, run.held_out, run.dataset.manifest, out)
+            return fabric.broadcast(card)
+
+
+def _do_steps(
+    run: _Run, chosen: TrainingThreads, checkpoint: Path, progress: Progress | None, save_every: float
+) -> None:
+    """Do what steps there are to do, and keep the state now and then."""
+    state, config = run.state, run.state.config
+    saved = time.monotonic()
+    while run.is_unfinished():
+        chosen.renew()
+        loss = run.step()
+        if progress is not None and state.fabric.is_global_zero:
+            progress(min(state.done, config.samples), config.samples, loss)
+        if time.monotonic() - saved > save_every:
+            state.save(checkpoint)
+            saved = time.monotonic()
+    run.ranks.agree(lambda: None)  # a signal since the last step ends the run here
+    state.save(checkpoint)
+
+
+def _started(config: TrainConfig, out: Path, threads: int | None) -> Fabric:
+    """The devices; of the processes on this machine the first tells mistakes, which all have."""
+    try:
+        check_threads(threads)
+        return start_fabric(config, out)
+    except ArgumentError as error:
+        if world_of().local_rank == 0:
+            raise
+        raise PeerError(str(error)) from error
+
+
+@contextmanager
+def _curves_closed(fabric: Fabric) -> Iterator[None]:
+    """Close the writer of the curves after the block; its thread complains in a process that ends before."""
+    try:
+        yield
+    finally:
+        fabric.logger.finalize("")
+
+
+def _prepare(
+    dataset: Dataset | Path, config: TrainConfig, out: Path, fabric: Fabric, ranks: Agreement
+) -> _Run:
+    """Open the set, claim the folder of the run and go on from its checkpoint."""
+
+    def claimed() -> tuple[Dataset, TrainConfig, MappedRows, MappedRows]:
+        opened = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+        whole = _for_set(config, len(opened.marker_names), fabric.world_size)
+        parts = _split(opened, config.batch)
+        if fabric.is_global_zero:
+            _claim(out, whole, opened)
+        return opened, whole, *parts
+
+    opened, whole, rows, held_out = ranks.agree(claimed)
+    torch.manual_seed(config.seed)
+    run = _Run(TrainingState(whole, fabric, rows), ranks, opened, rows, held_out)
+    with ranks.told_once():
+        run.state.restore(out / CHECKPOINT)
+    return run
+
+
+def _for_set(config: TrainConfig, num_labels: int, devices: int) -> TrainConfig:
+    """The same settings for a layout of this many markers, on this many devices."""
+    return dataclasses.replace(
+        config,
+        devices=devices,
+        network=dataclasses.replace(config.network, num_labels=num_labels),
+        cnn=dataclasses.replace(config.cnn, num_labels=num_labels),
+    )
+
+
+def _claim(out: Path, config: TrainConfig, dataset: Dataset) -> None:
+    """Claim the folder of the run, or check that the run there is this one."""
     settings: dict[str, Any] = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
+    del settings["train"]["devices"]
     if config.corruption is None:
         del settings["train"]["corruption"]
     else:
         check_corruption(config.corruption, len(dataset.marker_names))
-    with fabric.rank_zero_first():
-        claim(out / _CONFIG, settings, noun="training run", error=WeightsError, grows="train.samples")
-    torch.manual_seed(config.seed)
-    run = _Run(TrainingState(config, fabric, rows), rows, held_out, dataset.marker_names)
-    run.state.restore(out / CHECKPOINT)
+    # Older runs name their devices.
+    claim(
+        out / _CONFIG, settings, noun="training run", error=WeightsError,
+        grows="train.samples", free=("train.devices",),
+    )  # fmt: skip
+
+
+def _threads(given: int | None, fabric: Fabric) -> int | None:
+    """The threads of this process, None where they shall be measured, which processes cannot do alone."""
     if fabric.device.type != "cpu":
-        threads = threads or torch.get_num_threads()
-    chosen = TrainingThreads(threads, run.try_step)
-    with chosen.in_use(), run.kept(out / CHECKPOINT):
-        saved = time.monotonic()
-        while run.is_unfinished():
-            chosen.renew()
-            loss = run.step()
-            if progress is not None and fabric.is_global_zero:
-                progress(min(run.state.done, config.samples), config.samples, loss)
-            if time.monotonic() - saved > save_every:
-                run.state.save(out / CHECKPOINT)
-                saved = time.monotonic()
-        run.state.save(out / CHECKPOINT)
-        return _finish(run, dataset, out)
-
-
-def _for_labels(config: TrainConfig, num_labels: int) -> TrainConfig:
-    """The same settings for a layout of this many markers."""
-    return dataclasses.replace(
-        config,
-        network=dataclasses.replace(config.network, num_labels=num_labels),
-        cnn=dataclasses.replace(config.cnn, num_labels=num_labels),
-    )
+        return given or torch.get_num_threads()
+    return given if fabric.world_size == 1 else given or 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,9 +206,10 @@ class _Run:
     """The state of a run and what it learns from."""
 
     state: TrainingState
-    rows: NDArray[np.void]
-    held_out: NDArray[np.void]
-    names: tuple[str, ...]
+    ranks: Agreement
+    dataset: Dataset
+    rows: MappedRows
+    held_out: MappedRows
 
     def is_unfinished(self) -> bool:
         """Whether there are steps to do; an evaluation that is due is done first."""
@@ -142,11 +217,15 @@ class _Run:
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         due = state.done > evaluated and passed(state.done, config, _NUM_EVALUATIONS)
         if due and state.fabric.is_global_zero:
-            state.evaluate(_few(self.held_out, _CURVE_FRAMES[config.labeler]), self.names)
+            state.evaluate(few(self.held_out, _CURVE_FRAMES[config.labeler]), self.dataset.marker_names)
         return state.done < config.samples
 
     def step(self) -> float:
         """Make a step, whole or not at all, and return its loss."""
+        if not self.ranks.alone:
+            batch, rng = self.ranks.agree(self._draw)
+            with self.ranks.told_once():
+                return self.state.step(batch, rng=rng)
         with interrupt_flag() as interrupted:
             batch, rng = self._draw()
             loss = self.state.step(batch, rng=rng)
@@ -161,11 +240,9 @@ class _Run:
 
     def _draw(self) -> tuple[Batch, np.random.Generator]:
         """The batch of the next step, and the generator that the step goes on with."""
-        state, config, fabric = self.state, self.state.config, self.state.fabric
-        # One generator per step, so that a resumed run makes the same draws.
-        rng = np.random.default_rng((config.seed, state.done, fabric.global_rank))
-        share = dataclasses.replace(config, batch=config.batch // fabric.world_size)
-        return draw_batch(self.rows, share, rng=rng), rng
+        # One generator per step, so that a resumed run makes the same draws; the same one on each device.
+        rng = np.random.default_rng((self.state.config.seed, self.state.done, 0))
+        return draw_batch(self.rows, self.state.config, rng=rng), rng
 
     @contextmanager
     def kept(self, checkpoint: Path) -> Iterator[None]:
@@ -182,85 +259,10 @@ class _Run:
             ) from stop
 
 
-def _finish(run: _Run, dataset: Dataset, out: Path) -> dict[str, Any]:
-    """Evaluate the network, write weights, card and page, and return the card."""
-    config, held_out = run.state.config, run.held_out
-    network = run.state.averaged()
-    if isinstance(network, DeepLabelCNN):
-        choose_costs(network, run.names, _few(held_out, _COST_FRAMES))
-    else:
-        assert isinstance(network, SetLabeler)
-        rng = np.random.default_rng(config.seed)
-        network.prior = learn_pose_prior(right_hands(run.rows, _PRIOR_STRETCH, rng=rng), rng=rng)
-    card, report = _card(network, _few(held_out, _CARD_FRAMES[config.labeler]), config, dataset)
-    if run.state.fabric.is_global_zero:
-        card["curve"] = run.state.history.accuracies
-        save_network(out, network, card)
-        write_run_page(out, card, run.state.history, report)
-        write_model_card(out, card)
-    return card
-
-
-def _split(dataset: Dataset, batch: int) -> tuple[NDArray[np.void], NDArray[np.void]]:
+def _split(dataset: Dataset, batch: int) -> tuple[MappedRows, MappedRows]:
     """Rows to train on, and the held-out ones."""
-    rows = dataset.rows()
-    held_out = min(_MAX_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
+    rows = dataset.mapped_rows()
+    held_out = min(MOST_HELD_OUT, max(1, int(_HELD_OUT * len(rows))))
     if len(rows) - held_out < batch:
         raise DatasetError(f"{dataset.path} has {len(rows)} frames, expected at least {batch + held_out + 1}")
-    return rows[:-held_out], rows[-held_out:]
-
-
-def _few(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
-    """Every nth of these rows, at most `count`."""
-    return rows[:: -(-len(rows) // count)]
-
-
-def start_fabric(config: TrainConfig, out: Path) -> Fabric:
-    """The devices to train on, GPUs where there are any, and the writer of the curves."""
-    torch.set_flush_denormal(True)  # distance bumps underflow; denormals make a core many times slower
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)  # its messages are not about this run
-    warnings.filterwarnings("ignore", module="lightning_fabric")
-    fabric = Fabric(
-        accelerator="cuda" if torch.cuda.is_available() else "cpu",
-        devices=config.devices,
-        precision="bf16-mixed" if _takes_bf16(config.precision) else "32-true",
-        loggers=TensorBoardLogger(out, name="tensorboard", version=""),
-    )
-    fabric.launch()
-    return fabric
-
-
-def _takes_bf16(precision: str) -> bool:
-    """Whether the forward pass runs in bf16; without instructions for it a CPU is many times slower."""
-    if precision != "auto":
-        return precision == "bf16"
-    if torch.cuda.is_available():
-        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
-
-
-def _card(
-    network: nn.Module, rows: NDArray[np.void], config: TrainConfig, dataset: Dataset
-) -> tuple[dict[str, Any], Report]:
-    """Model card: where the weights come from, and their figures on held-out simulated frames.
-
-    Returns:
-        The card, and the evaluation with the paper's corruption.
-    """
-    labeler = labeler_of(network, dataset.marker_names)
-    markers = rows["markers"].astype(np.float64)
-    clean = evaluate_labeler(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
-    paper, report = paper_corruption(markers.shape[1]), paper_report(labeler, rows)
-    card = {
-        "marker_names": list(dataset.marker_names),
-        "trained_on": "simulated frames only",
-        "handsim": __version__,
-        "license": UNKNOWN_LICENSE,
-        "dataset": dataset.manifest.config,
-        "train": dataclasses.asdict(config),
-        "held_out_simulated": {
-            "clean": clean.figures,
-            f"occlude {paper.occlude}, ghosts {paper.ghosts}": report.figures,
-        },
-    }
-    return card, report
+    return rows.span(0, len(rows) - held_out), rows.span(len(rows) - held_out, len(rows))

@@ -16,7 +16,8 @@ from torch import nn
 from handsim.errors import HandSimError, WeightsError
 from handsim.files.atomic import atomic_write
 from train.config import TrainConfig
-from train.data.batches import Batch
+from train.data.batches import Batch, Part
+from train.data.mapped_rows import MappedRows
 from train.evaluation.labeler_evaluation import paper_report
 from train.history import History
 from train.labelers.kinds import batch_loss, labeler_of, new_network, prepare_network
@@ -34,9 +35,10 @@ class TrainingError(HandSimError):
 class TrainingState:
     """The state that a run carries from step to step and a checkpoint keeps."""
 
-    def __init__(self, config: TrainConfig, fabric: Fabric, rows: NDArray[np.void]) -> None:
+    def __init__(self, config: TrainConfig, fabric: Fabric, rows: NDArray[np.void] | MappedRows) -> None:
         self.config = config
         self.fabric = fabric
+        self.part = Part(fabric.global_rank, fabric.world_size)
         network = new_network(config.chosen)
         prepare_network(network, rows)
         self.network, self.optimizer = fabric.setup(network, _optimizer(config, network))
@@ -46,7 +48,11 @@ class TrainingState:
         self.began = time.monotonic(), 0
 
     def step(self, batch: Batch, *, rng: np.random.Generator) -> float:
-        """Make one gradient step and return the loss before it.
+        """Make one gradient step together with the other devices and return the loss before it.
+
+        Args:
+            batch: The whole batch; each device learns from its part.
+            rng: Source of further randomness, the same on each device.
 
         Raises:
             TrainingError: The loss is not finite; the state is of no use then.
@@ -55,7 +61,7 @@ class TrainingState:
         rate = self.config.learning_rate * _rate(self.config, self.done / self.config.samples)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        loss = batch_loss(self.config, self.network, batch, self.fabric.device, rng=rng)
+        loss = self._loss(batch, rng)
         self.optimizer.zero_grad()
         self.fabric.backward(loss)
         if self.config.optimizer == "adamw":
@@ -63,7 +69,7 @@ class TrainingState:
         self.optimizer.step()
         self.done += self.config.batch
         self._average()
-        value = float(loss.detach())
+        value = float(self.fabric.all_reduce(loss.detach(), reduce_op="mean"))  # type: ignore[arg-type]
         if not np.isfinite(value):
             raise TrainingError(
                 f"the loss is {value} after {self.done} samples; begin again with a learning rate below "
@@ -74,6 +80,9 @@ class TrainingState:
         if passed(self.done, self.config, _CURVE) or self.done >= self.config.samples:
             self._log(rate)
         return value
+
+    def _loss(self, batch: Batch, rng: np.random.Generator) -> torch.Tensor:
+        return batch_loss(self.config, self.network, batch, self.fabric.device, rng=rng, part=self.part)
 
     def _average(self) -> None:
         every = self.config.batch * self.config.average_every
@@ -112,7 +121,9 @@ class TrainingState:
         return network.eval()
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint; the first process does."""
+        if not self.fabric.is_global_zero:
+            return
         content = {
             "network": self.network.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -120,23 +131,24 @@ class TrainingState:
             "done": self.done,
             "history": dataclasses.asdict(self.history),
         }
-        if self.fabric.is_global_zero:
-            # Through memory: torch puts the temporary name into a file that it opens itself, and does not
-            # say that the disk is full.
-            buffer = io.BytesIO()
-            torch.save(content, buffer)
-            with atomic_write(path) as temporary:
-                temporary.write_bytes(buffer.getbuffer())
+        # Through memory: torch puts the temporary name into a file that it opens itself, and does not say
+        # that the disk is full.
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        with atomic_write(path) as temporary:
+            temporary.write_bytes(buffer.getbuffer())
 
     def restore(self, path: Path) -> None:
-        """Continue from a checkpoint, if there is one.
+        """Continue from a checkpoint, if there is one; the first process reads it for all.
 
         Raises:
             WeightsError: The checkpoint is damaged.
         """
-        if not path.is_file():
+        found = path.read_bytes() if self.fabric.is_global_zero and path.is_file() else None
+        found = self.fabric.broadcast(found)
+        if found is None:
             return
-        stored = io.BytesIO(path.read_bytes())  # torch calls some damage an OSError
+        stored = io.BytesIO(found)  # torch calls some damage an OSError
         try:
             content = torch.load(stored, weights_only=True, map_location=self.fabric.device)
             self._check(content)
@@ -165,7 +177,7 @@ class TrainingState:
         """Do the work of a step, to time it; the state stays as it is."""
         kept = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
         try:
-            self.fabric.backward(batch_loss(self.config, self.network, batch, self.fabric.device, rng=rng))
+            self.fabric.backward(self._loss(batch, rng))
         finally:
             self.optimizer.zero_grad()
             self.network.load_state_dict(kept)  # means of batch normalization move in a forward pass

@@ -36,7 +36,8 @@ def free_rays(
         segments: Both ends of every capsule's axis in the world [m].
         radii: Capsule radii [m].
     """
-    free: NDArray[np.bool_] = _free(markers, cameras, segments, radii)
+    free = np.ones((*markers.shape[:2], len(cameras)), dtype=np.bool_)
+    _keep_free(markers, cameras, segments, radii, free)
     return free
 
 
@@ -56,8 +57,8 @@ def visible_cameras(
         segments: Both ends of every capsule's axis in the world [m].
         radii: Capsule radii [m].
     """
-    clear = free_rays(markers, rig.positions, segments, radii)
-    seen: NDArray[np.bool_] = facing_cameras(markers, normals, rig) & clear
+    seen = facing_cameras(markers, normals, rig)
+    _keep_free(markers, rig.positions, segments, radii, seen)
     return seen
 
 
@@ -71,12 +72,13 @@ def facing_cameras(
         normals: Outward unit directions of the surface under the markers.
         rig: The cameras.
     """
-    cameras = rig.positions
-    ahead = normals @ cameras.T - np.einsum("tmi,tmi->tm", normals, markers)[..., None]
-    squared = np.einsum("tmi,tmi->tm", markers, markers)[..., None] - markers @ (2.0 * cameras.T)
-    squared += np.einsum("ci,ci->c", cameras, cameras)
-    facing: NDArray[np.bool_] = ahead > np.cos(MAX_FACING) * np.sqrt(squared)
-    return rig.in_view(markers) & facing
+    seen: NDArray[np.bool_] = _facing(
+        np.ascontiguousarray(markers, dtype=np.float64),
+        np.ascontiguousarray(normals, dtype=np.float64),
+        np.ascontiguousarray(rig.T_world_camera),
+        (np.cos(rig.field_of_view / 2), np.cos(MAX_FACING)),
+    )
+    return seen
 
 
 def pack_cameras(visible: Bool[np.ndarray, "*batch C"]) -> NDArray[np.uint32]:
@@ -93,15 +95,40 @@ def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndar
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _free(
+def _facing(markers: Any, normals: Any, T_world_camera: Any, cosines: tuple[float, float]) -> Any:
+    """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`.
+
+    Args:
+        markers: Marker centers (T, M, 3) [m]; what is NaN is in no view.
+        normals: Outward unit directions (T, M, 3).
+        T_world_camera: Camera poses (C, 4, 4).
+        cosines: Of half the field of view, and of the largest angle of facing.
+    """
+    frames, count = markers.shape[:2]
+    seen = np.empty((frames, count, len(T_world_camera)), dtype=np.bool_)
+    for t in range(frames):
+        for m in range(count):
+            marker, normal = markers[t, m], normals[t, m]
+            for c in range(len(T_world_camera)):
+                pose = T_world_camera[c]
+                x, y, z = marker[0] - pose[0, 3], marker[1] - pose[1, 3], marker[2] - pose[2, 3]
+                distance = np.sqrt(x * x + y * y + z * z)
+                depth = x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2]
+                ahead = -(x * normal[0] + y * normal[1] + z * normal[2])
+                seen[t, m, c] = depth >= cosines[0] * distance and ahead > cosines[1] * distance
+    return seen
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _keep_free(
     markers: Float[np.ndarray, "T M 3"],
     cameras: Float[np.ndarray, "C 3"],
     segments: Float[np.ndarray, "T K 2 3"],
     radii: Float[np.ndarray, "K"],
-) -> Any:
-    """Which lines (T, M, C) meet no capsule; arguments as for `free_rays`."""
+    free: Bool[np.ndarray, "T M C"],
+) -> None:
+    """Clear what is set of `free` (T, M, C) where a line meets a capsule; else as for `free_rays`."""
     frames, count = markers.shape[:2]
-    free = np.ones((frames, count, len(cameras)), dtype=np.bool_)
     capsules = len(radii)
     centers, reach = np.empty((capsules, 3)), np.empty(capsules)
     offset, gap, margin = np.empty((3, capsules)), np.empty(capsules), np.empty(capsules)
@@ -114,6 +141,8 @@ def _free(
                     offset[i, k] = centers[k, i] - marker[i]
                 gap[k] = offset[0, k] ** 2 + offset[1, k] ** 2 + offset[2, k] ** 2 - reach[k] ** 2
             for c in range(len(cameras)):
+                if not free[t, m, c]:
+                    continue
                 dx, dy, dz = (cameras[c, 0] - marker[0], cameras[c, 1] - marker[1], cameras[c, 2] - marker[2])
                 squared = dx * dx + dy * dy + dz * dz
                 inverse = 1.0 / squared
@@ -128,4 +157,3 @@ def _free(
                     ):
                         free[t, m, c] = False
                         break
-    return free

@@ -11,6 +11,7 @@
 - live_status: one line of status, renewed in place
 - interrupts: signals to end, as a flag that a loop reads or as an exception
 - workers: numbered jobs in worker processes, which end with their parent
+- executors: who does numbered jobs, those processes or a cluster
 - system_packages: names of system packages that pip cannot install
 - page: one HTML page of pictures and figures
 """

@@ -17,6 +17,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "render.commands.glove:GLOVE+track.commands.glove_advice:GLOVE",
         "List, show, start and check marker layouts; score and improve one before it is worn.",
     ),
+    "rig": (
+        "train.commands.rig:RIG+handsim.commands.rig_import:RIG+train.commands.rig_advice:RIG",
+        "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
+    ),
     "generate": ("train.commands.generate:generate", "Make a training set; goes on where it was stopped."),
     "train": (
         "train.commands.train:train",
@@ -42,6 +46,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "benchmark": (
         "track.commands.benchmark:BENCHMARK_COMMANDS",
         "Make the public benchmark, run a tracker on it, score anybody's results.",
+    ),
+    "sweep": (
+        "track.commands.sweep:sweep",
+        "Train and measure for gloves x rigs x people x seeds, as one job with a table.",
     ),
     "doctor": ("handsim.commands.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }

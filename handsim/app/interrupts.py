@@ -35,31 +35,39 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptFlag:
-    """Whether a signal to end came; called, it answers."""
+    """Whether a signal to end came; called, it answers.
 
-    def __init__(self) -> None:
+    Args:
+        again: Whether a second signal raises.
+    """
+
+    def __init__(self, *, again: bool = True) -> None:
         self.number = 0
         """The first signal that came, 0 if none did."""
+        self._again = again
 
     def __call__(self) -> bool:
         """Whether one came."""
         return self.number != 0
 
     def note(self, number: int, _frame: FrameType | None) -> None:
-        """Keep the first signal; raise at the second."""
-        if self.number:
+        """Keep the first signal; raise at the second, if at all."""
+        if self.number and self._again:
             raise Stopped(number)
-        self.number = number
+        self.number = self.number or number
 
 
 @contextmanager
-def interrupt_flag() -> Iterator[InterruptFlag]:
+def interrupt_flag(*, again: bool = True) -> Iterator[InterruptFlag]:
     """Within the block the first signal to end raises nothing; the yielded flag says whether it came.
 
-    An exception from a signal can be lost: compiled code that calls back into Python swallows it. A second
-    signal raises. Only the main thread gets signals; in other threads the flag stays down.
+    An exception from a signal can be lost: compiled code that calls back into Python swallows it. Only the
+    main thread gets signals; in other threads the flag stays down.
+
+    Args:
+        again: Whether a second signal raises.
     """
-    flag = InterruptFlag()
+    flag = InterruptFlag(again=again)
     with _handled(flag.note, ENDING):
         yield flag
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
@@ -44,6 +45,11 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
         else:
             with _lines(console, bar.tasks[0], unit):
                 yield bar, task
+
+
+def print_above(bar: Progress) -> Callable[[str], None]:
+    """Takes a line and prints it above the bar, on standard error."""
+    return functools.partial(bar.console.print, soft_wrap=True, markup=False, highlight=False)
 
 
 @contextmanager

@@ -45,35 +45,37 @@ def check_workers(workers: int | None) -> int:
     return usable_cores() if workers is None else workers
 
 
-def in_processes(job: Job, todo: Sequence[int], workers: int) -> Iterator[int]:
+def in_processes(job: Job, todo: Sequence[int], workers: int, *, first_alone: bool = True) -> Iterator[int]:
     """Do jobs and yield the number of each when it is done.
 
-    The first is done in this process, before the others. This fills numba's cache before workers need it, and
-    a mistake common to all jobs shows at once. Workers have one thread each; they end when this process does,
-    however it ends.
+    Workers have one thread each; they end when this process does, however it ends.
 
     Args:
         job: Takes a number and returns it; workers are spawned and unpickle it.
         todo: The numbers of the jobs.
         workers: Number of processes; with one, all jobs are done in this process.
+        first_alone: Whether the first is done in this process, before the others. This fills numba's cache
+            before workers need it, and a mistake common to all jobs shows at once.
 
     Raises:
         DatasetError: A worker died.
     """
-    if not todo:
-        return
-    yield job(todo[0])
+    if todo and (first_alone or workers == 1):
+        yield job(todo[0])
+        todo = todo[1:]
     if workers == 1 or len(todo) == 1:
-        yield from (job(number) for number in todo[1:])
+        yield from (job(number) for number in todo)
+        return
+    if not todo:
         return
     pool: dict[Connection, SpawnProcess] = {}
     try:
-        for _ in range(min(workers, len(todo) - 1)):
-            channel, process = _start(job)
+        for _ in range(min(workers, len(todo))):
+            channel, process = spawn(_work, job)
             pool[channel] = process
-        yield from _share_out(todo[1:], list(pool))
+        yield from _share_out(todo, list(pool))
     finally:
-        _end(pool)
+        end_processes(pool)
 
 
 def _share_out(todo: Sequence[int], channels: list[Connection]) -> Iterator[int]:
@@ -121,19 +123,28 @@ def _death() -> DatasetError:
     return DatasetError("a worker died (out of memory?); run the same command again to go on")
 
 
-def _start(job: Job) -> tuple[Connection, SpawnProcess]:
-    """A worker, and this end of its pipe."""
+def spawn(live: Callable[..., None], *args: object) -> tuple[Connection, SpawnProcess]:
+    """A process that calls `live(*args, channel)`, and this end of its pipe.
+
+    It ends when this process does, however that ends, has one thread unless the user chose otherwise, and
+    does not hear Ctrl-C or hang-ups.
+    """
     context = multiprocessing.get_context("spawn")
     channel, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(job, theirs, os.getpid()), daemon=True)
-    with _one_thread(), _without_signals():
+    process = context.Process(target=_bound, args=(os.getpid(), live, *args, theirs), daemon=True)
+    with _one_thread(), without_signals():
         process.start()
     theirs.close()
     return channel, process
 
 
-def _end(pool: dict[Connection, SpawnProcess]) -> None:
-    """End workers, whatever they do, and wait until they are gone."""
+def _bound(parent: int, live: Callable[..., None], *args: object) -> None:
+    _end_with(parent)
+    live(*args)
+
+
+def end_processes(pool: dict[Connection, SpawnProcess]) -> None:
+    """End processes, whatever they do, and wait until they are gone."""
     for channel, process in pool.items():
         channel.close()
         process.terminate()
@@ -156,7 +167,7 @@ def _one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def _without_signals() -> Iterator[None]:
+def without_signals() -> Iterator[None]:
     """Processes started within the block do not hear Ctrl-C or hang-ups; this one hears them after it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
@@ -168,10 +179,9 @@ def _without_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(job: Job, channel: Connection, parent: int) -> None:
+def _work(job: Job, channel: Connection) -> None:
     """The life of a worker: do one job after the other until the pipe closes."""
     signal.signal(signal.SIGTERM, _leave)  # so that a half-written file is removed
-    _end_with(parent)
     while True:
         try:
             number = channel.recv()
@@ -180,7 +190,7 @@ def _work(job: Job, channel: Connection, parent: int) -> None:
         try:
             answer: int | Exception = job(number)
         except Exception as error:
-            answer = _portable(error)
+            answer = portable(error)
         try:
             channel.send(answer)
         except OSError:
@@ -208,7 +218,7 @@ def _end_with(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _portable(error: Exception) -> Exception:
+def portable(error: Exception) -> Exception:
     """The same error, or its words where it does not survive the pipe."""
     try:
         same = pickle.loads(pickle.dumps(error))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import errno
 import glob
 import os
+import platform
 import re
 import shutil
 import tomllib
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -63,7 +65,7 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         if final.exists() and not final.is_file():
             raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
         final.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(final)
+        remove_abandoned(final)
     temporaries = [temporary_beside(final) for final in finals]
     modes = [_usual_mode(*pair) for pair in zip(temporaries, finals, strict=True)]
     renamed: list[Path] = []
@@ -86,7 +88,12 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
 
 def temporary_beside(path: Path) -> Path:
     """The hidden name under which this process writes `path`; `remove_leftovers` knows such names."""
-    return path.with_name(f".{path.stem}.tmp-{os.getpid()}{path.suffix}")
+    return path.with_name(f"{_prefix(path)}{os.getpid()}{path.suffix}")
+
+
+def _prefix(path: Path) -> str:
+    """How such names begin on this machine: another one that shares the folder has its own processes."""
+    return f".{path.stem}.tmp-{zlib.crc32(platform.node().encode()):08x}-"
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -101,12 +108,16 @@ def remove_leftovers(folder: Path) -> None:
             leftover.unlink(missing_ok=True)
 
 
-def _remove_abandoned(final: Path) -> None:
-    """Remove the temporary files of `final` whose process is gone."""
-    prefix = f".{final.stem}.tmp-"
+def remove_abandoned(final: Path) -> None:
+    """Remove what was to become `final` and whose process is gone; that of other machines stays."""
+    prefix = _prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix)
-        if number.isdecimal() and leftover.is_file() and not _is_running(int(number)):
+        if not number.isdecimal() or _is_running(int(number)):
+            continue
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover, ignore_errors=True)
+        else:
             leftover.unlink(missing_ok=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 from pathlib import Path
@@ -61,6 +62,12 @@ def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None
             return file.read() if most is None else file.read(most)
     except OSError as cause:
         raise error(f"{path}: cannot be read: {cause.strerror or cause}") from cause
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 _NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -17,9 +18,18 @@ _MOST_JSON: Final = 1 << 26  # bytes
 
 
 def save_json(path: Path, content: dict[str, Any]) -> None:
-    """Write a JSON file, whole or not at all."""
+    """Write a JSON file, whole or not at all; JSON knows no NaN and no infinity, which become null."""
     with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(_finite(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    """The same, with None for what is not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def load_json(path: Path) -> dict[str, Any]:
@@ -44,7 +54,9 @@ def claim(
     noun: str,
     error: type[HandSimError],
     grows: str = "",
+    free: Collection[str] = (),
     result: Path | None = None,
+    shown: str = "",
 ) -> None:
     """Claim a folder by a settings file, or check that its settings are equal; clear what a killed run left.
 
@@ -55,19 +67,22 @@ def claim(
         error: Class of the error.
         grows: A setting, written like `train.samples`, that may be larger than in the file; the file then
             takes the new settings.
+        free: Settings that may differ or be missing, because the content does not depend on them.
         result: A file that is true for the old settings only; it is removed before they change.
+        shown: The folder's name in messages, where it stands for another.
 
     Raises:
         HandSimError: Of class `error`: the `noun` there has other settings, or something else is there.
     """
-    out = path.parent
+    out, shown = path.parent, shown or str(path.parent)
     if path.is_file():
         found, expected = _flat(load_json(path)), _flat(json.loads(json.dumps(settings)))
-        differing = [key for key in sorted(found.keys() | expected) if not _same(found, expected, key)]
+        keys = sorted((found.keys() | expected) - set(free))
+        differing = [key for key in keys if not _same(found, expected, key)]
         grown = differing == [grows] and _is_larger(expected.get(grows), found.get(grows))
         if differing and not grown:
             raise error(
-                f"{out} holds a {noun} begun with other settings ({_told(differing, found, expected)}); "
+                f"{shown} holds a {noun} begun with other settings ({_told(differing, found, expected)}); "
                 f"use them or another folder{_hint(grows, differing)}"
             )
         remove_leftovers(out)

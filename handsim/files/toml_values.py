@@ -82,8 +82,8 @@ def shown(value: object) -> str:
 
 
 def quoted(text: str) -> str:
-    """A TOML basic string, which escapes as JSON does."""
-    return json.dumps(text, ensure_ascii=False)
+    """A TOML basic string, which escapes as JSON does, and the delete character too."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007F")
 
 
 def written(value: float) -> str:

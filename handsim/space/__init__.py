@@ -6,6 +6,7 @@
 - cameras: `CameraRig`, shipped rigs and rigs from files
 - rig_file: the TOML form of a rig
 - camera_file: the TOML form of cameras with lenses of their own
+- rig_formats: calibrations of cameras as other programs write them
 - solids: the simple solids that objects are made of
 - objects: rigid objects that a hand holds
 """

@@ -126,6 +126,17 @@ def named_rig(name: str) -> CameraRig:
     return _read(_SHIPPED / f"{name}.toml")
 
 
+def rig_description(name: str) -> str:
+    """What a rig that comes with the package is, in one sentence.
+
+    Raises:
+        ArgumentError: There is no rig of that name.
+    """
+    if name not in list_rigs():
+        raise ArgumentError(choices(name, list_rigs(), noun="camera rig"))
+    return read_rig_file(_SHIPPED / f"{name}.toml").description
+
+
 def load_rig(name_or_path: str | Path) -> CameraRig:
     """A shipped rig by its name, or your own by the path of its `.toml` file (format: docs/rigs.md).
 

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from handsim.errors import HandSimError, RigError
 from handsim.files.atomic import read_toml
-from handsim.files.toml_values import check_keys, number_of, numbers, quoted, shown, tables_of, written
+from handsim.files.toml_values import (
+    check_keys,
+    number_of,
+    numbers,
+    quoted,
+    shown,
+    tables_of,
+    text_of,
+    written,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,6 +40,7 @@ class RigTable(NamedTuple):
     """[px]"""
     cameras: list[tuple[NDArray[np.float64], NDArray[np.float64]] | NDArray[np.float64]]
     """Position and target (3,) [m], or a pose (4, 4)."""
+    description: str = ""
 
 
 def read_rig_file(path: Path) -> RigTable:
@@ -61,7 +71,7 @@ def _parse(table: Mapping[str, object]) -> RigTable:
         raise RigError(f"resolution is {shown(resolution)}, expected a whole number of pixels")
     angle = number_of(table, "field_of_view")
     cameras = [parse_place(entry, f"camera {number}") for number, entry in enumerate(tables, 1)]
-    return RigTable(name, angle, resolution, cameras)
+    return RigTable(name, angle, resolution, cameras, text_of(table, "description", default=""))
 
 
 def rig_lines(

@@ -6,6 +6,7 @@ motion can therefore be smoothed afterwards, towards the free side only.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -93,7 +94,6 @@ def close_fingers(
     for press, joints in _STAGES:
         for digit in _ORDER:
             parts = digit_parts(model, digit)
-            rest = [k for k in range(len(model.capsules.bones)) if k not in parts.capsules]
             columns = slice(4 * digit, 4 * digit + 4)
             goal = angles[:, columns].copy()
             goal[:, joints] = closed[:, columns][:, joints]
@@ -102,9 +102,9 @@ def close_fingers(
                 DigitPaths(rotations, positions, angles[busy, columns], goal[busy]),
                 parts,
                 Obstacles(
-                    np.concatenate([others, own[:, rest]], axis=1),
-                    np.concatenate([other.capsules.radii, model.capsules.radii[rest]]),
-                    np.concatenate([all_of_other, parts.meets[:, rest]], axis=1),
+                    np.concatenate([others, own[:, parts.others]], axis=1),
+                    np.concatenate([other.capsules.radii, model.capsules.radii[parts.others]]),
+                    np.concatenate([all_of_other, parts.meets[:, parts.others]], axis=1),
                     press,
                 ),
             )
@@ -129,6 +129,7 @@ def smooth_below(values: Float[np.ndarray, "T"], window: int) -> Float[np.ndarra
     return -smooth_above(-values, window)
 
 
+@lru_cache(maxsize=4 * len(_ORDER))
 def digit_parts(model: HandModel, digit: int) -> Digit:
     """A digit of a hand (0: thumb) as the compiled searches need it."""
     capsules, skeleton = model.capsules, model.skeleton
@@ -139,6 +140,7 @@ def digit_parts(model: HandModel, digit: int) -> Digit:
     meets[pairs[:, 0], pairs[:, 1]] = meets[pairs[:, 1], pairs[:, 0]] = True
     return Digit(
         capsules=indices,
+        others=np.setdiff1d(np.arange(len(capsules.bones)), indices),
         offsets=skeleton.offsets[first : first + 3],
         rotations=skeleton.rotations[first : first + 3],
         axes=skeleton.axes[4 * digit : 4 * digit + 4],

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numba
 import numpy as np
 
+from handsim.hand.capsules import bounding_spheres
 from handsim.kernels.chain import pose_digit_axes
 from handsim.kernels.segments import segment_distance_squared
 
@@ -29,6 +30,8 @@ class Digit(NamedTuple):
 
     capsules: NDArray[np.int64]
     """Indices of its capsules among the hand's (3,)."""
+    others: NDArray[np.int64]
+    """Indices of the hand's other capsules (K - 3,)."""
     offsets: NDArray[np.float64]
     """Origin of each bone in its parent's frame (3, 3) [m]."""
     rotations: NDArray[np.float64]
@@ -91,11 +94,14 @@ def search_contact(
     reach = np.empty(len(moving))
     p, q = np.empty(3), np.empty(3)
     for frame in range(len(moving)):
-        pairs = _pairs_in_line(moving[frame], moving_radii, still[frame], still_radii, axis[frame])
+        pairs, spheres = _pairs_in_line(moving[frame], moving_radii, still[frame], still_radii, axis[frame])
         shift = FARTHEST
         for _ in range(100):
             gap = 1e9
             for number in range(len(pairs)):
+                apart, along, near = spheres[number]
+                if apart + shift * (2.0 * along + shift) >= (near + gap) ** 2:
+                    continue  # spheres around them are farther apart than the nearest pair so far
                 i, j = pairs[number, 0], pairs[number, 1]
                 for k in range(3):
                     p[k] = moving[frame, i, 0, k] + shift * axis[frame, k]
@@ -114,23 +120,29 @@ def search_contact(
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
-    """Pairs (P, 2) whose bounding spheres meet somewhere along the axis; the others never touch."""
+    """Pairs (P, 2) whose bounding spheres meet somewhere along the axis; the others never touch.
+
+    And of each pair (P, 3): the squared distance [m^2] of the spheres' centers, its part along the axis [m],
+    and the sum of the spheres' radii [m].
+    """
     pairs = np.empty((len(moving_radii) * len(still_radii), 2), dtype=np.int64)
+    spheres = np.empty((len(pairs), 3))
     count = 0
     for i in range(len(moving_radii)):
         for j in range(len(still_radii)):
-            along, apart, lengths = 0.0, 0.0, np.zeros(2)
+            along, apart, length, other = 0.0, 0.0, 0.0, 0.0
             for k in range(3):
                 between = 0.5 * (moving[i, 0, k] + moving[i, 1, k] - still[j, 0, k] - still[j, 1, k])
                 along += between * axis[k]
                 apart += between * between
-                lengths[0] += (moving[i, 1, k] - moving[i, 0, k]) ** 2
-                lengths[1] += (still[j, 1, k] - still[j, 0, k]) ** 2
-            reach = moving_radii[i] + still_radii[j] + 0.5 * (np.sqrt(lengths[0]) + np.sqrt(lengths[1]))
+                length += (moving[i, 1, k] - moving[i, 0, k]) ** 2
+                other += (still[j, 1, k] - still[j, 0, k]) ** 2
+            reach = moving_radii[i] + still_radii[j] + 0.5 * (np.sqrt(length) + np.sqrt(other))
             if apart - along * along < reach * reach:
                 pairs[count, 0], pairs[count, 1] = i, j
+                spheres[count, 0], spheres[count, 1], spheres[count, 2] = apart, along, reach
                 count += 1
-    return pairs[:count]
+    return pairs[:count], spheres[:count]
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
@@ -144,12 +156,14 @@ def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any
     """
     share = np.ones(len(paths.start))
     near = np.empty(len(obstacles.radii), dtype=np.int64)
+    centers, sizes = np.empty((len(near), 3)), np.empty(len(near))
     angles, bones, scratch = np.empty(4), np.empty((3, 2, 3)), np.empty((4, 3))
     for frame in range(len(paths.start)):
         wrist = paths.rotations[frame], paths.positions[frame]
         count = _within_reach(wrist, parts, obstacles, frame, near)
         if count == 0:
             continue
+        bounding_spheres(obstacles.segments[frame], obstacles.radii, centers, sizes)
         bend = np.abs(paths.goal[frame] - paths.start[frame]).sum()
         steps = max(1, int(np.ceil(bend / _STEP)))
         low, high = 0.0, 1.0
@@ -160,7 +174,7 @@ def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any
                     paths.goal[frame, joint] - paths.start[frame, joint]
                 )
             pose_digit_axes(wrist, angles, parts, bones, scratch)
-            if _blocked(bones, parts, obstacles, frame, near[:count]):
+            if _blocked(bones, parts, obstacles, frame, near[:count], (centers, sizes)):
                 high = min(tried, 1.0 - 1e-9)
             else:
                 low = tried
@@ -188,11 +202,18 @@ def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any)
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
-def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> bool:
-    """Whether a digit with capsule axes `bones` (3, 2, 3) [m] meets one of the obstacles `near`."""
+def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any, spheres: Any) -> bool:
+    """Whether a digit with capsule axes `bones` (3, 2, 3) [m] meets one of the obstacles `near`.
+
+    Obstacles whose bounding spheres, centers (K, 3) [m] and radii (K,) [m], it does not meet cannot be met.
+    """
+    own, size = np.empty((3, 3)), np.empty(3)
+    bounding_spheres(bones, parts.radii, own, size)
     for i in range(3):
         for j in near:
-            if obstacles.meets[i, j]:
+            apart = size[i] + spheres[1][j] - obstacles.press
+            x, y, z = own[i, 0] - spheres[0][j, 0], own[i, 1] - spheres[0][j, 1], own[i, 2] - spheres[0][j, 2]
+            if obstacles.meets[i, j] and x * x + y * y + z * z < apart * apart:
                 reach = parts.radii[i] + obstacles.radii[j] - obstacles.press
                 a, b = obstacles.segments[frame, j, 0], obstacles.segments[frame, j, 1]
                 if segment_distance_squared(bones[i, 0], bones[i, 1], a, b) < reach * reach:

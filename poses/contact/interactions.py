@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -60,24 +61,30 @@ class Fingers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Meeting:
-    """One interaction as it was drawn: poses of the moving hand in the wrist frame of the still one."""
+    """Interactions as they were drawn: poses of the moving hand in the wrist frame of the still one."""
 
     still: Fingers
     moving: Fingers
     rotations: Float[np.ndarray, "K 3"]
     """Rotation vectors [rad], to be applied after `rotation`."""
-    rotation: Float[np.ndarray, "3 3"]
+    rotation: Float[np.ndarray, "K 3 3"]
+    """The same for all beats of one interaction."""
     targets: Float[np.ndarray, "K 3"]
     """Points of the still hand [m]."""
     anchors: Float[np.ndarray, "K 3"]
     """Points of the moving hand [m] that are put on them."""
-    axis: Float[np.ndarray, "3"]
-    """Unit direction in which the moving hand backs off."""
+    axis: Float[np.ndarray, "K 3"]
+    """Unit direction in which the moving hand backs off; the same for all beats of one interaction."""
+
+    def directions(self, beats: Float[np.ndarray, "T"]) -> NDArray[np.float64]:
+        """Unit directions (T, 3) in which the moving hand backs off."""
+        directions: NDArray[np.float64] = self.axis[beats.astype(int)]
+        return directions
 
     def placement(self, beats: Float[np.ndarray, "T"]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Orientations (T, 3, 3) and positions (T, 3) [m] of the moving wrist before it backs off."""
         tilts = Rotation.from_rotvec(at_beats(self.rotations, beats)).as_matrix()
-        rotations = tilts @ self.rotation
+        rotations = tilts @ self.rotation[beats.astype(int)]
         anchors = np.einsum("tij,tj->ti", rotations, at_beats(self.anchors, beats))
         return rotations, at_beats(self.targets, beats) - anchors
 
@@ -106,43 +113,77 @@ def draw_variant(name: str, *, rng: np.random.Generator) -> dict[str, Any]:
     return variant
 
 
-def draw_meeting(
-    variant: dict[str, Any],
-    still: HandModel,
-    moving: HandModel,
-    count: int,
-    *,
-    together: bool,
-    rng: np.random.Generator,
-) -> Meeting:
+class Sketch(NamedTuple):
+    """The random part of an interaction's beats, before hands give it their size."""
+
+    variant: dict[str, Any]
+    """Its description, from `draw_variant`."""
+    still: _FingerSketch
+    moving: _FingerSketch
+    targets: Float[np.ndarray, "K 3"]
+    """Points of the still hand [hand lengths]."""
+    tilts: Float[np.ndarray, "K 3"]
+    """Rotation of the moving hand [rad]."""
+
+
+class _FingerSketch(NamedTuple):
+    """Fingers of one hand (K, ...), not valid yet."""
+
+    opened: NDArray[np.float64]
+    closed: NDArray[np.float64]
+    wander: NDArray[np.float64]
+    """Change of the open fingers from beat to beat [rad]."""
+    strength: NDArray[np.float64]
+
+
+def sketch_meeting(
+    variant: dict[str, Any], count: int, *, together: bool, rng: np.random.Generator
+) -> Sketch:
     """Random positions, orientations and fingers for `count` beats.
 
     Args:
         variant: Its description, from `draw_variant`.
-        still: The hand that holds still.
-        moving: The other hand, of the other side.
         count: Number of beats, K.
         together: Whether beats belong to one meeting, and so resemble each other, or are independent.
         rng: Source of all randomness.
     """
     noise = _Noise(count, together, rng)
-    mirror = np.eye(3) if still.shape.side == "right" else MIRROR
-    fingers = [
-        _draw_fingers(model, variant[role], variant["relaxing"], noise, rng)
-        for model, role in ((still, "still"), (moving, "moving"))
-    ]
+    still, moving = (
+        _sketch_fingers(variant[role], variant["relaxing"], noise, rng) for role in ("still", "moving")
+    )
     targets = np.tile(variant["target"], (count, 1))
     targets[:, :2] += noise.around(np.array(variant["jitter"]), 0.0) + _offsets(variant, count, rng)
-    tilts = noise.around(np.deg2rad(variant["tilt"]), 0.3)
-    axis = np.array(variant["axis"], dtype=np.float64) @ mirror
+    return Sketch(variant, still, moving, targets, noise.around(np.deg2rad(variant["tilt"]), 0.3))
+
+
+def meet(sketches: Sequence[Sketch], still: HandModel, moving: HandModel) -> Meeting:
+    """The beats of all sketches, one sketch after another, with valid fingers of these hands.
+
+    Args:
+        sketches: What was drawn, from `sketch_meeting`.
+        still: The hand that holds still.
+        moving: The other hand, of the other side.
+    """
+    mirror = np.eye(3) if still.shape.side == "right" else MIRROR
+    counts = [len(sketch.targets) for sketch in sketches]
+    fingers = _valid_fingers(moving, [sketch.moving for sketch in sketches])
+    opened = np.split(fingers.opened, np.cumsum(counts)[:-1])
+    tilts = np.concatenate([sketch.tilts for sketch in sketches])[:, ::-1]
+    rotation = [euler_matrix(np.deg2rad(sketch.variant["rotation"])) for sketch in sketches]
+    axis = np.array([sketch.variant["axis"] for sketch in sketches], dtype=np.float64) @ mirror
     return Meeting(
-        still=fingers[0],
-        moving=fingers[1],
-        rotations=-tilts[:, ::-1] @ mirror if still.shape.side == "left" else tilts[:, ::-1],
-        rotation=mirror @ euler_matrix(np.deg2rad(variant["rotation"])) @ mirror,
-        targets=still.shape.length * targets @ mirror,
-        anchors=_anchors(variant["anchor"], moving, fingers[1].opened),
-        axis=axis / np.linalg.norm(axis),
+        still=_valid_fingers(still, [sketch.still for sketch in sketches]),
+        moving=fingers,
+        rotations=-tilts @ mirror if still.shape.side == "left" else tilts,
+        rotation=np.repeat(mirror @ np.array(rotation) @ mirror, counts, axis=0),
+        targets=still.shape.length * np.concatenate([sketch.targets for sketch in sketches]) @ mirror,
+        anchors=np.concatenate(
+            [
+                _anchors(sketch.variant["anchor"], moving, part)
+                for sketch, part in zip(sketches, opened, strict=True)
+            ]
+        ),
+        axis=np.repeat(axis / np.linalg.norm(axis, axis=1, keepdims=True), counts, axis=0),
     )
 
 
@@ -174,15 +215,21 @@ def _offsets(variant: dict[str, Any], count: int, rng: np.random.Generator) -> N
     return offsets
 
 
-def _draw_fingers(
-    model: HandModel, role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
-) -> Fingers:
+def _sketch_fingers(
+    role: dict[str, str], relaxing: float, noise: _Noise, rng: np.random.Generator
+) -> _FingerSketch:
     weaker = rng.random((noise.count, len(DIGITS))) < relaxing
     strength = np.where(weaker, rng.uniform(0.4, 1.0, size=weaker.shape), 1.0)
     opened = _angles(role["open"]) + noise.around(_NOISE, 0.0)
     closed = _angles(role["closed"]) + noise.around(_NOISE, 0.0)
+    return _FingerSketch(opened, closed, _WANDER * noise.around(_NOISE, 1.0, common=0.0), strength)
+
+
+def _valid_fingers(model: HandModel, sketches: Sequence[_FingerSketch]) -> Fingers:
+    """The fingers of all sketches, one after another, none in another's way."""
+    opened, closed, wander, strength = (np.concatenate(parts) for parts in zip(*sketches, strict=True))
     lasting = _loosened(model, make_valid(model, np.clip(opened, LOW, HIGH)))
-    wandering = np.clip(lasting + _WANDER * noise.around(_NOISE, 1.0, common=0.0), LOW, HIGH)
+    wandering = np.clip(lasting + wander, LOW, HIGH)
     valid = is_valid(model, wandering, max_penetration=_SNUG)
     return Fingers(np.where(valid[:, None], wandering, lasting), np.clip(closed, LOW, HIGH), strength)
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
 from handsim.hand.model import HandModel, join_qpos
 from poses.contact.contact_closing import NEAREST, close_fingers, first_contact, smooth_above
-from poses.contact.interactions import Meeting, draw_meeting, draw_variant
-from poses.contact.passages import Passage, TwoHandConfig, placed_qpos, valid_frames
+from poses.contact.interactions import Meeting, Sketch, draw_variant, meet, sketch_meeting
+from poses.contact.passages import Passage, TwoHandConfig, join_passages, placed_qpos, valid_frames
 from poses.motion.minimum_jerk import minimum_jerk
 
 if TYPE_CHECKING:
@@ -48,10 +49,10 @@ def play_meeting(
     still, moving = (right, left) if rng.random() < 0.5 else (left, right)
     variant = draw_variant(name, rng=rng)
     count = int(rng.integers(variant["beats"][0], variant["beats"][1] + 1))
-    draws = [
-        draw_meeting(variant, still, moving, count, together=True, rng=rng)
-        for _ in range(variant.get("tries", 1))
+    sketches = [
+        sketch_meeting(variant, count, together=True, rng=rng) for _ in range(variant.get("tries", 1))
     ]
+    draws = [meet([sketch], still, moving) for sketch in sketches]
     meeting = min(draws, key=lambda draw: float(_contact_distance(still, moving, draw, np.zeros(1))[0]))
     course = _course(variant, count, config, rng)
     distance = _contact_distance(still, moving, meeting, course.beats)
@@ -64,29 +65,68 @@ def play_meeting(
 
 
 def draw_poses(
-    right: HandModel, left: HandModel, name: str, count: int, *, rng: np.random.Generator
+    right: HandModel, left: HandModel, counts: Sequence[tuple[str, int]], *, rng: np.random.Generator
 ) -> Passage:
-    """Up to `count` valid single poses of one interaction, with the roles drawn once.
+    """Valid single poses of several interactions, the roles drawn once for each.
 
     Args:
         right: The right hand.
         left: The left hand.
-        name: One of `INTERACTIONS`.
-        count: Number of poses to draw; those that are not valid are left out.
+        counts: Names out of `INTERACTIONS`, each with a number of poses to draw; those that are not valid are
+            left out.
         rng: Source of all randomness.
     """
-    still, moving = (right, left) if rng.random() < 0.5 else (left, right)
+    draws = [_draw(name, count, rng) for name, count in counts]
+    order = np.argsort([draw.left_still for draw in draws], kind="stable")
+    passages, valid = [], []
+    for left_still, still, moving in ((False, right, left), (True, left, right)):
+        drawn = [draws[number] for number in order if draws[number].left_still == left_still]
+        if not drawn:
+            continue
+        meeting = meet([draw.sketch for draw in drawn], still, moving)
+        distance = _contact_distance(still, moving, meeting, np.arange(float(len(meeting.axis))))
+        best = _nearest_tries(drawn, distance)
+        course = _Course(
+            best.astype(float), *(np.concatenate([draw[part] for draw in drawn]) for part in (2, 3))
+        )
+        passages.append(_close_contact(still, moving, meeting, course, distance=distance[best], rate=None))
+        valid.append((distance[best] > NEAREST) & valid_frames(right, left, passages[-1]))
+    sizes = [len(draws[number].lift) for number in order]
+    as_drawn = np.argsort(np.repeat(order, sizes), kind="stable")
+    return join_passages(passages).at(as_drawn[np.concatenate(valid)[as_drawn]])
+
+
+class _Draw(NamedTuple):
+    """Single poses of one interaction, before hands give them their size."""
+
+    left_still: bool
+    """Whether the left hand holds still."""
+    sketch: Sketch
+    """The poses, each tried a few times."""
+    lift: NDArray[np.float64]
+    """Distance of the hands from touching (N,) [m]."""
+    grip: NDArray[np.float64]
+    """Share of their strength with which fingers close (N,)."""
+
+
+def _draw(name: str, count: int, rng: np.random.Generator) -> _Draw:
+    left_still = not rng.random() < 0.5
     variant = draw_variant(name, rng=rng)
-    tries = variant.get("tries", 1)
-    meeting = draw_meeting(variant, still, moving, count * tries, together=False, rng=rng)
-    distance = _contact_distance(still, moving, meeting, np.arange(float(count * tries)))
-    best = tries * np.arange(count) + distance.reshape(count, tries).argmin(axis=1)
+    sketch = sketch_meeting(variant, count * variant.get("tries", 1), together=False, rng=rng)
     lift = np.where(rng.random(count) < _TOUCHING, 0.0, _GAP * rng.random(count))
     grip = np.where(rng.random(count) < _HALF_CLOSED, rng.random(count), 1.0)
-    passage = _close_contact(
-        still, moving, meeting, _Course(best.astype(float), lift, grip), distance=distance[best], rate=None
-    )
-    return passage.at((distance[best] > NEAREST) & valid_frames(right, left, passage))
+    return _Draw(left_still, sketch, lift, grip)
+
+
+def _nearest_tries(draws: Sequence[_Draw], distance: NDArray[np.float64]) -> NDArray[np.int64]:
+    """The beat of each pose's try whose hands come nearest to each other."""
+    best, begin = [], 0
+    for draw in draws:
+        count, beats = len(draw.lift), len(draw.sketch.targets)
+        tries = distance[begin : begin + beats].reshape(count, -1)
+        best.append(begin + tries.shape[1] * np.arange(count) + tries.argmin(axis=1))
+        begin += beats
+    return np.concatenate(best)
 
 
 def _contact_distance(
@@ -98,7 +138,7 @@ def _contact_distance(
         join_qpos(meeting.still.at(beats).opened),
         moving,
         placed_qpos(meeting.moving.at(beats).opened, *meeting.placement(beats)),
-        np.tile(meeting.axis, (len(beats), 1)),
+        meeting.directions(beats),
     )
 
 
@@ -116,7 +156,8 @@ def _close_contact(
         1 if rate is None else 2 * int(window * rate / 2) + 1 for window in (_CONTACT_WINDOW, _FINGER_WINDOW)
     )
     rotation, position = meeting.placement(course.beats)
-    position = position + (smooth_above(distance, contact_window) + course.lift)[:, None] * meeting.axis
+    back = smooth_above(distance, contact_window) + course.lift
+    position = position + back[:, None] * meeting.directions(course.beats)
     fingers = meeting.still.at(course.beats), meeting.moving.at(course.beats)
     still_qpos, moving_qpos = join_qpos(fingers[0].opened), placed_qpos(fingers[1].opened, rotation, position)
     strength = [each.strength * course.grip[:, None] for each in fingers]

@@ -127,9 +127,8 @@ def sample_two_hand_poses(
         batches = rng.multinomial(
             missing + missing // 8 + 2, np.full(2 * len(INTERACTIONS), 0.5 / len(INTERACTIONS))
         )
-        for name, size in zip(2 * INTERACTIONS, batches, strict=True):
-            if size:
-                passages.append(draw_poses(right, left, name, int(size), rng=rng))
+        counts = [(name, int(n)) for name, n in zip(2 * INTERACTIONS, batches, strict=True) if n]
+        passages.append(draw_poses(right, left, counts, rng=rng))
         missing = count - sum(map(len, passages))
         if missing <= 0:
             whole = join_passages(passages)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
@@ -75,15 +76,15 @@ class GraspScene:
         """`T_wrist_object` of a state."""
         return qpos_to_pose(data.qpos[NUM_JOINTS:])
 
-    def distances(self, data: mujoco.MjData) -> NDArray[np.float64]:
-        """Distance [m] of every hand capsule to the object (K,), negative where they overlap."""
+    def distances(self, data: mujoco.MjData, geoms: Sequence[int] | None = None) -> NDArray[np.float64]:
+        """Distance [m] of some of the hand's capsules, or all, to the object (K,), negative inside it."""
         return np.array(
             [
                 min(
                     mujoco.mj_geomDistance(self.mj_model, data, geom, part, _FAR, None)
                     for part in self.object_geoms
                 )
-                for geom in self.hand_geoms
+                for geom in (self.hand_geoms if geoms is None else geoms)
             ]
         )
 

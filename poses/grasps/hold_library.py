@@ -8,11 +8,12 @@ from functools import cache, lru_cache
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
 
+import mujoco
 import numpy as np
 
 from handsim.errors import ArgumentError, choices
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import BONE_NAMES, DIGITS
+from handsim.hand.topology import BONE_NAMES, DIGITS, NUM_JOINTS
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import MIRROR, quaternion_matrix, vector_quaternions
 from poses.grasps.grasp_scene import GraspScene
@@ -73,11 +74,11 @@ def hold_style(model: HandModel, obj: RigidObject, name: str) -> HoldStyle:
         raise ArgumentError(choices(name, holds, noun=f"hold of the {obj.name}"))
     entry = holds[name]
     opened = _angles(gesture(entry["open"]["gesture"]), entry["open"])
-    closed = _angles(opened, entry["closed"])
+    fitted = retarget_angles(model, np.stack([opened, _angles(opened, entry["closed"])]))
     return HoldStyle(
         name=name,
-        open=retarget_angles(model, opened),
-        closed=retarget_angles(model, closed),
+        open=fitted[0],
+        closed=fitted[1],
         strength=np.repeat(entry["strength"], 4),
         palm_up=entry["palm_up"],
         needs=tuple(entry["needs"]),
@@ -177,13 +178,14 @@ def _landmark(
 
 def _slid_to_palm(scene: GraspScene, style: HoldStyle, pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """`T_wrist_object` (4, 4) of the object raised from below until it almost touches the palm."""
-    palm = [scene.mj_model.geom(geom).name.startswith("palm") for geom in scene.hand_geoms]
+    palm = [geom for geom in scene.hand_geoms if scene.mj_model.geom(geom).name.startswith("palm")]
+    data = scene.new_data(style.open, pose)
+    lowest = data.qpos[NUM_JOINTS + 2]
 
     def gap(height: float) -> float:
-        raised = pose.copy()
-        raised[2, 3] += height
-        data = scene.new_data(style.open, raised)
-        return float(scene.distances(data)[palm].min())
+        data.qpos[NUM_JOINTS + 2] = lowest + height
+        mujoco.mj_kinematics(scene.mj_model, data)
+        return float(scene.distances(data, palm).min())
 
     low, high = -_SLIDE, 0.0  # free, too high
     for _ in range(_HALVINGS):

@@ -1,6 +1,6 @@
 """The cameras of pictures: where they stand, and what their lenses do to a picture.
 
 - viewpoints: the cameras of each frame of a take (still, orbit, head, anywhere, rig).
-- own_cameras: cameras from a user's file; opencv_file and colmap_file read what others wrote.
+- own_cameras: a check that the cameras of a user's file look at the hands.
 - warp: pictures through a lens, resampled from pinhole pictures.
 """

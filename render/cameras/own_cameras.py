@@ -1,4 +1,4 @@
-"""Cameras from a user's file, and a check that they look at the hands."""
+"""A check that the cameras of a user's file look at the hands."""
 
 from __future__ import annotations
 
@@ -12,43 +12,12 @@ import numpy as np
 from handsim.errors import HandSimWarning, RigError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera
-from handsim.space.camera_file import read_camera_file
-from render.cameras.colmap_file import CAMERAS, IMAGES, read_colmap_cameras
-from render.cameras.opencv_file import read_opencv_cameras
 from render.shown_take import ShownTake
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_OPENCV: Final = (".yml", ".yaml", ".json")
 _CHUNK: Final = 2048  # frames
-
-
-def load_cameras(path: str | Path) -> tuple[Camera, ...]:
-    """The cameras of a file, by its ending.
-
-    Args:
-        path: A camera or rig file of ours (`.toml`), OpenCV's calibration (`.yml`, `.yaml`, `.json`), or
-            COLMAP's `cameras.txt`, `images.txt` or their folder.
-
-    Returns:
-        Cameras with intrinsics [px], lenses and poses in the world [m].
-
-    Raises:
-        RigError: The file cannot be read, or does not describe cameras; the sentence names it.
-    """
-    path = Path(path)
-    if path.suffix.lower() == ".toml":
-        return read_camera_file(path)
-    if path.suffix.lower() in _OPENCV:
-        return read_opencv_cameras(path)
-    if path.is_dir() or path.name in (CAMERAS, IMAGES):
-        return read_colmap_cameras(path)
-    hint = "; colmap model_converter writes text" if path.suffix == ".bin" else ""
-    raise RigError(
-        f"{path}: unknown kind of camera file, expected .toml, OpenCV's .yml or .json, or COLMAP's {CAMERAS} "
-        f"and {IMAGES}{hint}"
-    )
 
 
 def check_hands_in_view(path: str | Path, cameras: Sequence[Camera], take: ShownTake) -> None:

@@ -17,8 +17,8 @@ from scipy.ndimage import uniform_filter1d
 from handsim.errors import ArgumentError, choices
 from handsim.space.camera import Camera, preset
 from handsim.space.cameras import load_rig, look_at
+from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
-from render.cameras.own_cameras import load_cameras
 from render.shown_take import ShownTake
 
 if TYPE_CHECKING:

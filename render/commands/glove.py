@@ -64,7 +64,7 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
         "", "name", "bone", title=Text(f"{layout.name}: {layout.num_markers} markers"), title_justify="left"
     )
     for column in ("along", "around [deg]", "across", "stalk [mm]"):
-        table.add_column(column, justify="right")
+        table.add_column(Text(column), justify="right")
     for number, marker in enumerate(layout.markers):
         across = f"{marker.across:.2f}" if marker.bone == "palm" else ""
         around = f"{np.rad2deg(marker.around):.0f}"
@@ -114,7 +114,7 @@ def check_glove(
     picture = Path(glove).with_suffix(".png") if out is None else out
     check_outputs([glove], [picture])
     table = Table("size", "nearest two markers", title=Text(f"{layout.name}: {layout.num_markers} markers"))
-    table.add_column("centers apart [mm]", justify="right")
+    table.add_column(Text("centers apart [mm]"), justify="right")
     overlaps = []
     for name in SIZES:
         first, second, distance = nearest_pair(_fitted(layout, name).attachment.points)

@@ -10,9 +10,11 @@ from typing import Annotated, Final, Literal, cast
 import tyro
 from rich.console import Console
 
+from handsim.app.executors.executor import choose_executor
 from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimError, choices
+from handsim.files.object_folder import folder_or_objects
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from render.cameras.viewpoints import ViewConfig
@@ -88,7 +90,7 @@ class RenderOptions:
 def render(
     take: Annotated[Path | None, tyro.conf.Positional] = None,
     *,
-    out: Path,
+    out: Annotated[str, tyro.conf.arg(metavar="PATH")],
     poses: Path | None = None,
     hands: tuple[Side, ...] = ("right",),
     people: int | None = None,
@@ -97,6 +99,7 @@ def render(
     options: Annotated[RenderOptions, tyro.conf.arg(name="")] = RenderOptions(),
     format: tuple[str, ...] = ("webdataset",),
     workers: int | None = None,
+    cluster: str | None = None,
 ) -> None:
     """Draw the hands of a take: colors, depth, normals and ids, with the ground truth of each picture.
 
@@ -105,7 +108,8 @@ def render(
 
     Args:
         take: A tracked take (.npz), or the truth of a simulated one (.truth.npz).
-        out: Folder for the pictures, their annotations and contact_sheet.png.
+        out: Folder for the pictures, their annotations and contact_sheet.png; or a folder of an object store,
+            as s3://bucket/prefix (docs/object_stores.md).
         poses: Poses of your own (.npz) instead of a take; docs/rendering.md has the arrays.
         hands: Whose poses these are, in the file's order: right, left, or both.
         people: Number of people that they are distributed over; one for each shard when not given.
@@ -114,11 +118,16 @@ def render(
         options: What to draw.
         format: File formats: webdataset, coco, freihand, interhand, exr, png; several go into folders.
         workers: Processes; all cores when not given.
+        cluster: Where else to draw shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
+            docs/cluster.md.
     """
     if sum((take is not None, poses is not None, bool(merge))) != 1:
         raise HandSimError("expected a take, --poses or --merge, and one of them alone")
+    place = folder_or_objects(out)
     if merge:
-        count = merge_renderings(merge, out)
+        if not isinstance(place, Path):
+            raise HandSimError(f"--merge copies into a folder, and {place} is none; copy that folder then")
+        count = merge_renderings(merge, place)
         print_line(f"{out}: {count} shards of {len(merge)} renderings")
         return
     if poses is None:
@@ -127,7 +136,7 @@ def render(
         source: Path | PoseFile = cast("Path", take)
     else:
         source = PoseFile(poses, hands, people, glove)
-    check_outputs((take, poses, options.view.cameras), (out,))
+    check_outputs((take, poses, options.view.cameras), (place if isinstance(place, Path) else None,))
     config = options.config()
     start = time.perf_counter()
     if options.photos is not None:
@@ -135,14 +144,14 @@ def render(
     with progress_bar("images") as (bar, task):
         count = render_take(
             source,
-            out,
+            place,
             format,
             config,
-            workers=workers,
+            workers=choose_executor(cluster, workers, place, print_above(bar)),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     seconds = time.perf_counter() - start
-    lost = left_out_frames(out)
+    lost = left_out_frames(place)
     if lost:
         print_line(
             f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a "
@@ -150,7 +159,7 @@ def render(
         )
     print_line(f"{out}: {count} images in {seconds:.0f} s")
     if {"rgb", "depth"} & set(config.passes):
-        print_line(f"{out / SHEET}: some of them at one glance")
+        print_line(f"{place}/{SHEET}: some of them at one glance")
 
 
 def _tone_ranges(tones: tuple[str, ...]) -> tuple[float, ...]:

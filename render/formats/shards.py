@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import re
 import shutil
 import tarfile
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.files.atomic import atomic_write
+from handsim.files.atomic import atomic_write, temporary_beside
 from render.formats.annotations.common import to_json
 
 INDEX: Final = "index.json"
@@ -54,7 +53,7 @@ def one_sentence(folder: Path, doing: str) -> Iterator[None]:
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """A temporary folder beside `path` that replaces it when the block ends without an error."""
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    temporary = temporary_beside(path)
     clear_leftovers(path)
     temporary.mkdir(parents=True)
     try:

@@ -58,7 +58,7 @@ class HandTruth:
     box: Float[np.ndarray, "4"]
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     vertices: Float32[np.ndarray, "V 3"]
-    """Skin in the world [m]."""
+    """`HandModel.skin` in the world [m]; on pictures of bare hands joints shape it further."""
     marker_names: tuple[str, ...] = ()
     markers: Float[np.ndarray, "M 3"] = field(default_factory=lambda: np.empty((0, 3)))
     """Centers of the glove's markers as the pose has them, in the world [m]."""

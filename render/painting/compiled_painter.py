@@ -39,7 +39,7 @@ class _Mesh(NamedTuple):
     texels: NDArray[np.uint8]
     """Empty where there is no texture."""
     finish: NDArray[np.float64]
-    """Color, roughness and glow."""
+    """Color, roughness, glow and scatter."""
 
 
 def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
@@ -75,7 +75,7 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
             vertices[:, 12:] = one.uv
         texels = _NO_TEXELS if material.texels is None else material.texels
         faces = np.ascontiguousarray(triangles.faces, dtype=np.int64)
-        finish = np.array([*material.color, material.roughness, material.glow])
+        finish = np.array([*material.color, material.roughness, material.glow, *material.scatter])
         meshes.append(_Mesh(begin, faces, vertices, texels, finish))
         begin += len(faces)
     return meshes
@@ -121,7 +121,7 @@ def _shade_surface(
         faces: Triangles (F, 3).
         vertices: Rows (V, 14) of `_Mesh.vertices`.
         texels: Texture (h, w, 8), empty for none; see `Material.texels`.
-        finish: Linear color (3), roughness and glow.
+        finish: Linear color (3), roughness, glow and scatter (3).
         lamps: Rows (L, 9) of `_lamp_table`.
         ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
         to_map: `ShadowMap.to_map` (3, 4).
@@ -148,7 +148,7 @@ def _shade_surface(
                     if len(texels):
                         read_texels(texels, to_linear, spot)
                         _apply_normal_map(vertices, faces, face, spot)
-                    shade(spot, finish[4], lamps, ambient, to_map, nearest, bias, light)
+                    shade(spot, finish, lamps, ambient, to_map, nearest, bias, light)
                     share = 4.0 if smooth else 1.0
                     for k in range(3):
                         sums[row, column, k] += share * display(spot[9 + k] * light[k], to_display)

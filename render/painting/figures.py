@@ -88,7 +88,8 @@ class HandFigure:
 
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
         self.fit, self.look = fit, look
-        self._skin = SkinMesh(fit.model, look.forearm)
+        bony = look.skin.relief if look.glove is None else 0.0  # cloth levels it
+        self._skin = SkinMesh(fit.model, look.forearm, bony)
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from render.skin.texture import SkinTexture
 
 MARKER_COLOR: Final = (0.98, 0.98, 1.0)
+_SCATTER: Final = (0.30, 0.13, 0.08)
+"""Of skin: red light travels farthest in it (Jensen et al. 2001: mean free paths of 3.7, 1.4 and 0.7 mm)."""
 _FOLDS: Final = 0.85  # strength of ambient shade; below 1, because lamps light folds in part
 
 
@@ -28,6 +30,9 @@ class Material:
     """From 0 (mirror) to 1 (chalk)."""
     glow: float = 0.0
     """Emitted light, as a share of its color."""
+    scatter: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Light that travels under the surface, for red, green and blue: cosine beyond grazing at which lamps
+    still light it."""
     texels: UInt8[np.ndarray, "H W 8"] | None = None
     """Factors on the above, the top row first: sRGB, roughness (255 for 1), normals over the surface's own
     (0 for -1, 255 for 1) in the axes along u and normal x that, and nothing."""
@@ -54,7 +59,7 @@ def skin_material(texture: SkinTexture) -> Material:
     """Painted skin, for meshes with `DrawnSkin.uv`."""
     nothing = np.zeros_like(texture.roughness)
     texels = np.dstack([texture.color, texture.roughness, texture.normals, nothing])
-    return Material(np.ones(3), 1.0, texels=texels)
+    return Material(np.ones(3), 1.0, scatter=np.array(_SCATTER), texels=texels)
 
 
 def shade_colors(shade: Float32[np.ndarray, "D"]) -> Float32[np.ndarray, "D 4"]:

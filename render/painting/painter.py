@@ -66,10 +66,13 @@ def _window(camera: Camera, drawn: Sequence[Drawn]) -> tuple[int, int, int, int]
     if not drawn:
         return 0, 0, 0, 0
     local = camera.local(np.concatenate([one.triangles.vertices for one in drawn]))
-    if local[:, 2].min() < NEAR:
+    x, y, depth = np.ascontiguousarray(local.T)  # rows, whose extremes are found ten times as fast
+    if depth.min() < NEAR:
         return 0, 0, width, height
-    pixels = local[:, :2] / local[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-    low, high = np.floor(pixels.min(axis=0) - 1.0), np.ceil(pixels.max(axis=0) + 1.0)
+    pixels = np.stack(
+        [x / depth * camera.K[0, 0] + camera.K[0, 2], y / depth * camera.K[1, 1] + camera.K[1, 2]]
+    )
+    low, high = np.floor(pixels.min(axis=1) - 1.0), np.ceil(pixels.max(axis=1) + 1.0)
     left, top = (np.clip(low, 0, camera.size) // _STEP * _STEP).astype(int)
     right, bottom = np.minimum(np.ceil(np.clip(high, 0, camera.size) / _STEP) * _STEP, camera.size).astype(
         int

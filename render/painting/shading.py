@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 GAMMA: Final = 2.2
 _FACING: Final = 0.04  # specular reflectance of dielectrics at normal incidence
 _LIFT: Final = 1.7  # offset of shadow look-ups from slanted surfaces, against self-shadowing [bias]
+_UNDER: Final = 0.012  # depth that scattered light passes at a scatter of 1 [m]
 _LEVELS: Final = 2048
 _BYTES = np.arange(256) / 255.0
 TO_LINEAR: Final = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
@@ -77,7 +78,7 @@ def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float64], spot: NDA
 @numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def shade(
     spot: NDArray[np.float64],
-    glow: float,
+    finish: NDArray[np.float64],
     lamps: NDArray[np.float64],
     ambient: NDArray[np.float64],
     to_map: NDArray[np.float64],
@@ -89,7 +90,7 @@ def shade(
 
     Args:
         spot: See `SPOT`.
-        glow: See `Material.glow`.
+        finish: Linear color (3), roughness, glow, scatter (3); see `Material`.
         lamps: Rows (L, 9): unit vector to the lamp, its light with shadows, and its light without.
         ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
         to_map: `ShadowMap.to_map` (3, 4) of the first lamp.
@@ -103,16 +104,15 @@ def shade(
     facing = min(max(abs(nx * vx + ny * vy + nz * vz), 0.001), 1.0)
     rough = max(spot[17], 0.04)
     square, k = rough**4, (rough + 1.0) ** 2 / 8.0
-    red, green, blue = spot[14], spot[15], spot[16]
     for i in range(3):
         around = ambient[0, i] + nx * ambient[1, i] + ny * ambient[2, i] + nz * ambient[3, i]
         around += nx * ny * ambient[4, i] + ny * nz * ambient[5, i] + nx * nz * ambient[6, i]
         around += (nx * nx - ny * ny) * ambient[7, i] + (3.0 * nz * nz - 1.0) * ambient[8, i]
-        light[i] = spot[14 + i] * (max(around, 0.0) + glow)
+        light[i] = spot[14 + i] * (max(around, 0.0) + finish[4])
     for lamp in range(len(lamps)):
         lx, ly, lz = lamps[lamp, 0], lamps[lamp, 1], lamps[lamp, 2]
         cosine = nx * lx + ny * ly + nz * lz
-        if cosine <= 0.0:
+        if cosine <= -finish[5]:
             continue
         hx, hy, hz = lx + vx, ly + vy, lz + vz
         length = np.sqrt(max(hx * hx + hy * hy + hz * hz, 1e-12))
@@ -120,13 +120,20 @@ def shade(
         grazing = 1.0 - 0.5 * length  # the half vector's length is twice its cosine with either
         fresnel = _FACING + (1.0 - _FACING) * grazing**5
         peak = half * half * (square - 1.0) + 1.0
-        occlusion = 4.0 * (facing * (1.0 - k) + k) * (cosine * (1.0 - k) + k)
-        mirrored = cosine * fresnel * square / (np.pi * peak * peak * occlusion)
-        scattered = cosine * (1.0 - fresnel) * (1.0 - _FACING) / np.pi
+        occlusion = 4.0 * (facing * (1.0 - k) + k) * (max(cosine, 0.0) * (1.0 - k) + k)
+        mirrored = 0.0
+        if cosine > 0.0:
+            mirrored = cosine * fresnel * square / (np.pi * peak * peak * occlusion)
         lit = 1.0
         if lamp == 0:
             lift = _LIFT * bias * np.sqrt(1.0 - min(cosine, 1.0) ** 2)
-            lit = lit_share(to_map, nearest, bias, px + lift * nx, py + lift * ny, pz + lift * nz)
-        light[0] += (scattered * red + mirrored) * (lit * lamps[lamp, 3] + lamps[lamp, 6])
-        light[1] += (scattered * green + mirrored) * (lit * lamps[lamp, 4] + lamps[lamp, 7])
-        light[2] += (scattered * blue + mirrored) * (lit * lamps[lamp, 5] + lamps[lamp, 8])
+            # Light under the surface passes what is this thick before it.
+            under = finish[5] * _UNDER * (1.0 - cosine)
+            x, y, z = px + lift * nx + under * lx, py + lift * ny + under * ly, pz + lift * nz + under * lz
+            lit = lit_share(to_map, nearest, bias, x, y, z)
+        for i in range(3):
+            # The cosine, wrapped around the edge of the light.
+            wrapped = max((cosine + finish[5 + i]) / (1.0 + finish[5 + i]), 0.0)
+            scattered = wrapped * (1.0 - fresnel) * (1.0 - _FACING) / np.pi
+            arriving = lit * lamps[lamp, 3 + i] + lamps[lamp, 6 + i]
+            light[i] += (scattered * spot[14 + i] + mirrored) * arriving

@@ -44,7 +44,8 @@ def shadow_map(
     aside /= np.linalg.norm(aside)
     rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
     rotated = points @ rotation.T
-    low, high = rotated[:, :2].min(axis=0), rotated[:, :2].max(axis=0)
+    aside_and_down = np.ascontiguousarray(rotated[:, :2].T)
+    low, high = aside_and_down.min(axis=1), aside_and_down.max(axis=1)
     scale = (_TEXELS - 2.0 * _MARGIN) / max(float((high - low).max()), 1e-6)
     to_map = np.column_stack([rotation, np.zeros(3)])
     to_map[:2] *= scale

@@ -2,6 +2,7 @@
 
 - forearm: the arm behind the wrist.
 - atlas: connectivity and texture coordinates of the mesh, the same for every hand.
+- flexion: what joints make of the skin around them.
 - mesh: the posed mesh with normals, ambient shade and parts.
 - fields: smooth functions that textures are painted with.
 - texels: the anatomy at each texel.

@@ -24,7 +24,7 @@ TILE: Final = 16
 COLUMNS: Final = 20
 ARM_ROWS: Final = 48
 """Texels along the forearm."""
-RINGS: Final = 14
+RINGS: Final = 20
 """Rings of the forearm beyond the wrist's."""
 _LEVELS: Final = 2
 _SIDE: Final = 2**_LEVELS  # faces of the skin along a tile

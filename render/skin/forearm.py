@@ -2,7 +2,8 @@
 
 Girths are shares of the hand's breadth: ANSUR II (2012) has wrists of 176 and 154 mm and flexed forearms of
 309 and 263 mm around for hands of 88.3 and 78.2 mm (men's and women's means); a forearm at rest is about a
-tenth thinner.
+tenth thinner. Elbows, 1.4 hand lengths behind the wrist, are a little thinner, and upper arms thicker again
+(flexed biceps 358 and 305 mm, about a tenth less at rest).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from handsim.errors import HandSimError
 from handsim.hand.shape import HandShape
@@ -23,10 +25,11 @@ if TYPE_CHECKING:
 
 FOREARM: Final = NUM_BONES
 """Number of the forearm among a hand's parts, after those of its bones (`topology.BONES`)."""
-_LONGEST: Final = 0.5  # [m]
-_WRIST_GIRTH: Final = 1.92  # [hand breadths]
-_ARM_GIRTH: Final = 3.0
-_WIDEST: Final = 1.05  # position of the largest girth behind the wrist [hand lengths]
+_LONGEST: Final = 1.0  # [m]
+_PLACES: Final = (0.0, 0.28, 0.62, 1.0, 1.42, 1.9, 2.6, 6.0)
+"""Places behind the wrist [hand lengths]; the fifth is the elbow."""
+_GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
+"""Girths there [hand breadths]."""
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
 _BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
 
@@ -62,9 +65,9 @@ class Forearm:
 def sample_forearm(*, rng: np.random.Generator) -> Forearm:
     """A random forearm: wrists within half their range, a sleeve on one in three.
 
-    It is straight and longer than an arm is to the elbow, so that it extends beyond the picture.
+    The arm is straight and reaches beyond the elbow, so that it extends beyond most pictures.
     """
-    length = rng.uniform(0.38, 0.48)
+    length = rng.uniform(0.62, 0.75)
     flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
     girth = float(np.exp(np.clip(rng.normal(0.0, 0.06), -0.15, 0.15)))
     sleeve = rng.uniform(0.035, 0.12) if rng.random() < 1 / 3 else 1.0
@@ -96,7 +99,7 @@ def forearm_rings(
     section = (right - center)[:, 1:]
     lean = right[:, 0] - center[0]  # the wrist's ring is not quite planar
     # Rings lie closer together near the wrist, where all the bending is.
-    behind = forearm.length * np.linspace(0.0, 1.0, rings + 1)[1:] ** 1.35
+    behind = forearm.length * np.linspace(0.0, 1.0, rings + 1)[1:] ** 1.7
     width, depth = _half_axes(shape, forearm, behind)
     extent = np.abs(section).max(axis=0)
     angle = np.arctan2(section[:, 1] / extent[1], section[:, 0] / extent[0])
@@ -113,9 +116,8 @@ def _half_axes(
     shape: HandShape, forearm: Forearm, behind: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Half width and half depth of the arm's sections [m]: flat at the wrist, rounder and thicker behind."""
-    share = _smooth(np.clip(behind / (_WIDEST * shape.length), 0.0, 1.0)) ** 0.9
-    girth = forearm.girth * shape.breadth * (_WRIST_GIRTH + (_ARM_GIRTH - _WRIST_GIRTH) * share)
-    flatness = 0.70 + 0.18 * share
+    girth = forearm.girth * shape.breadth * PchipInterpolator(_PLACES, _GIRTHS)(behind / shape.length)
+    flatness = 0.70 + 0.18 * _smooth(behind / shape.length)
     # Ramanujan's ellipse: its girth over its half width
     h = ((1.0 - flatness) / (1.0 + flatness)) ** 2
     around = np.pi * (1.0 + flatness) * (1.0 + 3.0 * h / (10.0 + np.sqrt(4.0 - 3.0 * h)))

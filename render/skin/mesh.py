@@ -18,6 +18,7 @@ from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import NUM_BONES, PALM
 from render.skin.atlas import RINGS, skin_atlas
+from render.skin.flexion import Flexion
 from render.skin.forearm import FOREARM, Forearm, forearm_rings
 
 if TYPE_CHECKING:
@@ -51,9 +52,11 @@ class SkinMesh:
     Args:
         model: The hand.
         forearm: The forearm behind it.
+        bony: Factor on what joints make of the skin around them, see `render.skin.flexion`; 0 for the hand
+            model's own surface.
     """
 
-    def __init__(self, model: HandModel, forearm: Forearm | None = None) -> None:
+    def __init__(self, model: HandModel, forearm: Forearm | None = None, bony: float = 0.0) -> None:
         self.model = model
         self.forearm = Forearm() if forearm is None else forearm
         atlas, surface = skin_atlas(), model.surface
@@ -72,6 +75,7 @@ class SkinMesh:
         self._corner_faces = np.ascontiguousarray(
             atlas.corner_faces[:, ::-1] if mirrored else atlas.corner_faces
         )
+        self._flexion = Flexion(model, self.rest, vertex_normals(self.rest, self.faces), bony)
         self._rest_occluded = self._rest_occlusion(model.rest_transforms[None], self.rest, self.faces)
 
     def posed(self, qpos: Float[np.ndarray, "27"]) -> DrawnSkin:
@@ -82,7 +86,7 @@ class SkinMesh:
         """
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
-        points = self.merged(transforms)
+        points = self.merged(transforms, self._flexion.shaped(self.rest, qpos[7:]))
         normals = vertex_normals(points, self.faces)
         occluded = self._occluded(transforms, points, normals)
         shade = np.clip(1.0 - np.maximum(occluded - self._rest_occluded, 0.0), _DARKEST, 1.0)
@@ -96,10 +100,13 @@ class SkinMesh:
             face_parts(),
         )
 
-    def merged(self, transforms: Float[np.ndarray, "1 L 4 4"]) -> Float[np.ndarray, "U 3"]:
-        """Posed vertices of `rest` in the frame of the bones' transforms [m]."""
+    def merged(
+        self, transforms: Float[np.ndarray, "1 L 4 4"], rest: Float[np.ndarray, "U 3"] | None = None
+    ) -> Float[np.ndarray, "U 3"]:
+        """Posed vertices of `rest`, or of its changed form, in the frame of the bones' transforms [m]."""
+        still = self.rest if rest is None else rest
         points: NDArray[np.float64] = skin_frames(
-            self.rest, self._bones, self._weights, self.model.rest_transforms, transforms
+            still, self._bones, self._weights, self.model.rest_transforms, transforms
         )[0]
         return points
 

@@ -21,7 +21,7 @@ from render.skin.mesh import SkinMesh
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-REFERENCE: Final = Forearm()
+REFERENCE: Final = Forearm(length=0.5)
 """The forearm whose texels are painted; a longer one is stretched."""
 
 
@@ -53,6 +53,8 @@ class Texels(NamedTuple):
     """From -1 in the middle of the palm or of a finger's pad to 1 on the back (N,)."""
     back: NDArray[np.float64]
     """1 on the back of the hand, 0 on the palm, smooth between (N,)."""
+    facing: NDArray[np.float64]
+    """From -1 to 1 likewise, before that: how far the skin faces the way of the back (N,)."""
     palm: NDArray[np.float64]
     """Share of the skin that moves with the palm and no digit (N,)."""
     digits: tuple[DigitTexels, ...]
@@ -78,8 +80,8 @@ def skin_texels() -> Texels:
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     digits = tuple(_digit_texels(model, digit, positions, weights) for digit in range(len(DIGITS)))
     # The thumb's back faces sideways, but the part of it on the hand's back does not have the palm's skin.
-    back = smooth(np.maximum(dorsal, normals[:, 2]), -0.25, 0.35)
-    return Texels(positions, normals, dorsal, back, weights[:, 0], digits)
+    facing = np.maximum(dorsal, normals[:, 2])
+    return Texels(positions, normals, dorsal, smooth(facing, -0.25, 0.35), facing, weights[:, 0], digits)
 
 
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -63,17 +63,21 @@ def _painted(
     """Color, roughness and height of the relief."""
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     back = texels.back
+    # Pigment fades over the sides of fingers and hand, unevenly; relief ends sooner.
+    edge = 0.10 * noise(texels.positions, (0.02, 0.006), rng=rng)
+    pigment = smooth(texels.facing + edge, -0.8, 0.55)
     lab = np.empty((len(back), 3))
-    lab[:, 0] = look.palm_lightness + back * (look.lightness - look.palm_lightness)
+    lab[:, 0] = look.palm_lightness + pigment * (look.lightness - look.palm_lightness)
     # The palm of a dark hand is not redder or yellower than other palms: chroma depends on the pigment.
-    lab[:, 1] = 15.0 + back * (look.redness - 15.0)
-    lab[:, 2] = 16.0 + back * (look.yellowness - 16.0)
+    lab[:, 1] = 15.0 + pigment * (look.redness - 15.0)
+    lab[:, 2] = 16.0 + pigment * (look.yellowness - 16.0)
     _flush(lab, look)
     veins = _veins(rng)
     lab += look.veins * veins[:, None] * [-1.6, -1.6, -2.2]
     blotches = noise(texels.positions, (0.05, 0.018, 0.007, 0.003), rng=rng)
     lab += look.blotches * blotches[:, None] * [1.0, -0.6, 0.2]
-    lines = np.clip(line_depth(rng), 0.0, 1.0)
+    weight = 0.8 + 0.3 * noise(texels.positions, (0.014, 0.005), rng=rng)
+    lines = np.clip(line_depth(rng) * np.clip(weight, 0.2, 1.2), 0.0, 1.0)
     # Pigment collects in the lines; their darkness depends on the contrast that the skin allows.
     lab += look.creases * lines[:, None] * [-9.5, 4.0, 0.5]
     height = look.relief * relief() - 0.0004 * look.creases * lines + 0.00008 * look.veins * veins

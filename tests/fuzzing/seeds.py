@@ -109,6 +109,14 @@ def rig(folder: Path) -> list[Path]:
     return [folder / "rig.toml"]
 
 
+def sweep(folder: Path) -> list[Path]:
+    lists = 'gloves = ["dense19", "sparse13"]\nrigs = ["figure5"]\npeople = [0, 1]\nseeds = [3]\n'
+    tables = "[generate]\nnum_frames = 100\n[train]\nnetwork.width = 16\n[track]\nusers = 'calibrated'\n"
+    varied = '[vary]\n"train.rig_share" = [0, 0.5]\n"simulate.hands" = [["right"], ["left"]]\n'
+    (folder / "sweep.toml").write_text(lists + tables + varied)
+    return [folder / "sweep.toml"]
+
+
 def camera_files(folder: Path) -> list[Path]:
     top = 'name = "desk"\n[[camera]]\nname = "left"\nsize = [640, 480]\nfocal = [600.0, 601.0]\n'
     lens = 'lens = "brown"\ncoefficients = [0.1, -0.05, 0.001, 0.0, 0.0]\n'
@@ -125,6 +133,13 @@ def camera_files(folder: Path) -> list[Path]:
     (folder / "images.txt").write_text("1 1 0 0 0 0.1 0.2 0.3 1 one.jpg\n\n2 0 1 0 0 0 0 1 1 two.jpg\n\n")
     names = ("desk.toml", "stereo.yml", "stereo.json", "cameras.txt", "images.txt")
     return [folder / name for name in names]
+
+
+def calibrations(folder: Path) -> list[Path]:
+    """Of camera systems: Vicon's, Qualisys', Motive's, and OpenCV's of many cameras."""
+    from tests.handsim.space.rig_formats.known_rig import written
+
+    return list(written(folder).values())
 
 
 def own_poses(folder: Path) -> list[Path]:
@@ -213,6 +228,12 @@ def user(folder: Path) -> list[Path]:
 def settings(folder: Path) -> list[Path]:
     (folder / "config.json").write_text(json.dumps(SETTINGS))
     return [folder / "config.json"]
+
+
+def receipt(folder: Path) -> list[Path]:
+    files = {f"rows-{number:05d}.npy": {"bytes": 5 * number, "sha256": "ab" * 32} for number in range(3)}
+    (folder / "00000.json").write_text(json.dumps({"files": files}))
+    return [folder / "00000.json"]
 
 
 def packets(folder: Path) -> list[Path]:

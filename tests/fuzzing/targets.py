@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,11 +18,13 @@ from gloves.layout import load_layout
 from gloves.takes.corrections import load_corrections
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import load_tracked_take
-from handsim.errors import HandSimError
+from handsim.app.executors.output import load_receipt
+from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
 from handsim.space.cameras import load_rig
 from handsim.space.objects import load_object
-from render.cameras.own_cameras import load_cameras
+from handsim.space.rig_formats.any_file import load_cameras, load_lab_cameras
+from handsim.space.rig_formats.rig_of_cameras import marker_cameras, rig_of_cameras
 from render.own_poses import PoseFile, load_poses
 from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
@@ -30,6 +33,8 @@ from tests.fuzzing.mutations import mutate_archive
 from track.benchmark.manifest import label_names, load_benchmark
 from track.benchmark.results import read_result
 from track.bodies.body_file import load_body
+from track.evaluation.sweep.cells import cells_of
+from track.evaluation.sweep.sweep_file import load_sweep
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
 
@@ -102,6 +107,16 @@ def _read_checkpoint(path: Path) -> None:
     state(path.parent).restore(path)
 
 
+def _read_calibration(path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", HandSimWarning)
+        rig_of_cameras(path, marker_cameras(path, load_lab_cameras(path)))
+
+
+def _read_sweep(path: Path) -> None:
+    cells_of(load_sweep(path))
+
+
 def _read_result(path: Path) -> None:
     read_result(path, seeds.benchmark_capture(), label_names())
 
@@ -113,7 +128,9 @@ _ALL: Final = (
     Target("tsv", seeds.tsv, read_capture),
     Target("layout", seeds.layout, load_layout),
     Target("rig", seeds.rig, load_rig),
+    Target("sweep", seeds.sweep, _read_sweep),
     Target("cameras", seeds.camera_files, load_cameras),
+    Target("calibrations", seeds.calibrations, _read_calibration),
     Target("poses", seeds.own_poses, lambda path: load_poses(PoseFile(path)), mutate_archive),
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
@@ -130,6 +147,7 @@ _ALL: Final = (
     Target("dataset", seeds.dataset, _read_dataset),
     Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_archive),
     Target("settings", seeds.settings, _read_settings),
+    Target("receipt", seeds.receipt, load_receipt),
     Target("packet", seeds.packets, _read_packet, refusals=(DamagedPacket,)),
     Target("photo", seeds.photos, _read_photo),
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import row_dtype
-from train.loop import start_fabric
+from train.devices.fabric_start import start_fabric
 from train.training_state import TrainingState
 
 

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gloves.attachment import _crossings, _ray, attach_markers, vary_layout
+from gloves.attachment import _ray, attach_markers, vary_layout
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import LayoutError
 from handsim.hand.mjcf import build_spec
@@ -58,11 +58,12 @@ def test_markers_stand_where_a_ray_through_every_triangle_leaves_the_skin(side, 
     edges1, edges2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     for number, marker in enumerate(layout.markers):
         origin, direction = _ray(marker, model)
-        everywhere = np.broadcast_to(direction, edges1.shape)
-        _, distance, outwards = _crossings(
-            np.broadcast_to(origin, edges1.shape), everywhere, corners[:, 0], edges1, edges2
-        )
-        exit_point = origin + distance[outwards].min() * direction
+        ahead = np.broadcast_to(-direction, edges1.shape)
+        systems = np.stack([edges1, edges2, ahead], axis=-1)
+        u, v, distance = np.linalg.solve(systems, (origin - corners[:, 0])[..., None])[..., 0].T
+        outwards = np.cross(edges1, edges2) @ direction > 0.0
+        met = outwards & (np.minimum(u, v) >= 0.0) & (u + v <= 1.0) & (distance > 0.0)
+        exit_point = origin + distance[met].min() * direction
         below = attachment.points[number] - layout.radius * attachment.normals[number]
         np.testing.assert_allclose(below, exit_point, atol=1e-12)
 

@@ -8,7 +8,6 @@ import numba
 import numpy as np
 
 from track.kinematics.marker_kinematics import (
-    FAST,
     HandArrays,
     Workspace,
     compute_digit,
@@ -27,7 +26,7 @@ _LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2  # [1/rad^2] of a hinge beyond i
 _ROBUST_SQUARE: Final = 20.0  # squared standard deviations of the prior at which its loss levels off
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def fit_hypothesis(
     hand: HandArrays,
     digit: int,
@@ -114,7 +113,7 @@ def fit_hypothesis(
     return cost, 0.5 * (_log_determinant(normal) - _log_determinant(precision))
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _accumulate_normal_equations(
     hand: HandArrays,
     digit: int,
@@ -177,7 +176,7 @@ def _accumulate_normal_equations(
     return cost  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _log_determinant(matrix: Float[np.ndarray, "4 4"]) -> float:
     """Log determinant of a positive-definite matrix, by elimination."""
     factor, total = matrix.copy(), 0.0

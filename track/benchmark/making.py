@@ -17,8 +17,8 @@ from gloves.captures.markers import UNLABELED
 from gloves.fit import GloveFit
 from gloves.layout import load_layout, save_layout
 from gloves.takes.take import Take
+from handsim.app.executors.executor import Executor, executor_of
 from handsim.app.interrupts import Stopped
-from handsim.app.workers import check_workers, in_processes
 from handsim.files.atomic import atomic_write, remove_leftovers
 from handsim.files.disk import check_free
 from handsim.files.json_files import claim
@@ -58,27 +58,27 @@ _HAND_DECIMALS: Final = 9  # of hands and gloves [m]
 
 
 def make_benchmark(
-    plan: Plan, out: Path, *, workers: int | None = None, progress: Progress | None = None
+    plan: Plan, out: Path, *, workers: int | Executor | None = None, progress: Progress | None = None
 ) -> Benchmark:
     """Make a benchmark, or finish a stopped one; the bytes depend on the plan alone.
 
     Args:
         plan: Which captures.
         out: Folder to make it in.
-        workers: Processes; all cores when not given.
+        workers: Processes, all cores when not given; or who else makes the captures.
         progress: Called after every capture.
 
     Raises:
         BenchmarkError: `out` holds something else, or its disk is too small.
     """
-    processes, captures = check_workers(workers), plan.captures
+    executor, captures = executor_of(workers), plan.captures
     total = sum(one.num_frames for one in captures)
     check_free(out, _BYTES_PER_FRAME * total, f"{total} frames", "ask for --size small", error=BenchmarkError)
     claim(out / PLAN, _settings(plan), noun="benchmark", error=BenchmarkError, result=out / MANIFEST)
     todo = [number for number, one in enumerate(captures) if not _finished(out, one)]
     done = total - sum(captures[number].num_frames for number in todo)
     try:
-        for number in in_processes(functools.partial(make_capture, plan, out), todo, processes):
+        for number in executor.run(functools.partial(make_capture, plan, out), todo):
             done += captures[number].num_frames
             if progress is not None:
                 progress(done, total)

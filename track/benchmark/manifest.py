@@ -18,12 +18,12 @@ from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim._version import __version__
 from handsim.errors import DatasetError
+from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.hand.keypoints import KEYPOINT_NAMES
 from track.benchmark.answers import SIDES, Answers, BenchmarkError, load_answers
 from track.benchmark.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan
 from track.user import load_user
-from train.data.shards import checksum
 from train.simulation.motion import RATE
 
 MANIFEST: Final = "manifest.json"

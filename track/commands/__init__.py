@@ -12,5 +12,6 @@
 `glove_advice`: `handsim glove score` and `improve`, advice on a layout.
 `reproduce`: `handsim reproduce`, the paper's tables.
 `benchmark`: `handsim benchmark`, the public benchmark.
+`sweep`: `handsim sweep`, gloves x rigs x people x seeds.
 `demo`: the step of `handsim demo` that tracks.
 """

@@ -9,8 +9,9 @@ from typing import Annotated, Final, Literal
 import tyro
 from rich.console import Console
 
+from handsim.app.executors.executor import choose_executor
 from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimWarning
 from handsim.files.disk import shown_bytes
 from handsim.files.json_files import save_json
@@ -25,19 +26,26 @@ from track.benchmark.scoring import score_results
 _MOST_SHOWN: Final = 3  # files that differ
 
 
-def make(out: Path, size: Literal["small", "full"] = "small", workers: int | None = None) -> None:
+def make(
+    out: Path,
+    size: Literal["small", "full"] = "small",
+    workers: int | None = None,
+    cluster: str | None = None,
+) -> None:
     """Make the captures of the public benchmark and their truth; run it again to continue where it stopped.
 
     Args:
         out: Folder for captures, truth, data card and manifest.
         size: Which benchmark; results name it.
         workers: Processes; all cores when not given.
+        cluster: Where else to simulate captures: tcp://host:port of a Dask scheduler, its file (.json), or
+            local; docs/cluster.md.
     """
     with progress_bar("frames") as (bar, task):
         benchmark = make_benchmark(
             SIZES[size],
             out,
-            workers=workers,
+            workers=choose_executor(cluster, workers, out, print_above(bar)),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     frames = sum(one.num_frames for one in benchmark.captures)

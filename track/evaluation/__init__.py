@@ -6,5 +6,6 @@
 `paper`: the tracking results of Han et al. 2018.
 `tables`: tables of results beside the paper's.
 `hand_errors`: errors of a calibrated hand.
+`sweep`: gloves x rigs x people x seeds as one job.
 `take_summary`: summary of a tracked take as text.
 """

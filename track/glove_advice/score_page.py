@@ -43,7 +43,9 @@ def write_score_page(path: Path, score: LayoutScore, *, seen_by: str, trained: b
         _joints_section(score),
     ]
     network = (
-        "a labeler trained on it" if trained else "the network for any layout, without training on this one"
+        "a labeler trained on it"
+        if trained
+        else "the network for any layout, after a minute of learning this one"
     )
     lead = (
         f"{layout.num_markers} markers of {1e3 * layout.radius:.1f} mm, on {frames:,} frames of {seen_by}. "

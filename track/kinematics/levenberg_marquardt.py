@@ -14,7 +14,6 @@ import numpy as np
 from handsim.hand.topology import NUM_JOINTS
 from handsim.kernels.rotations import rotate_quaternion
 from track.kinematics.marker_kinematics import (
-    FAST,
     NUM_UNKNOWNS,
     HandArrays,
     Workspace,
@@ -34,7 +33,7 @@ _LEAST_DAMPING: Final = 1e-10  # share of the diagonal; keeps the factor positiv
 _MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from there on
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def levenberg_marquardt(
     hand: HandArrays,
     target: Float[np.ndarray, "M 3"],
@@ -91,7 +90,7 @@ def levenberg_marquardt(
     return cost, steps
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def marker_residuals(
     hand: HandArrays, target: Float[np.ndarray, "M 3"], qpos: Float[np.ndarray, "27"], work: Workspace
 ) -> None:
@@ -119,7 +118,7 @@ def marker_residuals(
         residual[2] = position[2] - c - 2.0 * (w * k + i * y - j * x)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _cost(
     hand: HandArrays,
     target: Float[np.ndarray, "M 3"],
@@ -149,7 +148,7 @@ def _cost(
     return cost
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _linearize(
     hand: HandArrays,
     qpos: Float[np.ndarray, "27"],
@@ -183,7 +182,7 @@ def _linearize(
             work.normal[unknown, unknown] += precision[unknown]
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
     """Solve the damped normal equations by a skyline Cholesky factor; `factor` and `step` are filled.
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
 """Unknowns of a step: 20 hinges, 3 translations and 3 rotations of the wrist."""
-FAST: Final = {"contract", "reassoc", "nsz"}
-"""Fast-math flags that let LLVM vectorize sums; NaN keeps its meaning, because it marks missing markers."""
 _TRANSLATION: Final = NUM_JOINTS  # index of the first unknown of the wrist's translation
 _ROTATION: Final = NUM_JOINTS + 3  # index of the first unknown of its rotation
 
@@ -138,7 +136,7 @@ def workspace(num_markers: int) -> Workspace:
     )
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Workspace) -> None:
     """Forward kinematics of all bones, hinge axes and markers, in the wrist's frame.
 
@@ -153,7 +151,7 @@ def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Wor
         compute_marker(hand, marker, work)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], work: Workspace) -> None:
     """Forward kinematics of the bones and hinge axes of one digit, in the wrist's frame.
 
@@ -179,7 +177,7 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
             _rotate_bone(own, hand.axes[hinge], angles[number], work.axes[hinge])
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
     """Position of one marker in the wrist's frame [m].
 
@@ -201,7 +199,7 @@ def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
             work.markers[marker, i] += term
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _rotate_bone(
     own: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float, outside: Float[np.ndarray, "3"]
 ) -> None:
@@ -225,7 +223,7 @@ def _rotate_bone(
         own[i, 2] = c * cosine + along * z + (a * y - b * x) * sine
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
     """Derivatives of one marker by all unknowns, in the wrist's frame.
 
@@ -259,7 +257,7 @@ def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
     jacobian[0, _ROTATION + 2], jacobian[1, _ROTATION + 2] = -y, x
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def accumulate_normal_equations(hand: HandArrays, weights: Float[np.ndarray, "M"], work: Workspace) -> None:
     """Normal matrix and half gradient of the sum of the markers' weighted squared residuals.
 

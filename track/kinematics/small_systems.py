@@ -7,13 +7,11 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from track.kinematics.marker_kinematics import FAST
-
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
     """Overwrite a symmetric positive-definite matrix by its inverse; only its lower triangle is read."""
     count = len(matrix)
@@ -40,7 +38,7 @@ def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
             matrix[column, row] = entry
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def eliminate(
     matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
 ) -> None:
@@ -64,7 +62,7 @@ def eliminate(
                 right_side[row] -= share * right_side[pivot]
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def solve_positive(matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"]) -> None:
     """Solve a symmetric positive-definite system; both are overwritten, the right side by the solution."""
     count = len(matrix)

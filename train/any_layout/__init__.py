@@ -5,6 +5,5 @@
 - layout_labeler: the labeler around the network, for one layout; the shipped weights.
 - fine_tuning: a minute of training of that network on one layout.
 - skin_bank: many places on the skin in many poses, of which random layouts are made.
-- random_layouts: layouts out of such places, scattered ones and regular ones.
 - layout_training: how the shipped weights were trained.
 """

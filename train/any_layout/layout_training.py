@@ -18,16 +18,16 @@ import numpy as np
 import torch
 
 from handsim.files.atomic import atomic_write
+from handsim.hand.topology import PALM
 from train.any_layout.layout_labeler import save_layout_network
 from train.any_layout.layout_network import LayoutNetwork, LayoutNetworkConfig, distance_features, layout_loss
-from train.any_layout.random_layouts import RandomLayouts
 from train.any_layout.skin_bank import SkinBank, sample_skin_bank
 from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.batches import stretched
 from train.threads import torch_threads
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
+    from jaxtyping import Float, Int
 
 PLACES, PEOPLE = 480, 1600
 _LAYOUTS, _CLOUDS = 8, 24  # of a batch; clouds of each layout
@@ -35,6 +35,7 @@ _MARKERS: Final = (5, 31)  # of a layout: least, and one more than most
 _PEAK_RATE, _WARM_UP = 2e-3, 200  # learning rate; steps until it is reached
 _STRETCH: Final = 0.03  # anisotropy of a hand
 _JITTER: Final = 0.0015  # of a batch, at most [m]
+_GAP: Final = (0.006, 0.014)  # least distance of two markers [m]
 _HIDDEN: Final = 0.3  # share of batches in which neighbors are lost together
 _HIDDEN_RADIUS: Final = 0.05  # [m]
 _LEAST_SEEN: Final = 4  # markers
@@ -53,14 +54,15 @@ class LayoutBatches:
 
     def __init__(self, bank: SkinBank, rng: np.random.Generator) -> None:
         self._bank, self._rng = bank, rng
-        self._layouts = RandomLayouts(bank.places, bank.mean_distances())
+        self._spacing = bank.mean_distances()
         self._features = _mean_features(bank)
+        self._bones = bank.bones
 
     def draw(self) -> tuple[Cloud, Float[np.ndarray, "G M M K"]]:
         """Clouds [m] of some layouts with equally many markers, and what is known of each layout."""
         rng = self._rng
         count = int(rng.integers(*_MARKERS))
-        layouts = [self._layouts.draw(count, rng) for _ in range(_LAYOUTS)]
+        layouts = [self._layout(count) for _ in range(_LAYOUTS)]
         frames = rng.integers(len(self._bank.positions), size=(_LAYOUTS, _CLOUDS))
         markers = np.concatenate(
             [
@@ -75,6 +77,21 @@ class LayoutBatches:
         ghosts = (0, 2, 2, 3)[int(rng.integers(4))]
         cloud = corrupt(markers, Corruption(occlude, ghosts, _JITTER * rng.uniform()), rng=rng)
         return cloud, np.array([self._features[np.ix_(layout, layout)] for layout in layouts], np.float32)
+
+    def _layout(self, count: int) -> Int[np.ndarray, "M"]:
+        """Places of a random layout, evenly or unevenly over the bones, and not too near to each other."""
+        rng, bones = self._rng, self._bones
+        while True:
+            share = rng.dirichlet(np.full(bones.max() + 1, rng.choice([0.3, 1.0, 4.0])))
+            share[PALM] *= rng.uniform(1.0, 6.0)
+            weight = np.maximum((share / np.maximum(np.bincount(bones), 1))[bones], 1e-9)
+            gap = rng.uniform(*_GAP)
+            chosen: list[int] = []
+            for place in rng.choice(len(bones), len(bones), replace=False, p=weight / weight.sum()):
+                if all(self._spacing[place, other] > gap for other in chosen):
+                    chosen.append(int(place))
+                if len(chosen) == count:
+                    return np.array(chosen)
 
     def _hide_neighbors(self, markers: Float[np.ndarray, "B M 3"]) -> Float[np.ndarray, "B M 3"]:
         """Most markers around a random one are lost, as behind another hand."""

@@ -8,8 +8,10 @@ from typing import Annotated, Final
 import tyro
 from rich.console import Console
 
+from handsim.app.executors.executor import choose_executor
 from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.progress import print_above, progress_bar
+from handsim.files.object_folder import folder_or_objects
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
@@ -20,27 +22,39 @@ _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 
 
 def generate(
-    out: Path, config: Annotated[DatasetConfig, tyro.conf.arg(name="")], workers: int | None = None
+    out: Annotated[str, tyro.conf.arg(metavar="PATH")],
+    config: Annotated[DatasetConfig, tyro.conf.arg(name="")],
+    workers: int | None = None,
+    cluster: str | None = None,
 ) -> None:
     """Make a training set and a page of plots of it; run it again to continue where it was stopped.
 
     Args:
-        out: Folder for the shards, their manifest and report.html.
+        out: Folder for the shards, their manifest and report.html; or a folder of an object store, as
+            s3://bucket/prefix, which gets no report (docs/object_stores.md).
         config: What to make.
         workers: Processes; all cores when not given.
+        cluster: Where else to make shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
+            docs/cluster.md.
     """
+    place = folder_or_objects(out)
     with progress_bar("frames") as (bar, task):
         manifest = generate_dataset(
             config,
-            out,
-            workers=workers,
+            place,
+            workers=choose_executor(cluster, workers, place, print_above(bar)),
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
+    print_line(f"{manifest.num_frames} frames of {config.glove} in {place}")
+    if isinstance(place, Path):
+        print_line(f"report in {_report(config, place)}")
+
+
+def _report(config: DatasetConfig, out: Path) -> Path:
+    """Write the page of plots."""
     # Not in generate_dataset: a set is complete without its report, whose bytes depend on matplotlib.
     with Console(stderr=True).status("drawing the report"):
         take = simulate_take(
             TakeConfig(kind="hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
         )
-        report = write_report(Dataset(out), present=take.markers_present(), rate=take.rate)
-    print_line(f"{manifest.num_frames} frames of {config.glove} in {out}")
-    print_line(f"report in {report}")
+        return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -11,7 +13,8 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
-from gloves.takes.take import SUFFIX
+from gloves.takes.take import SUFFIX, Take, load_take
+from handsim.app.executors.executor import choose_executor
 from handsim.app.memory import check_memory
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
@@ -25,24 +28,45 @@ _MEMORY: Final = 20_000
 _DISK: Final = 2_000  # bytes of a frame in both files
 
 
-def simulate(out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")]) -> None:
+def simulate(
+    out: Path, config: Annotated[TakeConfig, tyro.conf.arg(name="")], cluster: str | None = None
+) -> None:
     """Simulate a capture of one hand or two; the truth goes beside it.
 
     Args:
         out: Unlabeled .c3d, .trc or Motive .csv file; OUT.truth.npz takes IDs, labels, poses and shapes.
         config: What to simulate.
+        cluster: Where else to simulate: tcp://host:port of a Dask scheduler, its file (.json), or local;
+            docs/cluster.md.
     """
-    check_suffix(out, WRITABLE)
-    check_outputs((config.glove, config.rig), (out, out.with_suffix(SUFFIX)))
-    _check_space(out, config.num_frames or 0)
-    take = simulate_take(config)
-    names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     truth = out.with_suffix(SUFFIX)
-    with atomic_writes(out, truth) as (capture_file, truth_file):  # a capture without its truth is no use
-        write_capture(capture_file, Capture(names, take.points, take.rate), title=out.name)
-        take.save(truth_file)
+    check_suffix(out, WRITABLE)
+    check_outputs((config.glove, config.rig), (out, truth))
+    _check_space(out, config.num_frames or 0)
+    if cluster is None:
+        take = _simulate_into(out, config)
+    else:
+        executor = choose_executor(cluster, None, out.parent, print_line)
+        list(executor.run(functools.partial(_capture_of_seed, out, config), [config.seed]))
+        take = load_take(truth)
     counts = count_gaps(take.markers_present())
     print_line(f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}")
+
+
+def _capture_of_seed(out: Path, config: TakeConfig, seed: int) -> int:
+    """The job of a worker."""
+    _simulate_into(out, dataclasses.replace(config, seed=seed))
+    return seed
+
+
+def _simulate_into(out: Path, config: TakeConfig) -> Take:
+    take = simulate_take(config)
+    names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
+    with atomic_writes(out, out.with_suffix(SUFFIX)) as (capture_file, truth_file):
+        # A capture without its truth is no use.
+        write_capture(capture_file, Capture(names, take.points, take.rate), title=out.name)
+        take.save(truth_file)
+    return take
 
 
 def _check_space(out: Path, num_frames: int) -> None:

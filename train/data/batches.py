@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from handsim.hand.topology import SIDES
 from train.config import TrainConfig
 from train.data.augmentation import Cloud, Corruption, corrupt
+from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import own_cloud
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy.typing import NDArray
+
+
+class Weights(NamedTuple):
+    """Factors of the losses of a part of a batch; the mean over all parts is then the loss of the batch."""
+
+    points: float = 1.0
+    """Of a mean over points."""
+    clouds: float = 1.0
+    """Of a mean over clouds."""
+
+
+WHOLE: Final = Weights()
+"""Of the whole batch."""
 
 
 class Batch(NamedTuple):
@@ -22,6 +37,27 @@ class Batch(NamedTuple):
     cloud: Cloud
     markers: Float[np.ndarray, "B M 3"]
     """True positions [m] of all markers, the lost ones too, in the clouds' frame: centered, not rotated."""
+    weights: Weights = WHOLE
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Which clouds of every batch one of several processes learns from: every `count`-th from `first` on."""
+
+    first: int = 0
+    count: int = 1
+
+    def of(self, batch: Batch) -> Batch:
+        """These clouds of a batch; the whole batch where there is one part."""
+        if self.count == 1:
+            return batch
+        mine = slice(self.first, None, self.count)
+        cloud, total = batch.cloud, batch.cloud.present.sum()
+        width = max(1, int(cloud.present[mine].sum(axis=1).max()))  # points come before padding
+        part = Cloud(*(entry[mine, :width] for entry in cloud))
+        share = len(part.present) / len(cloud.present)
+        weights = Weights(self.count * float(part.present.sum() / total), self.count * share)
+        return Batch(part, batch.markers[mine], weights)
 
 
 def paper_corruption(num_markers: int) -> Corruption:
@@ -29,7 +65,9 @@ def paper_corruption(num_markers: int) -> Corruption:
     return Corruption(occlude=round(num_markers / 4), ghosts=2)
 
 
-def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Generator) -> Batch:
+def draw_batch(
+    rows: NDArray[np.void] | MappedRows, config: TrainConfig, *, rng: np.random.Generator
+) -> Batch:
     """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones.
 
     Args:
@@ -57,10 +95,11 @@ def draw_batch(rows: NDArray[np.void], config: TrainConfig, *, rng: np.random.Ge
 
 
 def right_hands(
-    rows: NDArray[np.void], anisotropy: float, *, rng: np.random.Generator
+    rows: NDArray[np.void] | MappedRows, anisotropy: float, *, rng: np.random.Generator
 ) -> Float[np.ndarray, "B M 3"]:
     """All markers of each row [m], of left hands mirrored; each hand is stretched around its center."""
-    centered = rows["markers"] - rows["markers"].mean(axis=1, keepdims=True)
+    markers = rows["markers"]
+    centered = markers - markers.mean(axis=1, keepdims=True)
     return stretched(centered @ _mirrors(rows["hand"]), anisotropy, rng=rng)
 
 

@@ -7,7 +7,7 @@ when training (`train.data.augmentation`).
 from __future__ import annotations
 
 import dataclasses
-import hashlib
+import io
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,10 +20,12 @@ from gloves.optics.ghosts import MAX_GHOSTS
 from handsim.errors import DatasetError, choices
 from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write
+from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.hand.records import HAND_DTYPE, unpack_hand
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_QPOS
+from train.data.mapped_rows import MappedRows
 
 if TYPE_CHECKING:
     from jaxtyping import Shaped
@@ -101,18 +103,20 @@ def load_redrawn(path: Path, num_shards: int) -> dict[str, int] | None:
     return dict(sorted(total.items()))
 
 
+def array_bytes(dtype: np.dtype[np.void], count: int) -> int:
+    """Length of the `.npy` file of so many records [bytes]."""
+    header = io.BytesIO()
+    about = np.lib.format.header_data_from_array_1_0(np.empty(0, dtype=dtype)) | {"shape": (count,)}
+    np.lib.format.write_array_header_1_0(header, about)
+    return len(header.getvalue()) + count * dtype.itemsize
+
+
 def save_array(path: Path, array: NDArray[Any]) -> None:
     """Write an `.npy` file, whole or not at all."""
     # Not numpy.save: it reports a full disk as "8192 requested and 6690 written", without its errno.
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
         file.write(np.ascontiguousarray(array).tobytes())
-
-
-def checksum(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def save_manifest(out: Path, manifest: Manifest) -> None:
@@ -216,15 +220,26 @@ class Dataset:
                     f"{MANIFEST} and run handsim generate again"
                 )
         self.path = path
-        names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
-        dtype = row_dtype(len(self.manifest.marker_names))
-        self.shards = [_load_records(path / name, dtype) for name in names]
+        self.shards = self._map_shards()
         found = sum(map(len, self.shards))
         if found != self.manifest.num_frames:
             raise DatasetError(
                 f"{path / MANIFEST} says {self.manifest.num_frames} frames, but the shards hold {found}; "
                 "delete it and run handsim generate again"
             )
+
+    def _map_shards(self) -> list[NDArray[np.void]]:
+        names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
+        dtype = row_dtype(len(self.manifest.marker_names))
+        return [_load_records(self.path / name, dtype) for name in names]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The folder alone: another process maps the same pages, which are checked already."""
+        return {"path": self.path.absolute(), "manifest": self.manifest}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.path, self.manifest = state["path"], state["manifest"]
+        self.shards = self._map_shards()
 
     @property
     def marker_names(self) -> tuple[str, ...]:
@@ -234,6 +249,10 @@ class Dataset:
     def rows(self) -> Shaped[np.ndarray, "T"]:
         """All T rows in order, read into memory; see `row_dtype` for their fields."""
         return np.concatenate(self.shards)
+
+    def mapped_rows(self) -> MappedRows:
+        """All T rows in order, left where they are; processes that read them share one copy."""
+        return MappedRows(self.shards)
 
     def hands(self, shard: int) -> list[HandShape]:
         """The hands of a shard; the `hand` of its rows is an index into them."""

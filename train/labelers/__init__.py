@@ -4,6 +4,7 @@
 - kinds: the table of networks: how each is built, its loss, and how it becomes a labeler.
 - storage: trained labelers on disk, shipped or a user's; loading and saving them.
 - set_network, set_labeler: the default network, on pairwise distances; the labeler around it.
+- batch_network: a network for batches, on a GPU where there is one.
 - set_inference: that network on one cloud in numpy.
 - views, depth_image: from where the network of Han et al. 2018 sees a cloud, and what it sees.
 - cnn_network, sparse_convolution, cnn_labeler: that network, its first filters, the labeler around it.

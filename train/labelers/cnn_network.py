@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from train.config import CNNConfig, TrainConfig
-from train.data.batches import Batch
+from train.data.batches import Batch, Part
 from train.labelers.depth_image import depth_images
 from train.labelers.sparse_convolution import filter_sparse
 from train.labelers.views import NUM_MOMENTS, MeanHand, random_views
@@ -114,15 +114,17 @@ def cnn_loss(
     config: TrainConfig,
     *,
     rng: np.random.Generator,
+    part: Part,
 ) -> Tensor:
-    """Loss of one batch, each cloud in a view of its own (section 3.1 of the paper)."""
+    """Loss of a part of one batch, each cloud in a view of its own (section 3.1 of the paper)."""
     points, present = batch.cloud.points, batch.cloud.present
     if config.cnn.views == "aligned":
         hand = network.mean_hand.get()  # type: ignore[operator, union-attr]
         views = hand.training_views(points, present, batch.markers, rng=rng)
     else:
         views = random_views(len(points), rng=rng)
-    images, frames = depth_images(points, present, views)
-    targets = torch.from_numpy(frames.normalize(batch.markers).astype(np.float32)).to(device)
+    mine = part.of(batch)
+    images, frames = depth_images(mine.cloud.points, mine.cloud.present, views[part.first :: part.count])
+    targets = torch.from_numpy(frames.normalize(mine.markers).astype(np.float32)).to(device)
     seen = torch.from_numpy(images)[:, None].to(device)
-    return position_loss(network(seen), targets, knee=config.knee)
+    return mine.weights.clouds * position_loss(network(seen), targets, knee=config.knee)

@@ -9,14 +9,15 @@ import torch
 from torch import nn
 
 from train.config import CNNConfig, NetworkConfig, TrainConfig
-from train.data.batches import Batch, draw_batch
+from train.data.batches import Batch, Part, draw_batch
+from train.data.mapped_rows import MappedRows
+from train.labelers.batch_network import BatchNetwork
 from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.cnn_network import DeepLabelCNN, cnn_loss
 from train.labelers.protocol import Labeler
 from train.labelers.set_labeler import TrainedSetLabeler, set_loss
 from train.labelers.set_network import SetLabeler
 from train.labelers.views import MeanHand
-from train.threads import labeling_threads
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,7 +33,7 @@ def new_network(config: NetworkConfig) -> nn.Module:
     return SetLabeler(config)
 
 
-def prepare_network(network: nn.Module, rows: NDArray[np.void]) -> None:
+def prepare_network(network: nn.Module, rows: NDArray[np.void] | MappedRows) -> None:
     """Give an untrained network what it must know of a training set before the first step."""
     if isinstance(network, DeepLabelCNN):
         rng = np.random.default_rng(0)
@@ -42,22 +43,30 @@ def prepare_network(network: nn.Module, rows: NDArray[np.void]) -> None:
 
 
 def batch_loss(
-    config: TrainConfig, network: nn.Module, batch: Batch, device: torch.device, *, rng: np.random.Generator
+    config: TrainConfig,
+    network: nn.Module,
+    batch: Batch,
+    device: torch.device,
+    *,
+    rng: np.random.Generator,
+    part: Part,
 ) -> torch.Tensor:
-    """Loss of one batch, a scalar."""
+    """Loss of a part of one batch, a scalar; its mean over all parts is the loss of the batch.
+
+    What is drawn is drawn for the whole batch, so that a cloud does not depend on the number of parts.
+    """
     if config.labeler == "cnn":
-        return cnn_loss(network, batch, device, config, rng=rng)
-    return set_loss(network, batch, device)
+        return cnn_loss(network, batch, device, config, rng=rng, part=part)
+    return set_loss(network, part.of(batch), device)
 
 
 def cnn_labeler(network: DeepLabelCNN, marker_names: tuple[str, ...]) -> CNNLabeler:
     """The paper's network with trained weights as a labeler."""
-    network.eval()
+    batches = BatchNetwork(network.eval())
 
     @torch.inference_mode()
     def positions(images: NDArray[np.float32]) -> NDArray[np.float32]:
-        with labeling_threads():
-            predicted: NDArray[np.float32] = network(torch.from_numpy(images)).numpy()
+        predicted: NDArray[np.float32] = batches(torch.from_numpy(images)).cpu().numpy()
         return predicted
 
     return CNNLabeler(positions, network.mean_hand.get(), network.config, marker_names)

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from train.data.batches import Batch
+from train.labelers.batch_network import BatchNetwork
 from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
 from train.labelers.set_inference import CloudScorer
 from train.labelers.set_network import SetLabeler, labeling_loss
 from train.matching.pose_prior import PosePrior
-from train.threads import labeling_threads
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -32,6 +32,7 @@ class TrainedSetLabeler:
     def __init__(self, network: SetLabeler, marker_names: tuple[str, ...]) -> None:
         self.network = network.eval()
         self.marker_names = marker_names
+        self._batches = BatchNetwork(self.network)
         self._scorer: CloudScorer | None = None  # made for the first cloud that comes alone
 
     @property
@@ -51,9 +52,9 @@ class TrainedSetLabeler:
             by_point, by_label = self._scorer.score(clouds[0])
             return label_by_scores(clouds, by_point[None], by_label[None], self.network.prior)
         points, present = pad_clouds(clouds)
-        with labeling_threads():
-            scores = self.network(torch.from_numpy(points), torch.from_numpy(present))
-        return label_by_scores(clouds, scores.points.numpy(), scores.labels.numpy(), self.network.prior)
+        scores = self._batches(torch.from_numpy(points), torch.from_numpy(present))
+        by_point, by_label = scores.points.cpu().numpy(), scores.labels.cpu().numpy()
+        return label_by_scores(clouds, by_point, by_label, self.network.prior)
 
 
 def set_loss(network: torch.nn.Module, batch: Batch, device: torch.device) -> torch.Tensor:
@@ -61,4 +62,4 @@ def set_loss(network: torch.nn.Module, batch: Batch, device: torch.device) -> to
     cloud = batch.cloud
     points = torch.from_numpy(cloud.points.astype(np.float32)).to(device)
     present, truth = torch.from_numpy(cloud.present).to(device), torch.from_numpy(cloud.truth).to(device)
-    return labeling_loss(network(points, present), truth, present)
+    return labeling_loss(network(points, present), truth, present, weights=batch.weights)

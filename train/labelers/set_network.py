@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from train.config import SetLabelerConfig
+from train.data.batches import WHOLE, Weights
 from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
@@ -111,13 +112,14 @@ class MessageRound(nn.Module):
         return features + update
 
 
-def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor) -> Tensor:
+def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor, *, weights: Weights = WHOLE) -> Tensor:
     """Cross-entropy of both outputs.
 
     Args:
         scores: From `SetLabeler`.
         truth: Label of each point (B, N), -1 for a ghost; padding is ignored.
         present: Which points are there (B, N).
+        weights: Of the two, where the clouds are a part of a batch.
     """
     num_labels = scores.points.shape[-1] - 1
     of_point = torch.where(truth < 0, num_labels, truth)
@@ -128,4 +130,4 @@ def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor) -> Tensor
     known = torch.where(present, of_point, num_labels)
     of_label = of_label.scatter(1, known, indices)[:, :num_labels]
     label_loss = -scores.labels.gather(-1, of_label[..., None]).mean()
-    return point_loss + label_loss
+    return weights.points * point_loss + weights.clouds * label_loss

@@ -7,28 +7,30 @@ import functools
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from gloves.attachment import attach_markers
-from gloves.layout import load_layout
+from gloves.layout import MarkerLayout, load_layout
+from handsim.app.executors.executor import Executor, executor_of
+from handsim.app.executors.output import FolderOutput, Output, open_output
 from handsim.app.interrupts import Stopped
-from handsim.app.workers import check_workers, in_processes
 from handsim.errors import DatasetError
 from handsim.files.atomic import remove_leftovers
 from handsim.files.disk import check_free
-from handsim.files.json_files import claim, load_json, save_json
+from handsim.files.json_files import load_json, save_json
+from handsim.files.object_folder import ObjectFolder
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES
-from handsim.space.cameras import ROOM_CENTER, check_outside_volume, list_rigs, load_rig
+from handsim.space.cameras import ROOM_CENTER, CameraRig, check_outside_volume, list_rigs, load_rig
 from poses.shapes.sampling import load_sampler
 from train.data.shards import (
     CONFIG,
     MANIFEST,
     Manifest,
-    checksum,
+    array_bytes,
     hands_name,
     load_redrawn,
     redrawn_name,
@@ -48,14 +50,19 @@ Progress = Callable[[int, int], None]
 
 
 def generate_dataset(
-    config: DatasetConfig, out: Path, *, workers: int | None = None, progress: Progress | None = None
+    config: DatasetConfig,
+    out: Path | ObjectFolder,
+    *,
+    workers: int | Executor | None = None,
+    progress: Progress | None = None,
 ) -> Manifest:
     """Make a training set, finish a stopped one, or let one grow; the bytes depend on the config alone.
 
     Args:
         config: What to make.
-        out: Folder to make it in. A set there may have fewer frames and must have the same settings else.
-        workers: Processes; all cores when not given.
+        out: Folder to make it in, or a folder of an object store. A set there may have fewer frames and must
+            have the same settings else.
+        workers: Processes, all cores when not given; or who else makes the shards.
         progress: Called after every shard.
 
     Returns:
@@ -64,10 +71,11 @@ def generate_dataset(
 
     Raises:
         DatasetError: `out` holds a set of another config, its disk is too small, or a worker died.
+        HandSimError: The object store does not answer or refuses.
         LayoutError: The glove is unknown or does not fit.
         ArgumentError: The rig is unknown or stands in the hands' way, or no hand of the population can rest.
     """
-    processes = check_workers(workers)
+    executor = executor_of(workers)
     layout, rig = load_layout(config.glove), load_rig(config.rig)
     check_outside_volume(rig, np.array(ROOM_CENTER), config.volume)
     if config.min_cameras > len(rig.positions):
@@ -77,6 +85,23 @@ def generate_dataset(
     attach_markers(layout, HandModel.named("M"))  # raises before anything is written
     if config.sampler is not None:
         load_sampler(config.sampler)
+    if isinstance(out, Path):
+        _check_space(config, out, layout.num_markers)
+    with open_output(out) as output:
+        output.claim(
+            CONFIG,
+            _settings(config, layout, rig),
+            noun="training set",
+            error=DatasetError,
+            grows="num_frames",
+            result=MANIFEST,
+        )
+        _make_shards(config, output, layout.num_markers, executor, progress)
+        return _complete(config, output, layout)
+
+
+def _settings(config: DatasetConfig, layout: MarkerLayout, rig: CameraRig) -> dict[str, Any]:
+    """What decides the bytes of a set, as JSON."""
     known = dataclasses.replace(config, optics=config.optics.worn(layout.radius))
     settings = {**dataclasses.asdict(known), "layout": dataclasses.asdict(layout)}
     if config.sampler is None:
@@ -86,41 +111,44 @@ def generate_dataset(
             "T_world_camera": rig.T_world_camera.tolist(),
             "field_of_view": rig.field_of_view,
         }
-    _check_space(config, out, layout.num_markers)
-    claim(
-        out / CONFIG,
-        settings,
-        noun="training set",
-        error=DatasetError,
-        grows="num_frames",
-        result=out / MANIFEST,
-    )
-    shards = range(-(-config.num_frames // ROWS_PER_SHARD))
-    todo = [shard for shard in shards if not _finished(config, out, shard)]
+    return settings
+
+
+def _make_shards(
+    config: DatasetConfig, output: Output, num_markers: int, executor: Executor, progress: Progress | None
+) -> None:
+    """Have the shards made that are not there."""
+    todo = [shard for shard in _shards(config) if not _finished(config, output, shard, num_markers)]
     done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
     try:
-        for shard in in_processes(functools.partial(make_shard, config, out), todo, processes):
+        for shard in executor.run(output.job(functools.partial(make_shard, config)), todo):
             done += _shard_size(config, shard)
             if progress is not None:
                 progress(done, config.num_frames)
     except KeyboardInterrupt as stop:
-        raise _stopped(stop, out, done, config.num_frames) from stop
-    names = [name(shard) for shard in shards for name in (rows_name, hands_name)]
+        raise _stopped(stop, output, done, config.num_frames) from stop
+
+
+def _complete(config: DatasetConfig, output: Output, layout: MarkerLayout) -> Manifest:
+    """Write the manifest."""
+    shards = _shards(config)
+    output.collect("redrawn-*.json")
     manifest = Manifest(
-        config=load_json(out / CONFIG),
+        config=load_json(output.folder / CONFIG),
         marker_names=layout.names,
         num_frames=config.num_frames,
         min_cameras=config.min_cameras,
-        files={name: checksum(out / name) for name in sorted(names)},
-        redrawn=load_redrawn(out, len(shards)),
+        files=output.checksums(sorted(name(shard) for shard in shards for name in (rows_name, hands_name))),
+        redrawn=load_redrawn(output.folder, len(shards)),
     )
-    save_manifest(out, manifest)
+    save_manifest(output.folder, manifest)
+    output.publish(MANIFEST)
     return manifest
 
 
-def _stopped(stop: KeyboardInterrupt, out: Path, done: int, expected: int) -> Stopped:
+def _stopped(stop: KeyboardInterrupt, out: Output, done: int, expected: int) -> Stopped:
     """The same signal, with what is kept."""
-    remove_leftovers(out)  # of workers that had no time to
+    remove_leftovers(out.folder)  # of workers that had no time to
     kept = f"{done} of {expected} frames are in {out}, and the same command goes on after them"
     return Stopped.again(stop, kept)
 
@@ -135,8 +163,16 @@ def _check_space(config: DatasetConfig, out: Path, num_markers: int) -> None:
         check_free(out, needed - there, what, "ask for fewer frames", error=DatasetError)
 
 
-def _finished(config: DatasetConfig, out: Path, shard: int) -> bool:
+def _shards(config: DatasetConfig) -> range:
+    return range(-(-config.num_frames // ROWS_PER_SHARD))
+
+
+def _finished(config: DatasetConfig, output: Output, shard: int, num_markers: int) -> bool:
     """Whether a shard is there with all its rows; the last one of a set that grows is made again."""
+    if not isinstance(output, FolderOutput):
+        expected = array_bytes(row_dtype(num_markers), _shard_size(config, shard))
+        return output.size(shard, rows_name(shard)) == expected
+    out = output.folder
     if not (out / hands_name(shard)).is_file():
         return False
     try:

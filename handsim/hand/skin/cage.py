@@ -72,6 +72,29 @@ _WEB_DISTANCES: Final = np.array(
     ]
 )
 
+# The palm's vertices around the thumb's metacarpal: where they go along it, in its lengths, sideways and
+# upwards, in its radii, and how much of the way there.
+_THUMB_BASE_ROWS: Final = np.repeat([CARPUS, THENAR, METACARPUS], [4, 5, 3])
+_THUMB_BASE_COLUMNS: Final = np.array(
+    [dorsal(0), *map(palmar, range(3)), dorsal(0), *map(palmar, range(4)), *map(palmar, range(3))]
+)
+_THUMB_BASE: Final = np.array(
+    [
+        [-0.1, -0.9, 0.9, 0.5],
+        [-0.03, 1.18, 0.47, 0.8],
+        [-0.02, 1.68, -0.35, 0.75],
+        [-0.11, 1.57, -1.36, 0.5],
+        [0.25, -1.2, 0.5, 0.5],
+        [0.48, 1.08, -0.78, 0.9],
+        [0.50, 0.50, -1.32, 0.9],
+        [0.41, 0.77, -1.94, 0.7],
+        [0.29, 0.59, -2.77, 0.4],
+        [0.65, -0.25, -1.20, 0.9],
+        [0.68, -0.55, -1.75, 0.8],
+        [0.69, -0.17, -2.31, 0.4],
+    ]
+)
+
 _RING_ANGLES: Final = np.deg2rad(np.arange(30.0, 360.0, 60.0))
 _ROUND: Final = np.stack([1.03 * np.cos(_RING_ANGLES), 0.97 * np.sin(_RING_ANGLES)], axis=-1)
 # Sections (y, z) of the rings about the axis: knuckles stand out on the back, the nail is flat, the pad full.
@@ -225,26 +248,10 @@ def _shape_thumb_base(
 ) -> None:
     """Thenar muscle and first web: the palm's rows around the thumb's metacarpal, in the thumb's frame."""
     length, radius = shape.bone_lengths[0, 0], shape.radii[0, 0]
-
-    def at(along: float, y: float, z: float) -> np.ndarray:
-        return _around(frames[0], along * length, radius * np.array([y, z]))
-
-    def move(row: int, index: int, target: np.ndarray, share: float) -> None:
-        vertex = topology.palm[row, index]
-        vertices[vertex] = (1.0 - share) * vertices[vertex] + share * target
-
-    move(CARPUS, dorsal(0), at(-0.1, -0.9, 0.9), 0.5)
-    move(CARPUS, palmar(0), at(-0.03, 1.18, 0.47), 0.8)
-    move(CARPUS, palmar(1), at(-0.02, 1.68, -0.35), 0.75)
-    move(CARPUS, palmar(2), at(-0.11, 1.57, -1.36), 0.5)
-    move(THENAR, dorsal(0), at(0.25, -1.2, 0.5), 0.5)
-    move(THENAR, palmar(0), at(0.48, 1.08, -0.78), 0.9)
-    move(THENAR, palmar(1), at(0.50, 0.50, -1.32), 0.9)
-    move(THENAR, palmar(2), at(0.41, 0.77, -1.94), 0.7)
-    move(THENAR, palmar(3), at(0.29, 0.59, -2.77), 0.4)
-    move(METACARPUS, palmar(0), at(0.65, -0.25, -1.20), 0.9)
-    move(METACARPUS, palmar(1), at(0.68, -0.55, -1.75), 0.8)
-    move(METACARPUS, palmar(2), at(0.69, -0.17, -2.31), 0.4)
+    moved = topology.palm[_THUMB_BASE_ROWS, _THUMB_BASE_COLUMNS]
+    along, across, share = np.split(_THUMB_BASE, [1, 3], axis=1)
+    targets = _around(frames[0], along[:, 0] * length, radius * across)
+    vertices[moved] = (1.0 - share) * vertices[moved] + share * targets
     ring = topology.rings[0][0]
     section = np.array([[1.02, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.2, -1.0], [0.95, -0.62]])
     along = np.array([0.55, 0.5, 0.55, 0.72, 0.77, 0.67]) * length

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
@@ -29,6 +30,11 @@ if __name__ == "__main__":
 """
 
 
+def sign(folder: Path, number: int) -> int:
+    (folder / str(number)).write_text(str(os.getpid()))
+    return number
+
+
 def double(number: int) -> int:
     return number
 
@@ -45,10 +51,21 @@ def die_at_two(number: int) -> int:
     return number
 
 
+@pytest.mark.parametrize("first_alone", [True, False])
 @pytest.mark.parametrize("workers", [1, 2, 9])
-def test_every_job_is_done_once(workers):
-    assert sorted(in_processes(double, range(7), workers)) == list(range(7))
-    assert list(in_processes(double, [], workers)) == []
+def test_every_job_is_done_once(workers, first_alone):
+    done = in_processes(double, range(7), workers, first_alone=first_alone)
+    assert sorted(done) == list(range(7))
+    assert list(in_processes(double, [], workers, first_alone=first_alone)) == []
+
+
+@pytest.mark.parametrize("first_alone", [True, False])
+def test_the_first_job_is_done_here_if_it_shall_be(first_alone, tmp_path):
+    job = functools.partial(sign, tmp_path)
+    assert sorted(in_processes(job, range(3), 2, first_alone=first_alone)) == [0, 1, 2]
+    signed = [int((tmp_path / str(number)).read_text()) for number in range(3)]
+    assert (signed[0] == os.getpid()) == first_alone
+    assert os.getpid() not in signed[1:]
 
 
 def test_what_a_job_raises_comes_back():

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from handsim.files.atomic import atomic_write, atomic_writes
+from handsim.files.atomic import atomic_write, atomic_writes, temporary_beside
 
 
 def entries(folder: Path) -> list[str]:
@@ -117,14 +117,19 @@ def test_the_mode_is_what_the_umask_asks_for(tmp_path: Path) -> None:
 def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    left = tmp_path / f".take[1].tmp-{gone.pid}.npz"
-    others = [tmp_path / f".take[1].tmp-{os.getppid()}.npz", tmp_path / f".b.tmp-{gone.pid}.npz"]
+    final, here = tmp_path / "take[1].npz", str(os.getpid())
+    left = tmp_path / temporary_beside(final).name.replace(here, str(gone.pid))
+    others = [
+        tmp_path / temporary_beside(final).name.replace(here, str(os.getppid())),
+        tmp_path / temporary_beside(tmp_path / "b.npz").name.replace(here, str(gone.pid)),
+        tmp_path / f".take[1].tmp-another-{gone.pid}.npz",
+    ]
     for file in (left, *others):
         file.write_text("half")
-    with atomic_write(tmp_path / "take[1].npz") as temporary:
+    with atomic_write(final) as temporary:
         temporary.write_text("whole")
     assert not left.exists()
-    assert all(file.exists() for file in others), "of a running process, and of another file"
+    assert all(file.exists() for file in others), "of a running process, another file, another machine"
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:

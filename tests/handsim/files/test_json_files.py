@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from handsim.errors import DatasetError
-from handsim.files.json_files import claim, load_json
+from handsim.files.json_files import claim, load_json, save_json
 
 SETTINGS = {"train": {"samples": 100, "seed": 3, "network": {"width": 64}}, "names": ["a", "b"]}
 
@@ -69,3 +71,11 @@ def test_json_nested_without_end_is_damage(tmp_path):
     (tmp_path / "config.json").write_text("[" * 200_000)
     with pytest.raises(DatasetError, match=r"config.json is damaged: it does not hold JSON"):
         load_json(tmp_path / "config.json")
+
+
+def test_what_is_not_finite_becomes_null(tmp_path):
+    path = tmp_path / "figures.json"
+    save_json(path, {"recall": float("nan"), "curve": [1.0, float("inf")], "runs": {"a": (2, 0.5)}})
+    assert json.loads(path.read_text(), parse_constant=pytest.fail) == {
+        "recall": None, "curve": [1.0, None], "runs": {"a": [2, 0.5]}
+    }  # fmt: skip

@@ -23,7 +23,7 @@ def test_drawn_skin_is_closed_and_faces_outwards(side: Side, rng: np.random.Gene
         solid = trimesh.Trimesh(mesh.rest, mesh.faces, process=False)
         assert solid.is_watertight
         assert solid.is_winding_consistent
-        assert 5e-4 < solid.volume < 3e-3  # [m3]: a hand on 16 to 25 cm of forearm
+        assert 2e-3 < solid.volume < 7e-3  # [m3]: a hand on an arm
 
 
 def test_the_hands_own_vertices_are_the_models(model: HandModel) -> None:
@@ -111,8 +111,14 @@ def test_arms_are_as_thick_as_people_are() -> None:
     rings = SkinMesh(model, Forearm(length=0.22)).rest[atlas.num_hand : -1].reshape(-1, len(atlas.wrist), 3)
     girths = np.linalg.norm(rings - np.roll(rings, 1, axis=1), axis=-1).sum(axis=1)
     assert 0.150 < girths.min() < 0.180  # [m]: men's wrists, ANSUR II
-    assert 0.24 < girths[-1] < 0.30
-    assert (np.diff(girths)[3:] > 0.0).all()
+    assert 0.24 < girths.max() < 0.30
+    assert (np.diff(girths[: girths.argmax()])[3:] > 0.0).all()
+    arm = SkinMesh(model, Forearm(length=0.7)).rest[atlas.num_hand : -1].reshape(-1, len(atlas.wrist), 3)
+    girths = np.linalg.norm(arm - np.roll(arm, 1, axis=1), axis=-1).sum(axis=1)
+    behind = -arm[..., 0].mean(axis=1)
+    elbow = (behind > 0.24) & (behind < 0.31)
+    assert girths[elbow].max() < girths[behind < 0.24].max()  # thinner than the forearm's flesh
+    assert 0.30 < girths[-1] < 0.36  # men's upper arms, ANSUR II
 
 
 def test_impossible_forearms_are_told() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
+from handsim.files.inputs import checksum
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.cameras import load_rig
 from track.benchmark.answers import BenchmarkError
@@ -25,7 +26,6 @@ from track.benchmark.manifest import (
     user_path,
 )
 from track.kinematics.pose_solver import PoseSolver
-from train.data.shards import checksum
 
 
 def test_made_twice_it_has_the_same_bytes(plan, benchmark, tmp_path):

@@ -28,6 +28,7 @@ from train.labelers.storage import load_labeler
 from train.simulation.room_settings import KINDS, TWINS
 from train.simulation.takes import TakeConfig, simulate_take
 
+pytestmark = pytest.mark.xdist_group("reproduce")  # what they share is made once
 METHODS = (OURS, PAPERS_LOOP, *NEED_FIRST_LABELS)
 WITH_BODY = "handsim, controller too"
 

@@ -18,10 +18,11 @@ import pytest
 from gloves.layout import load_layout, save_layout
 from handsim.app.interrupts import Stopped
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
+from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
 from poses.shapes.couplings import HIGH, LOW
-from train.data.shards import MANIFEST, Dataset, checksum, hands_name, redrawn_name, rows_name
+from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
 from train.simulation import frame_scenes, generation, people
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import NO_GRASP, NO_TOUCH, SceneMix

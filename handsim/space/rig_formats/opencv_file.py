@@ -1,4 +1,4 @@
-"""OpenCV's calibration files, YAML or JSON: one camera, or the two of a stereo pair.
+"""OpenCV's calibration files, YAML or JSON: one camera, the two of a stereo pair, or many.
 
 Read by our own few lines: the files are flat tables of numbers, and OpenCV's parser may never come back
 from a damaged one.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -20,6 +21,7 @@ from handsim.files.inputs import read_bytes
 from handsim.space.camera import Camera
 from handsim.space.camera_file import checked_cameras
 from handsim.space.lens import Lens
+from handsim.space.rig_formats.lab_camera import camera_names, nearest_rotation, rigid
 from handsim.space.transforms import quaternion_matrix, vector_quaternions
 
 if TYPE_CHECKING:
@@ -34,22 +36,35 @@ _ENTRY: Final = re.compile(r"^[\"']?([A-Za-z_][\w ]*?)[\"']?[ \t]*:(?=\s)", re.M
 _DATA: Final = re.compile(r"\bdata[\"']?[ \t]*:[ \t]*\[([^\[\]]*)\]")
 _LIST: Final = re.compile(r"[\[\],\s]+")
 _K: Final = ("camera_matrix", "cameraMatrix", "K", "mtx", "M")
-_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "dist")
-_WIDTH: Final = ("image_width", "imageWidth", "width")
-_HEIGHT: Final = ("image_height", "imageHeight", "height")
-_SIZE: Final = ("image_size", "imageSize", "img_size", "size")
+_D: Final = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "distCoef", "D", "dist")
+_WIDTH: Final = ("image_width", "imageWidth", "img_width", "width")
+_HEIGHT: Final = ("image_height", "imageHeight", "img_height", "height")
+_SIZE: Final = ("image_size", "imageSize", "img_size", "size", "resolution")
 _FISHEYE: Final = ("fisheye_model", "fisheye")
-_STEREO: Final = {"intrinsics": "extrinsics", "extrinsics": "intrinsics"}
+_R: Final = ("R", "Rot", "rvec", "rotation")
+_T: Final = ("T", "t", "tvec", "translation")
+_PAIRS: Final = {
+    "intrinsics": "extrinsics",
+    "extrinsics": "intrinsics",
+    "intri": "extri",
+    "extri": "intri",
+}
+"""Files that belong together: of OpenCV's stereo sample, and of EasyMocap."""
+_OF_ONE: Final = (*_K, *_D, *_WIDTH, "W", *_HEIGHT, "H", *_SIZE, *_FISHEYE, *_R, *_T)
+_SECTION: Final = re.compile(r"^[ \t]+[\"']?(?:" + "|".join(_K) + r")[\"']?[ \t]*:(?=\s)", re.M)
+_MOST_SECTIONS: Final = 256
 
 Values = dict[str, tuple[float, ...] | str]
+Sections = dict[str, Values]
+"""Tables of one camera each, by the cameras' names."""
 
 
 def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
-    """The camera of a calibration, or both cameras of a stereo one (docs/rendering.md has the names).
+    """The camera of a calibration, both of a stereo pair, or all of a file (docs/rendering.md has the names).
 
     Args:
         path: A `.yml`, `.yaml` or `.json` file. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo
-            sample writes them, either; the other is read too.
+            sample writes them, and of `intri.yml` and `extri.yml`, either; the other is read too.
 
     Returns:
         Cameras with their poses [m] and intrinsics [px].
@@ -57,23 +72,59 @@ def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
     Raises:
         RigError: It cannot be read, something is missing, or a lens is of a kind that we do not have.
     """
-    values = _read(path)
-    other = path.with_stem(_STEREO.get(path.stem, path.stem))
+    values, sections = _read(path)
+    other = path.with_stem(_PAIRS.get(path.stem, path.stem))
     if other != path and other.is_file():
-        values = _read(other) | values
+        more, others = _read(other)
+        values, sections = more | values, others | sections
     try:
-        cameras = _cameras(values)
+        cameras = _cameras(values, sections or _numbered_sections(values))
     except HandSimError as error:
         raise RigError(f"{path}: {error}") from error
     return checked_cameras(path, cameras)
 
 
-def _cameras(values: Values) -> list[Camera]:
+def _cameras(values: Values, sections: Sections) -> list[Camera]:
+    if sections:
+        return _many(values, sections)
     if _find(values, _numbered(_K, 1)) is not None:
         return _stereo(values)
     if _find(values, ("P1",)) is not None:
         return _rectified(values)
     return [_camera(values, "camera", _K, _D, _pose(values))]
+
+
+def _many(values: Values, sections: Sections) -> list[Camera]:
+    """Cameras in one world; what is stated once, as the size of the pictures, holds for all."""
+    if len(sections) > _MOST_SECTIONS:
+        raise RigError(f"{len(sections)} cameras, expected at most {_MOST_SECTIONS}")
+    cameras = []
+    common = {key: value for key, value in values.items() if key in (*_WIDTH, *_HEIGHT, *_SIZE)}
+    for name, (given, own) in zip(camera_names(list(sections)), sections.items(), strict=True):
+        try:
+            if "T_world_camera" not in own and (_find(own, _R) is None or _find(own, _T) is None):
+                raise RigError("no R and T, the rotation and translation from the world to the camera")
+            cameras.append(_camera(common | own, name, _K, _D, _pose(own)))
+        except HandSimError as error:
+            raise RigError(f"camera '{given[:40]}': {error}") from error
+    return cameras
+
+
+def _numbered_sections(values: Values) -> Sections:
+    """Of K_1, dist_1, R_1, T_1, K_2, ...: a table for each camera that has a translation of its own."""
+    found: Sections = {}
+    for key, separator in itertools.product(list(values), ("_", "")):
+        base = next((one for one in _K if key.startswith(one + separator) and key != one + separator), None)
+        if base is None:
+            continue
+        ending = key[len(base) :]
+        own = {one: values[one + ending] for one in _OF_ONE if one + ending in values}
+        for short, name in (("W", _WIDTH[0]), ("H", _HEIGHT[0])):
+            if short in own:
+                own[name] = own.pop(short)
+        if _find(own, _T) is not None:
+            found[ending.removeprefix("_")] = own
+    return found
 
 
 def _camera(
@@ -85,8 +136,8 @@ def _camera(
 
 def _stereo(values: Values) -> list[Camera]:
     """R and T take the first camera's coordinates to the second's."""
-    first = _pose({key: value for key, value in values.items() if key not in ("R", "T")})
-    second = first @ np.linalg.inv(_rigid(_rotation(values, "R"), _translation(values, "T")))
+    first = _pose(_without_pair(values))
+    second = first @ np.linalg.inv(rigid(_rotation(values, "R"), _translation(values, "T")))
     return [
         _camera(values, name, _numbered(_K, number), _numbered(_D, number), pose)
         for name, number, pose in (("left", 1, first), ("right", 2, second))
@@ -95,16 +146,20 @@ def _stereo(values: Values) -> list[Camera]:
 
 def _rectified(values: Values) -> list[Camera]:
     """A rectified pair: P2 is K2 (I | t), with the baseline in t."""
-    first, cameras = _pose({key: value for key, value in values.items() if key not in ("R", "T")}), []
+    first, cameras = _pose(_without_pair(values)), []
     for name, key in (("left", "P1"), ("right", "P2")):
         P = _matrix(values, (key,), (3, 4))
         if not np.linalg.det(P[:, :3]):
             raise RigError(f"{key} is not a projection matrix of a camera")
         shift = np.linalg.solve(P[:, :3], P[:, 3]).astype(np.float64)
         _check_baseline(shift)
-        pose = first @ np.linalg.inv(_rigid(np.eye(3), shift))
+        pose = first @ np.linalg.inv(rigid(np.eye(3), shift))
         cameras.append(Camera(name, _size(values), _from_corner(P[:, :3]), pose))
     return cameras
+
+
+def _without_pair(values: Values) -> Values:
+    return {key: value for key, value in values.items() if key not in (*_R, *_T)}
 
 
 def _from_corner(K: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -151,16 +206,11 @@ def _pose(values: Values) -> NDArray[np.float64]:
     """`T_world_camera`, or the inverse of the extrinsics R and T; without them the camera is the world."""
     if "T_world_camera" in values:
         return _matrix(values, ("T_world_camera",), (4, 4))
-    if "R" in values or "T" in values:
-        outer = _rigid(_rotation(values, "R"), _translation(values, "T", longest=None))
+    R, T = _find(values, _R), _find(values, _T)
+    if R is not None or T is not None:
+        outer = rigid(_rotation(values, R or "R"), _translation(values, T or "T", longest=None))
         return np.linalg.inv(outer).astype(np.float64)
     return np.eye(4)
-
-
-def _rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, translation
-    return transform
 
 
 def _rotation(values: Values, key: str) -> NDArray[np.float64]:
@@ -171,11 +221,7 @@ def _rotation(values: Values, key: str) -> NDArray[np.float64]:
         return turned
     if given.size != 9:
         raise RigError(f"{key} has {given.size} numbers, expected a rotation: 9 of a matrix or 3 of a vector")
-    left, stretch, right = np.linalg.svd(given.reshape(3, 3))
-    if np.abs(stretch - 1.0).max() > 1e-3 or np.linalg.det(given.reshape(3, 3)) < 0.0:
-        raise RigError(f"{key} is not a rotation matrix")
-    rotation: NDArray[np.float64] = (left @ right).astype(np.float64)  # files have few digits
-    return rotation
+    return nearest_rotation(key, given.reshape(3, 3))
 
 
 def _translation(
@@ -223,7 +269,7 @@ def _numbers(values: Values, key: str, shape: tuple[int, ...] | None) -> tuple[f
     return given
 
 
-def _read(path: Path) -> Values:
+def _read(path: Path) -> tuple[Values, Sections]:
     data = read_bytes(path, error=RigError, most=_MOST_BYTES)
     try:
         text = data.decode("utf-8-sig")
@@ -232,25 +278,66 @@ def _read(path: Path) -> Values:
     if text.lstrip().startswith("<"):
         raise RigError(f"{path}: this is XML, expected OpenCV's YAML or JSON")
     if not text.lstrip().startswith("{"):
-        return dict(_yaml_entries(text))
+        return _yaml_tables(text)
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise RigError(f"{path}: not a calibration: it is no JSON") from error
     if not isinstance(content, dict):
         raise RigError(f"{path}: not a calibration: its JSON is no table")
-    return {str(key): _json_value(value) for key, value in content.items()}
+    return _json_values(content), dict(_json_sections(content))
+
+
+def _yaml_tables(text: str) -> tuple[Values, Sections]:
+    """The values at the top level, and the cameras below them."""
+    values: Values = {}
+    sections: Sections = {}
+    for name, body in _yaml_bodies(text):
+        if _SECTION.search(body):
+            sections[name] = dict(_yaml_entries(textwrap.dedent(body.strip("\n"))))
+        else:
+            values[name] = _yaml_value(body)
+    return values, sections
 
 
 def _yaml_entries(text: str) -> Iterator[tuple[str, tuple[float, ...] | str]]:
-    """The values at the top level: numbers, lists of numbers, matrices; anything else as text."""
+    return ((name, _yaml_value(body)) for name, body in _yaml_bodies(text))
+
+
+def _yaml_bodies(text: str) -> Iterator[tuple[str, str]]:
+    """Each key at the left margin, and what follows it."""
     starts = list(_ENTRY.finditer(text))
     ends = [start.start() for start in starts[1:]]
     for start, end in itertools.zip_longest(starts, ends):
-        body = text[start.end() : end].strip()
-        data = _DATA.search(body)
-        words = [word for word in _LIST.split(data[1] if data else body, _MOST_NUMBERS + 2) if word]
-        yield start[1], _as_numbers(words) or body.strip("\"' ")
+        yield start[1], text[start.end() : end]
+
+
+def _yaml_value(body: str) -> tuple[float, ...] | str:
+    """A number, a list of numbers, a matrix; anything else as text."""
+    body = body.strip()
+    data = _DATA.search(body)
+    words = [word for word in _LIST.split(data[1] if data else body, _MOST_NUMBERS + 2) if word]
+    return _as_numbers(words) or body.strip("\"' ")
+
+
+def _json_values(table: Mapping[str, object]) -> Values:
+    return {str(key): _json_value(value) for key, value in table.items()}
+
+
+def _json_sections(content: Mapping[str, object]) -> Iterator[tuple[str, Values]]:
+    """Tables of cameras at the top level, or in a table or list `cameras`."""
+    cameras = content.get("cameras", content)
+    if isinstance(cameras, list):
+        named = [
+            (str(one["name"]) if "name" in one else str(n), one)
+            for n, one in enumerate(cameras, 1)
+            if isinstance(one, dict)
+        ]
+    else:
+        named = list(cameras.items()) if isinstance(cameras, dict) else []
+    for name, one in named[: _MOST_SECTIONS + 1]:
+        if isinstance(one, dict) and _find(one, _K) is not None:
+            yield name, _json_values(one)
 
 
 def _json_value(value: object) -> tuple[float, ...] | str:

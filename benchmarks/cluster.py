@@ -1,0 +1,204 @@
+"""A Dask scheduler and its workers against this machine's worker processes: bytes, deaths, and overhead.
+
+python benchmarks/cluster.py [--frames 400000] [--pictures 5000] [--workers 4] [--rounds 2] [--shards 10000]
+
+Training sets and pictures are made by worker processes and by as many `dask worker` processes of one thread,
+in turns, and compared byte by byte. Then each is made once more while two of the workers are killed (SIGKILL)
+and another one is started. At last shards that do nothing show what the scheduler takes for each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from machine import describe
+
+from handsim.app.executors.dask_cluster import DaskCluster
+from handsim.app.executors.executor import Executor, Processes
+from render.config import RenderConfig
+from render.session import render_take
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
+from train.simulation.takes import TakeConfig, simulate_take
+
+WAIT = 60.0  # [s] for a scheduler or a worker to come
+
+
+@dataclass
+class DaskProcesses:
+    """A scheduler and workers, each a process of its own that was started by Dask's own command."""
+
+    folder: Path
+    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    @property
+    def address(self) -> str:
+        """The scheduler's, once it wrote its file."""
+        return str(json.loads((self.folder / "scheduler.json").read_text())["address"])
+
+    def start(self, count: int) -> None:
+        """Start the scheduler and some workers, and wait until all are there."""
+        self.scheduler = self._dask(
+            "scheduler", "--scheduler-file", "scheduler.json", "--port", "0", "--host", "127.0.0.1"
+        )
+        until = time.monotonic() + WAIT
+        while not (self.folder / "scheduler.json").exists():
+            assert time.monotonic() < until, "no scheduler"
+            time.sleep(0.05)
+        for _ in range(count):
+            self.add_worker()
+        from distributed import Client
+
+        with Client(self.address, set_as_default=False) as client:
+            client.wait_for_workers(count, timeout=WAIT)
+
+    def add_worker(self) -> None:
+        """Start one more, which does not come back when it is killed."""
+        options = ("--nthreads", "1", "--no-nanny", "--memory-limit", "0", "--local-directory", ".")
+        self.workers.append(self._dask("worker", self.address, *options))
+
+    def kill_worker(self) -> None:
+        """Kill the oldest one."""
+        self.workers.pop(0).send_signal(signal.SIGKILL)
+
+    def stop(self) -> None:
+        """End all of them."""
+        for process in (*self.workers, self.scheduler):
+            process.terminate()
+            process.wait()
+
+    def _dask(self, name: str, *options: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{name}", *options, "--no-dashboard"]
+        environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+        log = (self.folder / "dask.log").open("ab")
+        return subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env=environment)
+
+
+Make = Callable[[Path, Executor], object]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--frames", type=int, default=400_000, help="of the training sets")
+    parser.add_argument("--pictures", type=int, default=5_000)
+    parser.add_argument("--workers", type=int, default=4, help="processes of either kind")
+    parser.add_argument("--rounds", type=int, default=2, help="of each, in turns")
+    parser.add_argument("--shards", type=int, default=10_000, help="that do nothing")
+    options = parser.parse_args()
+    print(describe("dask", "distributed"))
+    with tempfile.TemporaryDirectory() as name, running(Path(name), options.workers) as dask:
+        folder = Path(name)
+        take = simulate_take(TakeConfig(kind="hand-hand", num_frames=options.pictures))
+        take.save(folder / "take.npz")
+        kinds: dict[str, Make] = {
+            f"{options.frames} training frames": functools.partial(frames, options.frames),
+            f"{options.pictures} pictures": functools.partial(pictures, folder / "take.npz"),
+        }
+        for kind, make in kinds.items():
+            compare(kind, make, dask, options)
+        empty_shards(dask, options)
+
+
+@contextmanager
+def running(folder: Path, workers: int) -> Iterator[DaskProcesses]:
+    """A cluster that ends with the block."""
+    dask = DaskProcesses(folder / "dask")
+    dask.folder.mkdir()
+    try:
+        dask.start(workers)
+        yield dask
+    finally:
+        dask.stop()
+
+
+def frames(count: int, out: Path, executor: Executor) -> None:
+    generate_dataset(DatasetConfig(num_frames=count, seed=3), out, workers=executor)
+
+
+def pictures(take: Path, out: Path, executor: Executor) -> None:
+    config = RenderConfig(passes=("rgb", "depth", "ids"), depth_sensor=None, color_sensor=None, seed=3)
+    render_take(take, out, ("webdataset",), config, workers=executor)
+
+
+def compare(kind: str, make: Make, dask: DaskProcesses, options: argparse.Namespace) -> None:
+    """Make the same in turns by either, and once more while workers die and come."""
+    seconds: dict[str, list[float]] = {"processes": [], "dask": []}
+    results: set[str] = set()
+    for _ in range(options.rounds):
+        for name, times in seconds.items():
+            with tempfile.TemporaryDirectory() as folder:
+                out = Path(folder) / "out"
+                executor = Processes(options.workers)
+                if name == "dask":
+                    executor = DaskCluster(dask.address, out, tell=lambda line: None)
+                start = time.perf_counter()
+                make(out, executor)
+                times.append(time.perf_counter() - start)
+                results.add(digest(out))
+    pool, there = (float(np.median(each)) for each in seconds.values())
+    print(
+        f"{kind}: {options.workers} processes {pool:.1f} s, {options.workers} Dask workers {there:.1f} s, "
+        f"overhead {100 * (there / pool - 1):.1f} %; bytes {'equal' if len(results) == 1 else 'DIFFER'}"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "out"
+        timers = [threading.Timer(share * there, dask.kill_worker) for share in (0.2, 0.5)]
+        timers.append(threading.Timer(0.4 * there, dask.add_worker))
+        for timer in timers:
+            timer.start()
+        start = time.perf_counter()
+        make(out, DaskCluster(dask.address, out, tell=lambda line: None))
+        took = time.perf_counter() - start
+        for timer in timers:
+            timer.join()
+        same = {digest(out)} == results
+    dask.add_worker()  # as many as before
+    print(
+        f"{kind}: two workers killed and one added: {took:.1f} s; bytes {'equal' if same else 'DIFFER'}",
+        flush=True,
+    )
+
+
+def digest(folder: Path) -> str:
+    """Of the names and bytes of all files, hidden ones too."""
+    whole = hashlib.sha256()
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            whole.update(f"{path.relative_to(folder)}".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return whole.hexdigest()
+
+
+def nothing(number: int) -> int:
+    return number
+
+
+def empty_shards(dask: DaskProcesses, options: argparse.Namespace) -> None:
+    """What either takes for a shard, if nothing is to be done."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, executor in (
+            ("Dask", DaskCluster(dask.address, Path(folder), tell=lambda line: None)),
+            ("processes", Processes(options.workers)),
+        ):
+            start = time.perf_counter()
+            done = sum(1 for _ in executor.run(nothing, range(options.shards)))
+            took = time.perf_counter() - start
+            print(f"{done} empty shards, {name}: {took:.1f} s, {1e3 * took / done:.2f} ms each", flush=True)
+
+
+if __name__ == "__main__":
+    main()

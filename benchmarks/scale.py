@@ -1,0 +1,141 @@
+"""What a million and a billion cost: processor time and bytes of each item, and how far a scheduler reaches.
+
+python benchmarks/scale.py [--core-hour 0.045] [--gigabyte-month 0.023] [--workers 4 16]
+
+Items are made in this process by one thread, and processor time counts, so that other work on the machine
+matters little. Prices are dollars per core-hour and per gigabyte and month. For the scheduler's part a Dask
+cluster of many workers with one thread each runs in this process; its shards sleep for a second, and what
+takes longer than that is the scheduler's, and that of this machine's cores, which all workers share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from machine import describe
+
+from handsim.app.executors.dask_cluster import DaskCluster
+from render.config import RenderConfig
+from render.session import render_take
+from train.data.augmentation import Corruption, corrupt
+from train.labelers.storage import load_labeler
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.generation import generate_dataset
+from train.simulation.held_out import held_out_markers
+from train.simulation.takes import TakeConfig, simulate_take
+
+SHARD = 1.0  # [s] that a shard sleeps
+EACH = 8  # shards of each worker
+PICTURES = 192
+PERFECT = RenderConfig(depth_sensor=None, color_sensor=None)
+
+
+class Cost(NamedTuple):
+    """Of one item, on one core."""
+
+    seconds: float
+    num_bytes: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--core-hour", type=float, default=0.045)
+    parser.add_argument("--gigabyte-month", type=float, default=0.023)
+    parser.add_argument("--workers", type=int, nargs="*", default=[4, 16])
+    options = parser.parse_args()
+    print(describe("dask", "torch"))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        items = {
+            "training frames": cost(lambda out: frames(out, 24_576), folder / "frames"),
+            "pictures": cost(lambda out: pictures(out, PERFECT), folder / "plain"),
+            "pictures with sensors": cost(lambda out: pictures(out, RenderConfig()), folder / "sensed"),
+            "labeled hands": label_cost(),
+        }
+        for kind, one in items.items():
+            print_cost(kind, one, options)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        print(f"largest memory so far: {peak / 1e6:.2g} GB")
+        for count in options.workers:
+            share = efficiency(count, folder)
+            print(f"{count} workers: {100 * share:.0f} % of their time in shards of a second", flush=True)
+
+
+def cost(make: Callable[[Path], int], out: Path) -> Cost:
+    """Processor time and bytes of an item; `make` returns how many it made."""
+    make(out.with_name(f"{out.name}-first"))  # kernels and tables are loaded
+    start = time.process_time()
+    count = make(out)
+    seconds = time.process_time() - start
+    files = [path.stat().st_size for path in out.rglob("*") if path.is_file()]
+    return Cost(seconds / count, sum(files) / count)
+
+
+def frames(out: Path, count: int) -> int:
+    generate_dataset(DatasetConfig(num_frames=count, seed=1), out, workers=1)
+    return count
+
+
+def pictures(out: Path, config: RenderConfig) -> int:
+    """Two hands, with colors, depth, normals, ids and keypoints."""
+    take = out.parent / "take.npz"
+    if not take.exists():
+        simulate_take(TakeConfig(kind="hand-hand", num_frames=PICTURES, seed=1)).save(take)
+    return render_take(take, out, ("webdataset",), config, workers=1)
+
+
+def label_cost(count: int = 6000) -> Cost:
+    """Corrupted clouds of the dense19 glove in batches, without files."""
+    cloud = corrupt(held_out_markers("dense19", count, seed=1), Corruption(), rng=np.random.default_rng(0))
+    hands = [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)]
+    labeler = load_labeler("dense19")
+    labeler.label_frames(hands[:256])
+    start = time.process_time()
+    labeler.label_frames(hands)
+    return Cost((time.process_time() - start) / count, 0.0)
+
+
+def print_cost(kind: str, one: Cost, options: argparse.Namespace) -> None:
+    hours = one.seconds / 3600.0
+    print(f"{kind}: {1e-3 / hours:.0f} thousand a core-hour, {one.num_bytes / 1e3:.2f} kB each")
+    for name, count in (("million", 1e6), ("billion", 1e9)):
+        core_hours, gigabytes = count * hours, count * one.num_bytes / 1e9
+        print(
+            f"  {name}: {plain(core_hours)} core-hours, {plain(gigabytes)} GB; "
+            f"${plain(options.core_hour * core_hours)}, "
+            f"and ${plain(options.gigabyte_month * gigabytes)} a month"
+        )
+
+
+def plain(number: float) -> str:
+    """Two figures that count, without an exponent."""
+    rounded = float(f"{number:.2g}")
+    return f"{rounded:,.0f}" if rounded >= 10.0 else f"{rounded:g}"
+
+
+def rest(number: int) -> int:
+    time.sleep(SHARD)
+    return number
+
+
+def efficiency(count: int, folder: Path) -> float:
+    """Share of the workers' time that is spent in shards."""
+    from distributed import LocalCluster
+
+    options = {"n_workers": count, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
+    with LocalCluster(**options, protocol="tcp://", host="127.0.0.1", silence_logs="CRITICAL") as cluster:
+        executor = DaskCluster(cluster.scheduler_address, folder, tell=lambda line: None)
+        start = time.perf_counter()
+        done = sum(1 for _ in executor.run(rest, range(EACH * count)))
+        return done * SHARD / count / (time.perf_counter() - start)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,260 @@
+"""Train a network that finds 21 keypoints of a hand on drawn pictures alone, and look at photographs with it.
+
+    python examples/14_train_a_keypoint_network.py            # seconds, too little to learn anything
+    python examples/14_train_a_keypoint_network.py --pictures 20000 --samples 400000 --out network.pt \
+        --photos Dataset --reference reference.json          # hours on two cores
+
+The photographs may be any pictures of single hands; the reference holds keypoints for some of them, by file:
+{"3/IMG_4509.JPG": {"points": [[x, y], ...21], "score": 0.98}} in pixels, from people or from a detector.
+PCK@0.1 is the share of keypoints that are found within a tenth of the longer side of their hand's box.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+from torch.nn import functional
+
+from handsim import HandModel
+from poses import load_gestures, sample_poses
+from render import PoseFile, RenderConfig, ViewConfig, render_take
+
+SIZE = 128  # of a crop [px]
+HEAT = 16  # cells of a heat map, each way
+SPREAD = 0.06  # of the heat around a keypoint [share of the side]
+
+
+class Pictures(NamedTuple):
+    """Square crops around hands, and the keypoints in them."""
+
+    crops: np.ndarray
+    """(N, 160, 160, 3) sRGB, as `draw` cuts them: wider than the network sees."""
+    points: np.ndarray
+    """(N, 21, 2) [px]."""
+    sizes: np.ndarray
+    """Longer side of each hand's box (N,) [px]."""
+
+
+WIDE = 160  # of a stored crop [px]
+
+
+def write_poses(path: Path, count: int, rng: np.random.Generator) -> None:
+    """A pose file: half random poses, half named gestures, a little changed."""
+    model = HandModel.named("M")
+    qpos = sample_poses(model, count, rng=rng)
+    gestures = list(load_gestures().values())
+    for row in np.flatnonzero(rng.random(count) < 0.5):
+        angles = gestures[rng.integers(len(gestures))] + rng.normal(0.0, np.deg2rad(4.0), 20)
+        qpos[row, 7:] = np.clip(angles, *model.skeleton.ranges.T)
+    qpos[:, :3] = 0.0
+    qpos[:, 3:7] = [1.0, 0.0, 0.0, 0.0]
+    np.savez(path, qpos=qpos)
+
+
+def draw(count: int, seed: int) -> Pictures:
+    """Draw hands of many people from everywhere, and cut them out."""
+    rng = np.random.default_rng(seed)
+    view = ViewConfig(placement="anywhere", distance=(0.45, 0.8))
+    config = RenderConfig(passes=("rgb", "ids"), view=view, vary="frame", frames_per_shard=4, seed=seed)
+    found = []
+    with TemporaryDirectory() as name:
+        for side in ("right", "left"):
+            path, out = Path(name) / f"{side}.npz", Path(name) / side
+            write_poses(path, count // 2, rng)
+            render_take(PoseFile(path, sides=(side,)), out, ["coco"], config)
+            coco = json.loads((out / "annotations.json").read_text())
+            files = {image["id"]: out / "images" / image["file_name"] for image in coco["images"]}
+            for hand in coco["annotations"]:
+                pixels = np.array(hand["keypoints"]).reshape(21, 3)[:, :2]
+                found.append(cut_out(cv2.imread(str(files[hand["image_id"]]))[..., ::-1], pixels, rng))
+    return Pictures(*(np.stack(values) for values in zip(*found, strict=True)))
+
+
+def cut_out(picture: np.ndarray, pixels: np.ndarray, rng: np.random.Generator) -> tuple:
+    """A square around a hand with room for shifts and turns."""
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    side = (high - low).max() * rng.uniform(1.5, 2.4)
+    scale = WIDE / side
+    matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])
+    matrix[:, 2] = WIDE / 2 - scale * (low + high) / 2
+    crop = cv2.warpAffine(np.ascontiguousarray(picture), matrix, (WIDE, WIDE), borderMode=cv2.BORDER_REFLECT)
+    points = pixels @ matrix[:, :2].T + matrix[:, 2]
+    return crop, points, float(np.ptp(points, axis=0).max())
+
+
+def batches(pictures: Pictures, size: int, rng: np.random.Generator) -> Iterator[tuple]:
+    """Endless batches: turned, shifted, scaled, mirrored, in other colors."""
+    while True:
+        images, targets = [], []
+        for number in rng.integers(len(pictures.crops), size=size):
+            turn, scale = rng.uniform(-40.0, 40.0), rng.uniform(0.75, 1.15)
+            matrix = cv2.getRotationMatrix2D((WIDE / 2, WIDE / 2), turn, scale)
+            matrix[:, 2] += rng.uniform(-10.0, 10.0, 2) - (WIDE - SIZE) / 2
+            image = cv2.warpAffine(
+                pictures.crops[number], matrix, (SIZE, SIZE), borderMode=cv2.BORDER_REFLECT
+            )
+            points = pictures.points[number] @ matrix[:, :2].T + matrix[:, 2]
+            if rng.random() < 0.5:
+                image, points = image[:, ::-1], [SIZE - 1, 0] + points * [-1, 1]
+            image = image * rng.uniform(0.7, 1.3, 3) * rng.uniform(0.8, 1.2) + rng.uniform(-15.0, 15.0)
+            if rng.random() < 0.5:
+                image = cv2.GaussianBlur(np.ascontiguousarray(image), (5, 5), rng.uniform(0.3, 1.5))
+            images.append(np.clip(image, 0.0, 255.0))
+            targets.append(points)
+        yield to_input(np.stack(images)), torch.from_numpy(np.stack(targets).astype(np.float32)) / SIZE
+
+
+def to_input(images: np.ndarray) -> torch.Tensor:
+    """Pictures (B, 128, 128, 3) as a tensor (B, 3, 128, 128), each of mean 0 and deviation 1."""
+    tensor = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32))
+    tensor = (tensor - tensor.mean((1, 2, 3), keepdim=True)) / (tensor.std((1, 2, 3), keepdim=True) + 1.0)
+    return tensor.to(memory_format=torch.channels_last)
+
+
+class Block(nn.Module):
+    """An inverted residual of MobileNetV2 (Sandler et al. 2018)."""
+
+    def __init__(self, inside: int, outside: int, stride: int, expand: int = 4) -> None:
+        super().__init__()
+        middle = inside * expand
+        self.layers = nn.Sequential(
+            *(nn.Conv2d(inside, middle, 1, bias=False), nn.BatchNorm2d(middle), nn.ReLU6()),
+            nn.Conv2d(middle, middle, 3, stride, 1, groups=middle, bias=False),
+            *(nn.BatchNorm2d(middle), nn.ReLU6()),
+            *(nn.Conv2d(middle, outside, 1, bias=False), nn.BatchNorm2d(outside)),
+        )
+        self.adds = stride == 1 and inside == outside
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Features in, features out."""
+        return x + self.layers(x) if self.adds else self.layers(x)
+
+
+class KeypointNetwork(nn.Module):
+    """Heat maps of 21 keypoints; a keypoint is the mean place of its map."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Sequential(
+            *(nn.Conv2d(3, 16, 3, 2, 1, bias=False), nn.BatchNorm2d(16), nn.ReLU6()),
+            *(nn.Conv2d(16, 24, 3, 2, 1, bias=False), nn.BatchNorm2d(24), nn.ReLU6()),
+        )
+        self.fine = nn.Sequential(Block(24, 24, 1, 2), Block(24, 48, 2), Block(48, 48, 1))
+        self.coarse = nn.Sequential(Block(48, 64, 2), Block(64, 64, 1), Block(64, 96, 2), Block(96, 96, 1))
+        self.up = nn.Conv2d(96, 64, 1)
+        self.head = nn.Sequential(
+            nn.Conv2d(112, 96, 1), nn.ReLU6(), Block(96, 96, 1, 2), nn.Conv2d(96, 21, 1)
+        )
+        at = (torch.arange(HEAT) + 0.5) / HEAT
+        self.register_buffer(
+            "places", torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Keypoints (B, 21, 2) of pictures (B, 3, 128, 128), shares of the side."""
+        return self.heat(x).softmax(dim=2) @ self.places
+
+    def loss(self, x: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """How little of the heat is near the keypoints, and how far its mean is from them."""
+        heat = self.heat(x)
+        near = torch.exp(-(torch.cdist(points, self.places.expand(len(x), -1, -1)) ** 2) / (2 * SPREAD**2))
+        near = near / near.sum(dim=2, keepdim=True).clamp(min=1e-6)
+        found = heat.softmax(dim=2) @ self.places
+        return -(near * heat.log_softmax(dim=2)).sum(dim=2).mean() + 10.0 * (found - points).abs().mean()
+
+    def heat(self, x: torch.Tensor) -> torch.Tensor:
+        """Heat (B, 21, cells) before it is made a share of 1."""
+        fine = self.fine(self.stem(x))
+        coarse = functional.interpolate(self.up(self.coarse(fine)), size=HEAT, mode="bilinear")
+        return self.head(torch.cat([fine, coarse], dim=1)).flatten(2)
+
+
+def train(pictures: Pictures, samples: int, seed: int = 0, batch: int = 32) -> KeypointNetwork:
+    """Train a network on pictures."""
+    torch.manual_seed(seed)
+    network = KeypointNetwork().to(memory_format=torch.channels_last)
+    steps = max(1, samples // batch)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=0.01)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps + 1)
+    source, start, mean = batches(pictures, batch, np.random.default_rng(seed)), time.time(), 0.0
+    for step in range(1, steps + 1):
+        images, targets = next(source)
+        loss = network.loss(images, targets)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        mean += (loss.item() - mean) / min(step, 200)
+        if step % max(1, steps // 10) == 0:
+            seconds = time.time() - start
+            print(f"{step * batch} samples, loss {mean:.2f}, {seconds:.0f} s")
+    return network.eval()
+
+
+@torch.inference_mode()
+def find(network: KeypointNetwork, pictures: np.ndarray) -> np.ndarray:
+    """Keypoints (N, 21, 2) in pictures (N, 128, 128, 3): the mean of those in each and its mirror image."""
+    found = []
+    for first in range(0, len(pictures), 64):
+        some = pictures[first : first + 64]
+        here, mirrored = (network(to_input(images)).numpy() for images in (some, some[:, :, ::-1]))
+        found.append(SIZE * (here + [1, 0] + mirrored * [-1, 1]) / 2)
+    return np.concatenate(found)
+
+
+def load_photos(folder: Path, reference: Path) -> Pictures:
+    """Photographs that the reference is sure of, as the network sees them."""
+    entries = {name: one for name, one in json.loads(reference.read_text()).items() if one["score"] > 0.9}
+    crops, points, sizes = [], [], []
+    for name, one in entries.items():
+        image = cv2.imread(str(folder / name))[..., ::-1]
+        scale = SIZE / max(image.shape[:2])
+        crops.append(cv2.resize(np.ascontiguousarray(image), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC))
+        points.append(scale * np.array(one["points"]))
+        sizes.append(np.ptp(points[-1], axis=0).max())
+    return Pictures(np.stack(crops), np.stack(points), np.array(sizes))
+
+
+def pck(network: KeypointNetwork, pictures: Pictures) -> float:
+    """PCK@0.1."""
+    off = np.linalg.norm(find(network, pictures.crops) - pictures.points, axis=2)
+    return float((off < 0.1 * pictures.sizes[:, None]).mean())
+
+
+def middle_of(pictures: Pictures) -> Pictures:
+    """What the network sees of stored crops."""
+    edge = (WIDE - SIZE) // 2
+    return Pictures(pictures.crops[:, edge:-edge, edge:-edge], pictures.points - edge, pictures.sizes)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--pictures", type=int, default=16)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--photos", type=Path)
+    parser.add_argument("--reference", type=Path)
+    options = parser.parse_args()
+    pictures, held_out = draw(options.pictures, seed=1), draw(max(8, options.pictures // 20), seed=2)
+    print(f"{len(pictures.crops)} pictures to learn from, {len(held_out.crops)} others")
+    network = train(pictures, options.samples)
+    print(f"drawn hands: PCK@0.1 {100 * pck(network, middle_of(held_out)):.1f} %")
+    if options.photos is not None and options.reference is not None:
+        photos = load_photos(options.photos, options.reference)
+        print(f"{len(photos.crops)} photographs: PCK@0.1 {100 * pck(network, photos):.1f} %")
+    if options.out is not None:
+        torch.save(network.state_dict(), options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,96 @@
+"""The search for a rig against trying everything, and the views of candidates against a rig's own."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from gloves.layout import load_layout
+from handsim.errors import ArgumentError
+from handsim.space.cameras import ROOM_CENTER, CameraRig, named_rig
+from train.rig_advice.candidate_views import view_candidates
+from train.rig_advice.forecast import light
+from train.rig_advice.plan import LensKind, plan
+from train.rig_advice.planning import Planning
+
+LENS = LensKind(float(np.deg2rad(60.0)), 1280)
+
+
+@pytest.fixture(scope="module")
+def candidates(work):
+    """Ten of the sixteen cameras of `figure5`, as candidates."""
+    poses = named_rig("figure5").T_world_camera[[0, 2, 4, 6, 8, 10, 11, 13, 14, 15]]
+    return poses, view_candidates([one.faster(4) for one in work], poses, *LENS, rng=np.random.default_rng(0))
+
+
+def seen_of(views):
+    flags = np.unpackbits(views.bits.view(np.uint8), axis=1).astype(bool)
+    assert not flags[:, views.num_marker_frames :].any()
+    return flags[:, : views.num_marker_frames].T
+
+
+def test_candidates_see_what_a_rig_of_them_sees(candidates, work):
+    poses, views = candidates
+    rig = CameraRig("ten", poses, *LENS)
+    lit = light([one.faster(4) for one in work], rig, rng=np.random.default_rng(0))
+    expected = np.concatenate([one.seen.reshape(-1, 10) for one in lit])
+    seen = seen_of(views)
+    assert seen.shape == expected.shape
+    assert (seen == expected).mean() > 0.98  # the visible spots are drawn anew
+    tilted = poses.copy()
+    tilted[:, :3, :3] = poses[:, :3, :3] @ np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    away = view_candidates(work[:1], tilted, *LENS, rng=np.random.default_rng(0))
+    assert not away.bits.any() and not away.told.any()
+
+
+def test_the_search_finds_the_best_of_all_choices(candidates):
+    poses, views = candidates
+    search = Planning(views, poses[:, :3, 3])
+    values = {chosen: search._value_of(chosen) for chosen in itertools.combinations(range(len(poses)), 4)}
+    steps = []
+    search.grow(4)
+    search.exchange(steps.append)
+    assert steps == sorted(steps)
+    assert search.value == pytest.approx(values[tuple(sorted(search.chosen))])
+    assert search.value > max(values.values()) - 0.003
+    assert search.value > np.percentile(list(values.values()), 95)
+
+
+def test_the_value_is_that_of_shares_and_errors(candidates):
+    poses, views = candidates
+    search = Planning(views, poses[:, :3, 3])
+    count = seen_of(views)[:, [1, 5, 7]].sum(axis=1)
+    shares = [(count >= level).mean() for level in (1, 2, 3, 4)]
+    told = views.told[:, [1, 5, 7]].sum(axis=1).astype(float)
+    errors = []
+    for a, b, c, d, e, f in told.T:
+        matrix = np.array([[a, b, c], [b, d, e], [c, e, f]])
+        good = np.linalg.matrix_rank(matrix) == 3 and np.linalg.cond(matrix) < 1e5
+        errors.append(min(1.5, np.sqrt(np.trace(np.linalg.inv(matrix)))) if good else 1.5)
+    expected = np.dot(shares, (0.02, 0.4, 0.6, 0.05)) - 0.15 * np.mean(errors)
+    assert search._value_of([1, 5, 7]) == pytest.approx(expected, abs=2e-3)
+    assert search._values_with([1, 5])[7] == pytest.approx(search._value_of([1, 5, 7]), abs=1e-6)
+
+
+def test_kept_cameras_stay_and_too_many_have_no_room(candidates):
+    poses, views = candidates
+    search = Planning(views, poses[:, :3, 3], kept=[3, 8])
+    search.grow(5)
+    search.exchange()
+    assert search.chosen[:2] == [3, 8] and len(set(search.chosen)) == 5
+    with pytest.raises(ArgumentError, match=r"there is room for 10 cameras 0\.3 m apart, expected 11"):
+        search.grow(11)
+
+
+def test_a_plan_beats_cameras_in_a_row():
+    row = np.stack([named_rig("figure5").T_world_camera[n] for n in (0, 1)])
+    old = CameraRig("row", row, *LENS)
+    found = plan(
+        4, np.array([2.4, 1.8, 2.2]), ("truss",), load_layout("tips8"), np.array(ROOM_CENTER),
+        np.full(3, 0.6), LENS, old, name="new",
+    )  # fmt: skip
+    assert found.rig.T_world_camera[:2] == pytest.approx(row)
+    assert len(found.rig.positions) == len(found.targets) == 4
+    assert found.after.seen_by_two > found.before.seen_by_two + 0.1

@@ -1,0 +1,225 @@
+"""Training in two processes is training in one: the same samples, losses and weights, if resumed too."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from handsim.app.cli import main
+from handsim.app.interrupts import Stopped
+from handsim.errors import ArgumentError, WeightsError
+from train.config import SetLabelerConfig, TrainConfig, default_config
+from train.data.batches import Part, draw_batch
+from train.data.shards import Dataset
+from train.devices.fabric_start import start_fabric
+from train.devices.world import World
+from train.labelers.cnn_network import DeepLabelCNN
+from train.labelers.kinds import batch_loss, new_network, prepare_network
+from train.labelers.storage import CARD, WEIGHTS, load_network
+from train.loop import CHECKPOINT, train_labeler
+from train.reports.run_page import PAGE
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.frame_scenes import SceneMix
+from train.simulation.generation import generate_dataset
+
+pytestmark = pytest.mark.xdist_group("many devices")  # what they share is made once
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
+ONE = TrainConfig(samples=640, batch=32, network=SMALL)
+TWO = dataclasses.replace(ONE, devices=2)
+OPTIONS = ["--samples", "640", "--batch", "32", "--network.width", "8", "--network.gates", "2"]
+OPTIONS += ["--network.depth", "1"]
+HANDSIM = [sys.executable, "-c", "import sys; from handsim.app.cli import main; sys.exit(main())"]
+SRUN = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NAME": "training", "SLURM_NODELIST": "127.0.0.1"}
+SRUN |= {"SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2", "SLURM_NNODES": "1", "SLURM_STEP_NUM_NODES": "1"}
+SRUN |= {"SLURM_NODEID": "0"}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sets") / "small"
+    config = DatasetConfig(num_frames=300, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
+    generate_dataset(config, out, workers=1)
+    return Dataset(out)
+
+
+@pytest.fixture(scope="module")
+def one(dataset, tmp_path_factory):
+    """A run on one device."""
+    out = tmp_path_factory.mktemp("runs") / "one"
+    train_labeler(dataset, ONE, out, threads=1)
+    return out
+
+
+def weights_of(run):
+    return load_network(run)[0].state_dict()
+
+
+def losses_of(run):
+    return np.array(torch.load(run / CHECKPOINT, weights_only=True)["history"]["losses"])
+
+
+def check_same_run(run, other):
+    """Rounding differs: gradients are added in another order."""
+    assert losses_of(run) == pytest.approx(losses_of(other), rel=1e-3)
+    for name, values in weights_of(other).items():
+        assert torch.allclose(weights_of(run)[name], values, atol=1e-3), name
+    curves = [json.loads((folder / CARD).read_text())["curve"] for folder in (run, other)]
+    assert [entry[0] for entry in curves[0]] == [entry[0] for entry in curves[1]]
+    assert (run / PAGE).is_file() and not list(run.glob(".*"))
+
+
+def stop_at(samples):
+    """A progress that interrupts this process, as Ctrl-C does."""
+
+    def progress(done, expected, loss):
+        if done == samples:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    return progress
+
+
+@pytest.mark.parametrize(("first", "then"), [(TWO, ONE), (ONE, TWO)])
+def test_a_run_goes_on_with_another_number_of_devices(dataset, one, tmp_path, first, then):
+    with pytest.raises(Stopped, match=r"of 640 samples are kept in .*checkpoint\.pt") as stopped:
+        train_labeler(dataset, first, tmp_path / "run", progress=stop_at(64), threads=1)
+    assert stopped.value.number == signal.SIGINT
+    done = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)["done"]
+    assert 64 <= done < 640
+    steps = []
+    card = train_labeler(
+        dataset, then, tmp_path / "run", progress=lambda *step: steps.append(step[0]), threads=1
+    )
+    assert steps == list(range(done + 32, 641, 32))
+    assert card["train"]["devices"] == then.devices
+    check_same_run(tmp_path / "run", one)
+
+
+def environment(**variables):
+    """This one, with the sources and without a word about processes."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("SLURM_")}
+    return {**kept, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", **variables}
+
+
+def test_torchrun_needs_no_options(dataset, one, tmp_path):
+    command = tmp_path / "handsim"
+    command.write_text(f"#!/bin/sh\nexec '{sys.executable}' -c '{HANDSIM[2]}' \"$@\"\n")
+    command.chmod(0o755)
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run(
+        [*torchrun, "--no-python", command, "train", dataset.path, "--out", tmp_path / "run", *OPTIONS],
+        capture_output=True, text=True, check=False, env=environment(),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("weights and model card in") == done.stdout.count("report in") == 1
+    check_same_run(tmp_path / "run", one)
+    assert json.loads((tmp_path / "run" / CARD).read_text())["train"]["devices"] == 2
+
+
+def tasks_of_srun(dataset, out, *options):
+    """The two processes that `srun --ntasks 2` starts, in their environment."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    return [
+        subprocess.Popen(
+            [*HANDSIM, "train", str(dataset.path), "--out", str(out), *OPTIONS, *options],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            env=environment(**SRUN, SLURM_PROCID=str(rank), SLURM_LOCALID=str(rank), MASTER_PORT=port),
+        )
+        for rank in range(2)
+    ]  # fmt: skip
+
+
+def ends_of(tasks):
+    outputs = [task.communicate(timeout=300) for task in tasks]
+    return [task.returncode for task in tasks], *zip(*outputs, strict=True)
+
+
+def test_a_run_of_slurm_is_stopped_by_a_signal_to_one_task(dataset, one, tmp_path):
+    tasks = tasks_of_srun(dataset, tmp_path / "run")
+    while not (tmp_path / "run" / "train.json").exists() and tasks[0].poll() is None:
+        time.sleep(0.05)
+    tasks[1].send_signal(signal.SIGTERM)
+    codes, said, told = ends_of(tasks)
+    assert codes == [143, 143], told
+    assert said == ("", "") and told[1] == ""
+    assert told[0].startswith("handsim train: ended by SIGTERM") and told[0].count("\n") == 1
+
+
+def test_a_mistake_ends_all_tasks_with_one_sentence(dataset, one):
+    codes, said, told = ends_of(tasks_of_srun(dataset, one, "--seed", "1"))
+    assert codes == [1, 1], told
+    assert said == ("", "") and told[1] == "" and told[0].count("\n") == 1
+    assert "holds a training run begun with other settings (train.seed: 0 there, 1 here)" in told[0]
+
+
+@pytest.mark.parametrize(
+    "options", [["--seed", "-1"], ["--sed", "1"], ["--preset", "han2018", "--seed", "x"]]
+)
+def test_a_mistake_in_the_options_is_told_by_the_first_process_alone(dataset, capsys, monkeypatch, options):
+    for name, value in World(1, 1, 2, 2).variables().items():
+        monkeypatch.setenv(name, value)
+    try:
+        code = main(["train", str(dataset.path), "--out", "unused", *options])
+    except SystemExit as end:
+        code = end.code
+    assert code in (1, 2) and capsys.readouterr() == ("", "")
+
+
+def test_other_devices_than_there_are_processes_are_told(tmp_path, monkeypatch):
+    for name, value in World(0, 0, 2, 2).variables().items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ArgumentError, match="devices is 3, but torchrun started 2 processes on this machine"):
+        start_fabric(TrainConfig(devices=3), tmp_path)
+
+
+def test_more_devices_than_clouds_are_told(dataset, tmp_path):
+    with pytest.raises(ArgumentError, match="batch is 32, expected at least 33: a cloud for each device"):
+        train_labeler(dataset, dataclasses.replace(ONE, devices=33), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_of_an_earlier_version_with_its_number_of_devices_goes_on(dataset, tmp_path):
+    short = dataclasses.replace(ONE, samples=64)
+    train_labeler(dataset, short, tmp_path)
+    settings = json.loads((tmp_path / "train.json").read_text())
+    assert "devices" not in settings["train"]
+    settings["train"]["devices"] = 4
+    (tmp_path / "train.json").write_text(json.dumps(settings))
+    train_labeler(dataset, short, tmp_path)
+    with pytest.raises(WeightsError, match=r"\(train.seed: 0 there, 1 here\)"):
+        train_labeler(dataset, dataclasses.replace(short, seed=1), tmp_path)
+
+
+@pytest.mark.parametrize("views", ["aligned", "random"])
+def test_parts_of_a_batch_give_the_papers_network_the_loss_of_the_whole(dataset, tmp_path, views):
+    """Each cloud keeps its own view; batch normalization is off, which sees the part alone."""
+    config = default_config("cnn")
+    config = dataclasses.replace(config, batch=7, cnn=dataclasses.replace(config.cnn, views=views))
+    fabric = start_fabric(TrainConfig(precision="32"), tmp_path)
+    network = new_network(config.cnn)
+    assert isinstance(network, DeepLabelCNN)
+    prepare_network(network, dataset.mapped_rows())
+    network.eval()
+
+    def loss(part):
+        rng = np.random.default_rng(3)
+        batch = draw_batch(dataset.mapped_rows(), config, rng=rng)
+        with torch.no_grad():
+            return float(batch_loss(config, network, batch, fabric.device, rng=rng, part=part))
+
+    parts = [loss(Part(first, 3)) for first in range(3)]
+    assert np.mean(parts) == pytest.approx(loss(Part()), rel=1e-5)
+    assert (tmp_path / WEIGHTS).exists() is False

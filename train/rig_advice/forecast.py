@@ -1,0 +1,192 @@
+"""The forecast of a rig: what captures of hands at work will miss, by simulated takes' optical system."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from gloves.captures.gaps import run_lengths
+from gloves.optics.blobs import MARKER_RADIUS
+from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from gloves.optics.strays import StrayConfig
+from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
+from train.rig_advice.point_error import ErrorEllipsoid, covariances, ellipsoid
+from train.simulation.light_sources import LightSources, sample_light_sources
+from train.simulation.motion import SceneMotion
+from train.simulation.room import label_false_points
+from train.simulation.room_settings import RoomConfig
+from train.simulation.sight import SceneSight
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool
+
+_ERRORS: Final = 4000  # marker-frames of a scene from which the error is taken
+ROOM: Final = RoomConfig(strays=StrayConfig(number=0.0))
+"""A well-kept optical system; how many stray reflections a room has does not depend on its cameras."""
+
+
+class LitScene(NamedTuple):
+    """A scene, and all that shines in it as the cameras of a rig see it."""
+
+    scene: SceneMotion
+    sources: LightSources
+
+    @property
+    def num_markers(self) -> int:
+        """Markers of the hands, the first of the sources."""
+        return sum(hand.fit.layout.num_markers for hand in self.scene.hands)
+
+    @property
+    def num_worn(self) -> int:
+        """These and the markers of the object, which come next."""
+        held = self.scene.moving_object
+        return self.num_markers + (0 if held is None else len(held.rigid_object.markers))
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "T M C"]:
+        """Which cameras have a free view of the hands' markers."""
+        return self.sources.visible[:, : self.num_markers]
+
+    def without(self, camera: int) -> LitScene:
+        """The same before one camera less."""
+        visible = np.delete(self.sources.visible, camera, axis=2)
+        return self._replace(sources=self.sources._replace(visible=visible))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forecast:
+    """What a rig makes of hands at work; shares are of marker-frames: every marker in every frame."""
+
+    marker_frames: int
+    seen_by_two: float
+    """Share that two cameras or more see."""
+    seen_by_three: float
+    missing: float
+    """Share without a point."""
+    gaps: float
+    """Gaps of a marker in a minute."""
+    gap_median: float
+    """Length of a gap [s]; NaN without gaps."""
+    gap_p95: float
+    ghosts: float
+    """Points of a frame that are no marker."""
+    error: ErrorEllipsoid
+
+
+class CameraLoss(NamedTuple):
+    """What one camera is worth."""
+
+    seen: float
+    """Share of the marker-frames that it sees."""
+    needed: float
+    """Share of the marker-frames that it sees and fewer than two others see."""
+    without: Forecast | None
+    """Without it; None where two cameras are all there are."""
+
+
+def light(scenes: Sequence[SceneMotion], rig: CameraRig, *, rng: np.random.Generator) -> list[LitScene]:
+    """Cast all lines of sight.
+
+    Args:
+        scenes: Hands at work.
+        rig: The cameras.
+        rng: Source of the spots of markers that are seen past an edge.
+
+    Raises:
+        ArgumentError: A camera stands in the hands.
+    """
+    return [LitScene(scene, sample_light_sources(SceneSight(scene, rig), ROOM, rng=rng)) for scene in scenes]
+
+
+def forecast(
+    lit: Sequence[LitScene], rig: CameraRig, optics: OpticsConfig = ROOM.optics, *, seed: int = 0
+) -> Forecast:
+    """What the optical system makes of scenes.
+
+    Args:
+        lit: Scenes as this rig sees them.
+        rig: The cameras.
+        optics: Noise and losses.
+        seed: Of noise and losses.
+    """
+    rng = np.random.default_rng(seed)
+    counted = [_count(one, rig, optics, rng) for one in lit]
+    total = sum(one.marker_frames for one in counted)
+    minutes = sum(one.minutes for one in counted)
+    lengths = np.concatenate([one.lengths for one in counted])
+    median, p95 = np.percentile(lengths, [50, 95]) if len(lengths) else (np.nan, np.nan)
+    return Forecast(
+        total,
+        sum(one.two for one in counted) / total,
+        sum(one.three for one in counted) / total,
+        sum(one.missing for one in counted) / total,
+        len(lengths) / minutes,
+        float(median),
+        float(p95),
+        sum(one.ghosts for one in counted) / sum(one.scene_frames for one in counted),
+        ellipsoid(np.concatenate([one.spread for one in counted])),
+    )
+
+
+def camera_losses(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> list[CameraLoss]:
+    """What each camera is worth: the same hands without it."""
+    counts = [one.seen.sum(axis=-1) for one in lit]
+    total = sum(count.size for count in counts)
+    found = []
+    for camera in range(len(rig.positions)):
+        mine = [one.seen[..., camera] for one in lit]
+        seen = sum(int(part.sum()) for part in mine)
+        needed = sum(
+            int((part & (count <= FEWEST_CAMERAS)).sum()) for part, count in zip(mine, counts, strict=True)
+        )
+        without = None
+        if len(rig.positions) > FEWEST_CAMERAS:
+            fewer = dataclasses.replace(rig, T_world_camera=np.delete(rig.T_world_camera, camera, axis=0))
+            without = forecast([one.without(camera) for one in lit], fewer, seed=seed)
+        found.append(CameraLoss(seen / total, needed / total, without))
+    return found
+
+
+class _Counts(NamedTuple):
+    marker_frames: int
+    scene_frames: int
+    minutes: float  # of markers
+    two: int
+    three: int
+    missing: int
+    ghosts: int
+    lengths: np.ndarray  # of gaps [s]
+    spread: np.ndarray  # of points (N, 3, 3) [m^2]
+
+
+def _count(one: LitScene, rig: CameraRig, optics: OpticsConfig, rng: np.random.Generator) -> _Counts:
+    sources, markers, rate = one.sources, one.num_markers, one.scene.rate
+    found = reconstruct(
+        sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
+    )
+    triangulated = np.isfinite(found.positions[..., 0])
+    false_labels = label_false_points(found, sources.positions, sources.labels, optics.max_residual)
+    present = triangulated[:, :markers].copy()
+    frame, column = np.nonzero((false_labels >= 0) & (false_labels < markers))
+    present[frame, false_labels[frame, column]] = True
+    false = np.isfinite(found.false_points[..., 0]) & (false_labels < 0)
+    views = one.seen.sum(axis=-1)
+    rows, columns = np.nonzero(triangulated[:, :markers] & (views >= FEWEST_CAMERAS))
+    step = max(1, len(rows) // _ERRORS)
+    rows, columns = rows[::step], columns[::step]
+    noise = optics.noise * np.sqrt(MARKER_RADIUS / sources.radii[columns])
+    return _Counts(
+        present.size,
+        len(present),
+        present.size / rate / 60.0,
+        int((views >= FEWEST_CAMERAS).sum()),
+        int((views > FEWEST_CAMERAS).sum()),
+        int((~present).sum()),
+        int(triangulated[:, one.num_worn :].sum() + false.sum()),
+        run_lengths(~present) / rate,
+        covariances(sources.positions[rows, columns], one.seen[rows, columns], rig, noise),
+    )

@@ -1,0 +1,120 @@
+"""A planned rig, and what it makes of hands that the plan did not see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from gloves.layout import MarkerLayout
+from handsim.space.cameras import CameraRig
+from train.rig_advice.candidate_views import view_candidates
+from train.rig_advice.forecast import Forecast, forecast, light
+from train.rig_advice.mounts import Mount, places
+from train.rig_advice.planning import Planning
+from train.rig_advice.work import sample_work
+from train.simulation.motion import SceneMotion
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy.typing import NDArray
+
+_PEOPLE: Final = 3  # of each kind of work
+_FRAMES: Final = 900  # of each
+_SKIPPED: Final = 12  # every so many frames count
+_JUDGED: Final = 600  # frames of a person that the plan did not see
+
+
+class LensKind(NamedTuple):
+    """What all cameras of a rig share."""
+
+    field_of_view: float
+    """[rad]"""
+    resolution: int
+    """[px]"""
+
+
+class Plan(NamedTuple):
+    """A rig, and the forecast of it."""
+
+    rig: CameraRig
+    targets: Float[np.ndarray, "C 3"]
+    """What each camera looks at [m]; of cameras that were kept a point one meter ahead."""
+    before: Forecast | None
+    """Of the cameras that were kept alone."""
+    after: Forecast
+
+
+def plan(
+    num_cameras: int,
+    room: Float[np.ndarray, "3"],
+    mounts: Sequence[Mount],
+    layout: MarkerLayout,
+    center: Float[np.ndarray, "3"],
+    sides: Float[np.ndarray, "3"],
+    lens: LensKind,
+    kept: CameraRig | None = None,
+    *,
+    name: str,
+    told: Callable[[str], None] = lambda line: None,
+    seed: int = 0,
+) -> Plan:
+    """Look for the best places of cameras.
+
+    Args:
+        num_cameras: Cameras of the rig, with those that are kept.
+        room: Width, depth and height of the room or truss [m].
+        mounts: What cameras can hang on.
+        layout: The glove.
+        center: Middle of the volume that hands work in [m].
+        sides: Its sides [m].
+        lens: Of every camera.
+        kept: Cameras that stay.
+        name: Of the rig.
+        told: Called with what is going on.
+        seed: Of people and motion.
+
+    Raises:
+        ArgumentError: There is no room for so many cameras.
+        RigError: No camera has such a lens.
+    """
+    CameraRig(name, np.stack([np.eye(4), _moved(np.eye(4))]), *lens)  # raises what is out of range
+    free = places(room, mounts, center, sides)
+    old = np.empty((0, 4, 4)) if kept is None else kept.T_world_camera
+    poses = np.concatenate([old, free.T_world_camera])
+    targets = np.concatenate([old[:, :3, 3] + old[:, :3, 2], free.targets])
+    rng = np.random.default_rng(seed)
+    scenes = [one.faster(_SKIPPED) for one in _scenes(layout, center, sides, _FRAMES, _PEOPLE, rng)]
+    told(f"what cameras at {len(free.targets)} places would see")
+    views = view_candidates(scenes, poses, lens.field_of_view, lens.resolution, rng=rng)
+    search = Planning(views, poses[:, :3, 3], range(len(old)))
+    search.grow(num_cameras)
+    search.exchange(lambda value: told(f"moving cameras: {value:.4f}"))
+    rig = CameraRig(name, poses[search.chosen], *lens)
+    told("forecasting")
+    fresh = _scenes(layout, center, sides, _JUDGED, 1, np.random.default_rng(seed + 1))
+    before = None if kept is None else _forecast(fresh, kept, seed)
+    return Plan(rig, targets[search.chosen], before, _forecast(fresh, rig, seed))
+
+
+def _scenes(
+    layout: MarkerLayout,
+    center: NDArray[np.float64],
+    sides: NDArray[np.float64],
+    frames: int,
+    people: int,
+    rng: np.random.Generator,
+) -> list[SceneMotion]:
+    work = sample_work(layout, center, sides, frames, people, rng=rng)
+    return [one for scenes in work.values() for one in scenes]
+
+
+def _forecast(scenes: Sequence[SceneMotion], rig: CameraRig, seed: int) -> Forecast:
+    return forecast(light(scenes, rig, rng=np.random.default_rng(seed)), rig, seed=seed)
+
+
+def _moved(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    moved = pose.copy()
+    moved[0, 3] = 1.0
+    return moved

@@ -1,0 +1,159 @@
+"""Hands at work: simulated motion of several people, or that of a take, wherever in the volume they go."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from gloves.fit import GlovedHand, GloveFit, attach
+from gloves.layout import MarkerLayout
+from gloves.takes.take import Take
+from gloves.takes.tracked_take import TrackedTake
+from handsim.errors import CaptureError, PoseError
+from handsim.hand.motion import BodyMotion
+from handsim.space.cameras import ROOM_CENTER
+from handsim.space.objects import named_object, object_names
+from train.rig_advice.rig_faults import HALF_SIDE
+from train.simulation.motion import MovingObject, SceneMotion
+from train.simulation.real_like import sample_real_like_scene
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import sample_scene
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, Float
+    from numpy.typing import NDArray
+
+_REAL_LIKE: Final = "real-like"
+_MAX_PEOPLE: Final = 10
+_FEWEST: Final = 12  # frames of a stretch of a take without a break
+_ROUND: Final = (11.0, 14.0, 9.0)  # through the volume and back along each axis [s]
+
+
+def sample_work(
+    layout: MarkerLayout,
+    center: Float[np.ndarray, "3"],
+    sides: Float[np.ndarray, "3"],
+    num_frames: int,
+    people: int,
+    *,
+    rng: np.random.Generator,
+) -> dict[str, list[SceneMotion]]:
+    """What several people's hands do, by kind: like real ones, alone, together, with a pen, a controller.
+
+    Args:
+        layout: The glove on both hands.
+        center: Middle of the volume that hands work in [m].
+        sides: Its sides [m]; where they are longer than hands reach, people walk through it.
+        num_frames: Frames of each person and kind.
+        people: People of each kind.
+        rng: Source of all randomness.
+
+    Raises:
+        LayoutError: The glove does not fit, or is for one hand.
+        PoseError: None of the people drawn can do this.
+    """
+    work: dict[str, list[SceneMotion]] = {}
+    draws: dict[str, Callable[[], SceneMotion]] = {
+        _REAL_LIKE: functools.partial(_real_like, layout, num_frames, rng)
+    }
+    for kind in KINDS:
+        draws[kind] = functools.partial(sample_scene, kind, layout, num_frames, rng=rng)
+    for name, draw in draws.items():
+        work[name] = []
+        for _ in range(people):
+            scene = draw()
+            walk = _walk(scene.num_frames / scene.rate, scene.num_frames, sides, rng)
+            work[name].append(moved(scene, walk + center - ROOM_CENTER))
+    return work
+
+
+def _real_like(layout: MarkerLayout, num_frames: int, rng: np.random.Generator) -> SceneMotion:
+    """Of the first person who can bring the hands together."""
+    reason: PoseError | None = None
+    for _ in range(_MAX_PEOPLE):
+        try:
+            return sample_real_like_scene(layout, num_frames, rng=rng)
+        except PoseError as error:
+            reason = error
+    raise PoseError(f"none of {_MAX_PEOPLE} people can do '{_REAL_LIKE}'; the last: {reason}") from reason
+
+
+def moved(scene: SceneMotion, offsets: Float[np.ndarray, "T 3"]) -> SceneMotion:
+    """The same motion somewhere else in each frame [m]."""
+    hands = []
+    for hand in scene.hands:
+        qpos = hand.qpos.copy()
+        qpos[:, :3] += offsets
+        hands.append(GlovedHand(hand.fit, qpos))
+    held = scene.moving_object
+    if held is not None:
+        poses = held.motion.T_world_body.copy()
+        poses[:, :3, 3] += offsets
+        held = dataclasses.replace(held, motion=BodyMotion(poses, held.motion.rate))
+    return dataclasses.replace(scene, hands=tuple(hands), moving_object=held)
+
+
+def work_of_take(
+    take: Take | TrackedTake, layout: MarkerLayout | None, num_frames: int
+) -> dict[str, list[SceneMotion]]:
+    """The hands of a take where they were, in stretches in which every hand has a pose.
+
+    Args:
+        take: A tracked or simulated take.
+        layout: Another glove for its hands; their own when not given.
+        num_frames: Frames to use, from the first.
+
+    Raises:
+        CaptureError: There is no such stretch.
+        LayoutError: The glove does not fit.
+    """
+    if isinstance(take, Take):
+        fits, poses = [hand.fit for hand in take.hands], [hand.qpos for hand in take.hands]
+    else:
+        fits, poses = list(take.hands), [take.qpos[:, number] for number in range(len(take.hands))]
+    if layout is not None:
+        fits = [attach(layout, fit.model) for fit in fits]
+    whole = np.isfinite(np.stack(poses)).all(axis=(0, 2))
+    scenes, left = [], num_frames
+    for stretch in _stretches(whole):
+        part = slice(stretch.start, min(stretch.stop, stretch.start + left))
+        if part.stop - part.start >= _FEWEST:
+            left -= part.stop - part.start
+            scenes.append(_scene(take, fits, poses, part))
+    if not scenes:
+        raise CaptureError(
+            f"the take has no {_FEWEST} frames in a row in which every hand has a pose, expected some"
+        )
+    return {"the take": scenes}
+
+
+def _scene(
+    take: Take | TrackedTake, fits: list[GloveFit], poses: list[NDArray[np.float64]], part: slice
+) -> SceneMotion:
+    hands = tuple(
+        GlovedHand(fit, np.ascontiguousarray(qpos[part])) for fit, qpos in zip(fits, poses, strict=True)
+    )
+    held = None
+    if isinstance(take, Take) and take.body is not None and take.body.name in object_names():
+        motion = BodyMotion(take.body.T_world_body[part], take.rate)
+        held = MovingObject(named_object(take.body.name), motion)
+    return SceneMotion(hands, held, take.rate)
+
+
+def _stretches(flags: Bool[np.ndarray, "T"]) -> list[slice]:
+    steps = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
+    begins, ends = np.flatnonzero(steps == 1), np.flatnonzero(steps == -1)
+    return [slice(int(begin), int(end)) for begin, end in zip(begins, ends, strict=True)]
+
+
+def _walk(
+    seconds: float, frames: int, sides: Float[np.ndarray, "3"], rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Offsets (T, 3) [m] to and fro through the part of the volume that hands in its middle do not reach."""
+    reach = np.maximum(0.0, np.asarray(sides) / 2 - HALF_SIDE)
+    turns = seconds * np.linspace(0.0, 1.0, frames)[:, None] / _ROUND + rng.random(3)
+    return np.asarray(reach * (4.0 * np.abs(turns % 1.0 - 0.5) - 1.0))

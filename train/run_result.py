@@ -1,0 +1,95 @@
+"""What a run ends with: the evaluated network, its card and a page."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from torch import nn
+
+from handsim._version import __version__
+from train.config import Kind, TrainConfig
+from train.data.augmentation import Corruption
+from train.data.batches import paper_corruption, right_hands
+from train.data.mapped_rows import MappedRows
+from train.data.shards import Manifest
+from train.evaluation.labeler_evaluation import Report, evaluate_labeler, paper_report
+from train.evaluation.matching_costs import choose_costs
+from train.labelers.cnn_network import DeepLabelCNN
+from train.labelers.kinds import labeler_of
+from train.labelers.set_network import SetLabeler
+from train.labelers.storage import save_network
+from train.matching.prior_learning import learn_pose_prior
+from train.reports.model_card import UNKNOWN_LICENSE, write_model_card
+from train.reports.run_page import write_run_page
+from train.training_state import TrainingState
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MOST_HELD_OUT: Final = 8192
+_CARD_FRAMES: Final[dict[Kind, int]] = {"set": MOST_HELD_OUT, "cnn": 1024}  # of the evaluation
+_PRIOR_STRETCH: Final = 0.03  # anisotropy of the hands of the pose prior: people differ more than simulated
+_COST_FRAMES: Final = 400  # for the costs of the paper's network
+
+
+def finish_run(
+    state: TrainingState, rows: MappedRows, held_out: MappedRows, manifest: Manifest, out: Path
+) -> dict[str, Any]:
+    """Evaluate the network, write weights, card and page, and return the card.
+
+    Args:
+        state: The trained state.
+        rows: What it was trained on.
+        held_out: What it has not seen.
+        manifest: Of the training set.
+        out: Folder of the run.
+    """
+    config, names = state.config, manifest.marker_names
+    network = state.averaged()
+    if isinstance(network, DeepLabelCNN):
+        choose_costs(network, names, few(held_out, _COST_FRAMES))
+    else:
+        assert isinstance(network, SetLabeler)
+        rng = np.random.default_rng(config.seed)
+        network.prior = learn_pose_prior(right_hands(rows, _PRIOR_STRETCH, rng=rng), rng=rng)
+    card, report = _card(network, few(held_out, _CARD_FRAMES[config.labeler]), config, manifest)
+    card["curve"] = state.history.accuracies
+    save_network(out, network, card)
+    write_run_page(out, card, state.history, report)
+    write_model_card(out, card)
+    return card
+
+
+def few(rows: MappedRows, count: int) -> NDArray[np.void]:
+    """Every nth of these rows, at most `count`."""
+    return rows[np.arange(0, len(rows), -(-len(rows) // count))]
+
+
+def _card(
+    network: nn.Module, rows: NDArray[np.void], config: TrainConfig, manifest: Manifest
+) -> tuple[dict[str, Any], Report]:
+    """Model card: where the weights come from, and their figures on held-out simulated frames.
+
+    Returns:
+        The card, and the evaluation with the paper's corruption.
+    """
+    labeler = labeler_of(network, manifest.marker_names)
+    markers = rows["markers"].astype(np.float64)
+    clean = evaluate_labeler(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
+    paper, report = paper_corruption(markers.shape[1]), paper_report(labeler, rows)
+    card = {
+        "marker_names": list(manifest.marker_names),
+        "trained_on": "simulated frames only",
+        "handsim": __version__,
+        "license": UNKNOWN_LICENSE,
+        "dataset": manifest.config,
+        "train": dataclasses.asdict(config),
+        "held_out_simulated": {
+            "clean": clean.figures,
+            f"occlude {paper.occlude}, ghosts {paper.ghosts}": report.figures,
+        },
+    }
+    return card, report
