@@ -182,6 +182,13 @@ def without_signals() -> Iterator[None]:
 def _work(job: Job, channel: Connection) -> None:
     """The life of a worker: do one job after the other until the pipe closes."""
     signal.signal(signal.SIGTERM, _leave)  # so that a half-written file is removed
+    try:
+        _do_jobs(job, channel)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what Python calls at its end would print the exit
+
+
+def _do_jobs(job: Job, channel: Connection) -> None:
     while True:
         try:
             number = channel.recv()

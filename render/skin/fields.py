@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+import numba
 import numpy as np
-from scipy import ndimage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,14 +24,54 @@ def noise(
         rng: Source of the noise.
     """
     total = np.zeros(len(positions))
-    low, high = positions.min(axis=0), positions.max(axis=0)
+    low, high = _extent(positions)
     for size in sizes:
         count = np.minimum(np.ceil((high - low) / size).astype(int) + 2, _MOST_KNOTS)
-        knots = rng.standard_normal(count)
-        at = (positions - low) / np.maximum(high - low, 1e-9) * (count - 1.001)
-        total += ndimage.map_coordinates(knots, at.T, order=1, mode="nearest")
-    scaled: NDArray[np.float64] = total * (1.6 / np.sqrt(len(sizes)))
-    return scaled
+        scale = (count - 1.001) / np.maximum(high - low, 1e-9)
+        _add_octave(positions, low, scale, rng.standard_normal(count), total)
+    total *= 1.6 / np.sqrt(len(sizes))
+    return total
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _extent(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least and greatest coordinates (3,) of positions (N, 3)."""
+    low, high = positions[0].copy(), positions[0].copy()
+    for row in positions:
+        for axis in range(3):
+            low[axis] = min(low[axis], row[axis])
+            high[axis] = max(high[axis], row[axis])
+    return low, high
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _add_octave(
+    positions: NDArray[np.float64],
+    low: NDArray[np.float64],
+    scale: NDArray[np.float64],
+    knots: NDArray[np.float64],
+    total: NDArray[np.float64],
+) -> None:
+    """Add the trilinear interpolation of knots.
+
+    Args:
+        positions: Where (N, 3) [m].
+        low: Position of the first knot (3,) [m].
+        scale: Knots a meter, each way (3,).
+        knots: Values (A, B, C), which reach over all positions.
+        total: Added to (N,).
+    """
+    for number in range(len(positions)):
+        x = (positions[number, 0] - low[0]) * scale[0]
+        y = (positions[number, 1] - low[1]) * scale[1]
+        z = (positions[number, 2] - low[2]) * scale[2]
+        i, j, k = int(x), int(y), int(z)
+        u, v, w = x - i, y - j, z - k
+        near = (1.0 - w) * knots[i, j, k] + w * knots[i, j, k + 1]
+        beside = (1.0 - w) * knots[i, j + 1, k] + w * knots[i, j + 1, k + 1]
+        over = (1.0 - w) * knots[i + 1, j, k] + w * knots[i + 1, j, k + 1]
+        far = (1.0 - w) * knots[i + 1, j + 1, k] + w * knots[i + 1, j + 1, k + 1]
+        total[number] += (1.0 - u) * ((1.0 - v) * near + v * beside) + u * ((1.0 - v) * over + v * far)
 
 
 def smooth(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:

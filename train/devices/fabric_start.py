@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import os
 import sys
@@ -55,7 +56,15 @@ def start_fabric(config: TrainConfig, out: Path) -> Fabric:
     )
     _meet_on_this_machine(world)
     fabric.launch()
+    if world.size > 1:
+        atexit.register(_leave)
     return fabric
+
+
+def _leave() -> None:
+    """End gloo's threads while there is an interpreter: one that drops a tensor later aborts the process."""
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 def check_devices(config: TrainConfig, size: int, local_size: int) -> None:

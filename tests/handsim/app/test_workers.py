@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from handsim.app.workers import check_workers, in_processes, usable_cores
+from handsim.app.workers import _work, check_workers, in_processes, usable_cores
 from handsim.errors import ArgumentError, DatasetError, LayoutError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -112,3 +113,15 @@ def test_workers_end_with_their_parent(number, tmp_path):
         time.sleep(0.02)
     assert not any(map(running, workers))
     assert set(os.listdir("/dev/shm")) <= before
+
+
+def test_a_worker_that_ends_is_not_interrupted_by_its_own_handler():
+    """What Python calls at its end would print the exit that the handler raises."""
+    before = signal.getsignal(signal.SIGTERM)
+    ours, theirs = multiprocessing.Pipe()
+    ours.close()
+    try:
+        _work(double, theirs)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, before)
