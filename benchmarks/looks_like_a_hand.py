@@ -1,15 +1,17 @@
 """Whether a hand tracker that was trained on photographs takes the renders for hands.
 
     python benchmarks/looks_like_a_hand.py OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
+        [--takes TRACKED.npz ...]
 
 Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:
 OUT/clean (plain and graded backgrounds) and OUT/mixed (rooms, noise and clutter; pictures without a hand
 among them). Five kinds of pose x palm, back and edge views x six skin tones x both sides; the hand's box
-takes 20 to 30 % of the frame. OUT/*/judged.json is the COCO file with each picture's view, pose and tone.
+takes 20 to 30 % of the frame. With --takes hands and poses are those of tracked takes instead.
+OUT/*/judged.json is the COCO file with each picture's view, pose and tone.
 
 The judge is a program of the user's own: `judge --images DIR --annotations COCO --report JSON` finds hands in
 the pictures without being told where they are. With --judge it is run, and its figures are printed by view,
-pose, tone and side; without, its command lines are.
+pose, tone, side and background; without, its command lines are.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ import numpy as np
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
+from gloves.takes.tracked_take import load_tracked_take
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
@@ -63,7 +66,7 @@ SETS: Final = {
 FILL: Final = (0.2, 0.3)  # the hand's box over the frame
 TILT: Final = np.deg2rad(22.0)  # how far a view is off its axis at most, each way
 JUDGED: Final = "judged.json"
-GROUPS: Final = ("view", "pose", "tone", "side")
+GROUPS: Final = ("view", "pose", "tone", "side", "background")
 WRIST, INDEX, MIDDLE, LITTLE = 0, 5, 9, 17  # keypoints
 PARTS: Final = {
     "wrist": [WRIST],
@@ -71,6 +74,8 @@ PARTS: Final = {
     "finger tips": [8, 12, 16, 20],
     "thumb's last two": [3, 4],
 }
+Tracked = dict[Side, list[tuple[HandModel, np.ndarray]]]
+"""Hands of tracked takes, and their poses (T, 27); empty where gestures are drawn."""
 FLAT: Final = 5.0  # width of a palm that is seen edge on [px]
 
 
@@ -85,17 +90,38 @@ class Case(NamedTuple):
     model: HandModel
     qpos: np.ndarray
     camera: Camera
+    background: str
 
 
-def make_case(number: int, rng: np.random.Generator) -> Case:
+def make_case(number: int, background: str, tracked: Tracked, rng: np.random.Generator) -> Case:
     """Kinds go round by number; all else is drawn."""
-    pose = list(POSES)[number % 5]
+    pose = "tracked" if tracked else list(POSES)[number % 5]
     view = list(VIEWS)[number // 5 % 3]
     side = SIDES[number // 15 % 2]
     tone = list(TONES)[(number // 30 + number) % 6]
-    name = POSES[pose][int(rng.integers(len(POSES[pose])))]
-    model, qpos = sample_pose(name, side, rng)
-    return Case(pose, view, tone, side, name, model, qpos, place_camera(model, qpos, view, rng))
+    if tracked:
+        model, rows = tracked[side][int(rng.integers(len(tracked[side])))]
+        number = int(rng.integers(len(rows)))
+        name, qpos = f"pose {number}", rows[number]
+    else:
+        name = POSES[pose][int(rng.integers(len(POSES[pose])))]
+        model, qpos = sample_pose(name, side, rng)
+    camera = place_camera(model, qpos, view, rng)
+    return Case(pose, view, tone, side, name, model, qpos, camera, background)
+
+
+def load_tracked(paths: list[Path]) -> Tracked:
+    """The hands of tracked takes and their poses (T, 27) where they were tracked, the wrists in one place."""
+    found: Tracked = {side: [] for side in SIDES} if paths else {}
+    for path in paths:
+        take = load_tracked_take(path)
+        for number, hand in enumerate(take.hands):
+            rows = take.qpos[np.isfinite(take.qpos[:, number, 0]), number, 7:]
+            found[hand.model.shape.side].append((hand.model, join_qpos(rows)))
+    for side in found:
+        if not found[side]:
+            sys.exit(f"no {side} hand in {', '.join(map(str, paths))}, expected both sides")
+    return found
 
 
 def sample_pose(name: str, side: Side, rng: np.random.Generator) -> tuple[HandModel, np.ndarray]:
@@ -157,26 +183,28 @@ def photograph(
     return dataclasses.replace(studio.photograph(0, case.camera, choices), number=number)
 
 
-def frames_of(name: str, hands: int, empty: int, seed: int, cases: list[Case]) -> Iterator[RenderedFrame]:
+def frames_of(
+    name: str, hands: int, empty: int, seed: int, tracked: Tracked, cases: list[Case]
+) -> Iterator[RenderedFrame]:
     """The pictures of one set, those without a hand last; what they show is added to `cases`."""
     for number in range(hands + empty):
         rng = np.random.default_rng([seed, list(SETS).index(name), number])
         background, lighting = sample_surroundings(SETS[name], None, rng=rng)
-        cases.append(make_case(number, rng))
+        cases.append(make_case(number, background.kind, tracked, rng))
         yield photograph(number, cases[-1], background, lighting, shown=number < hands, rng=rng)
         if sys.stderr.isatty():
             print(f"\r{name}: {number + 1} of {hands + empty}", end="", file=sys.stderr)
 
 
-def write_set(name: str, hands: int, empty: int, seed: int, out: Path) -> None:
+def write_set(name: str, hands: int, empty: int, seed: int, tracked: Tracked, out: Path) -> None:
     """Pictures and judged.json of one set."""
     writer, cases = open_writer("coco", out), []
-    writer.write(0, frames_of(name, hands, empty, seed, cases))
+    writer.write(0, frames_of(name, hands, empty, seed, tracked, cases))
     writer.finish()
     coco = json.loads((out / "annotations.json").read_text(encoding="utf-8"))
     for image, case in zip(coco["images"], cases, strict=True):
         image["file_name"] = f"images/{image['file_name']}"
-        image |= {"pose": case.pose, "view": case.view, "tone": case.tone, "gesture": case.gesture}
+        image |= {name: getattr(case, name) for name in ("pose", "view", "tone", "gesture", "background")}
     (out / JUDGED).write_text(json.dumps(coco), encoding="utf-8")
 
 
@@ -235,10 +263,12 @@ def main() -> None:
     parser.add_argument("--empty", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--judge", type=Path, default=None)
+    parser.add_argument("--takes", type=Path, nargs="+", default=[])
     options = parser.parse_args()
+    tracked = load_tracked(options.takes)
     for name, hands, empty in (("clean", options.clean, 0), ("mixed", options.mixed, options.empty)):
         if hands + empty:
-            write_set(name, hands, empty, options.seed, options.out / name)
+            write_set(name, hands, empty, options.seed, tracked, options.out / name)
             judge(options.judge, options.out / name)
 
 

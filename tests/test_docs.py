@@ -18,6 +18,8 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 SLOW = {
     "calibration",
     "formats",
+    "sweeps",
+    "training_on_many_devices",
     "tracking_commands",
     "troubleshooting",
     "tutorials/my_captures",

@@ -5,6 +5,7 @@
 - figures: hands and rigid bodies as surfaces with materials.
 - rasterizer: depth, normals and ids of triangles by a compiled z-buffer.
 - shadow_map: a lamp's z-buffer.
+- cast_shadow: shadows on what is close behind the hands.
 - shading: the microfacet model of a surface point.
 - compiled_painter: colors by the compiled z-buffer and shading.
 - gl: the import of pyrender, and one off-screen renderer per process.

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from handsim.errors import HandSimError, choices
+from render.scenery.backdrops import Backdrop, sample_backdrop
 from render.scenery.photographs import draw_photo, pick_photo
 from render.scenery.rooms import draw_room, paint_tint
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
+_CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # may be the picture of a wall or a table
 _GAMMA: Final = 2.2
 
 
@@ -67,6 +69,8 @@ class Background:
     """Standard deviation of its blur, in picture heights."""
     photo: str | None = None
     """The photograph's file."""
+    backdrop: Backdrop | None = None
+    """What the hands' shadows fall on; None where the background is far away."""
 
 
 def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> Background:
@@ -78,9 +82,10 @@ def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> 
     shares = np.array(config.shares())
     kind = KINDS[int(rng.choice(len(KINDS), p=shares / shares.sum()))]
     first, second = _color(rng), _color(rng)
-    blur = float(rng.uniform(0.0, 0.008)) if kind in ("room", "clutter", "photo") else 0.0
+    blur = float(rng.uniform(0.0, 0.01)) if kind in ("room", "clutter", "photo") else 0.0
     photo = str(pick_photo(Path(str(config.photos)), rng)) if kind == "photo" else None
-    return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo)
+    backdrop = sample_backdrop(rng=rng) if kind in _CLOSE else None
+    return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo, backdrop)
 
 
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
@@ -157,7 +162,7 @@ def _noise(
     first: NDArray[np.float32], second: NDArray[np.float32], size: tuple[int, int], rng: np.random.Generator
 ) -> NDArray[np.float32]:
     share = 0.5 + 0.35 * _octaves(size, 1, float(rng.uniform(0.5, 0.85)), rng)
-    color = 1.0 + 0.12 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
+    color = 1.0 + 0.05 * _octaves(size, 3, float(rng.uniform(0.4, 0.8)), rng)
     mixed: NDArray[np.float32] = (first + np.clip(share, 0.0, 1.0) * (second - first)) * color
     return mixed
 

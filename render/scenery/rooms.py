@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 _REDUCED: Final = 2
 _FURNITURE: Final = (4, 14)
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls
+_WALLS: Final = (0.12, 0.08, 0.12, 0.68)  # how often a wall has each of these
+_FLOORS: Final = (0.25, 0.4, 0.35)  # likewise a floor, without stripes; ceilings are plain
+_FLOOR: Final = 4  # number of that side
+_CONTRAST: Final = (0.15, 0.7)  # of a pattern, as a share of the difference of any two paints
+_COLORED: Final = 0.4  # share of paints with a strong color
 _FRAME: Final = 0.06  # of a picture or window, as a share of its sides
 
 
@@ -77,7 +82,7 @@ def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.
     light = _cast_all(rays, eye, room, walls, _place_boxes(room, eye, rng), lamp, strength).light
     small = light.reshape(height, width, 3)
     small *= 1.0 + np.float32(0.05) * rng.standard_normal((height, width, 1), dtype=np.float32)
-    small = cv2.GaussianBlur(small, (0, 0), 0.7)  # or edges would show the coarse pixels
+    small = cv2.GaussianBlur(small, (0, 0), 0.9)  # or edges would show the coarse pixels
     drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
     return drawn
 
@@ -149,10 +154,14 @@ def _paint_walls(room: NDArray[np.float64], rng: np.random.Generator) -> _Walls:
             window = rng.random() < 0.3
             glass = np.ones(3) if window else _paint(rng)
             frames[wall, number] = left, low, wide, high, *_paint(rng), *glass, rng.uniform(-0.5, 0.5)
+    patterns = rng.choice([_STRIPES, _TILES, _BOARDS, _PLAIN], 6, p=_WALLS)
+    patterns[_FLOOR:] = rng.choice([_TILES, _BOARDS, _PLAIN], p=_FLOORS), _PLAIN
+    colors = np.array([[_paint(rng), _paint(rng)] for _ in range(6)], dtype=np.float64)
+    colors[:, 1] = colors[:, 0] + rng.uniform(*_CONTRAST, (6, 1)) * (colors[:, 1] - colors[:, 0])
     return _Walls(
-        rng.choice([_STRIPES, _TILES, _BOARDS, _PLAIN, _PLAIN], 6),
+        patterns,
         rng.uniform(0.06, 0.5, 6),
-        np.array([[_paint(rng), _paint(rng)] for _ in range(6)], dtype=np.float64),
+        colors,
         rng.uniform(0.0, 0.5, 512),
         frames,
     )
@@ -301,7 +310,11 @@ def _paint(rng: np.random.Generator) -> NDArray[np.float32]:
 
 
 def paint_tint(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Logarithms of a paint's red, green and blue over its gray: warm or cool, seldom green or magenta."""
-    warm, green = rng.normal(0.12, 0.28), rng.normal(0.0, 0.10)
+    """Logarithms of a paint's red, green and blue over its gray: warm or cool, seldom green or magenta.
+
+    Most walls, floors and cloths are nearly gray, some have a strong color.
+    """
+    strong = rng.random() < _COLORED
+    warm, green = rng.normal(0.08, 0.32 if strong else 0.10), rng.normal(0.0, 0.10 if strong else 0.04)
     tint: NDArray[np.float64] = np.array([warm, green, -1.1 * warm])
     return tint

@@ -24,7 +24,7 @@ _SIZE: Final = (64, 48)  # of the picture that gives light
 _DIRECTIONS: Final = 1024
 _MIDDLE_SKIN: Final = 0.3  # reflectance
 _METERED: Final = 0.5
-_SHARE: Final = (0.2, 0.8)  # of the light from everywhere that has the picture's colors
+_SHARE: Final = (0.1, 0.5)  # of the light from everywhere that has the picture's colors, after white balance
 _LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 # What a matt surface makes of each order, and the integrals of the squared functions over the sphere.
 _MATT: Final = np.array([1.0, *[2.0 / 3.0] * 3, *[0.25] * 5])

@@ -16,6 +16,7 @@ from handsim.errors import HandSimError
 from handsim.space.camera import Camera
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
 from render.frames.frame import PASSES, BodyTruth, Pictures, RenderedFrame
+from render.painting.cast_shadow import light_behind
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
@@ -213,9 +214,19 @@ class Studio:
         painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
         whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
         if choices.enclosure is None:
-            return put_before(whole, _background(choices.background, camera.size))
+            return put_before(whole, self._behind(camera, drawn, choices))
         behind = draw_surroundings(choices.background, choices.enclosure, camera)
         return put_before(whole, behind.rgb.astype(np.float32))
+
+    def _behind(
+        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
+    ) -> Float32[np.ndarray, "H W 3"]:
+        """The background with what shadows fall on it, sRGB from 0 to 255."""
+        plain, backdrop = _background(choices.background, camera.size), choices.background.backdrop
+        if backdrop is None or camera.lens.kind != "pinhole":
+            return plain
+        light = light_behind(camera, drawn, choices.lighting, backdrop)
+        return plain if light is None else plain * cv2.pow(light, 1.0 / GAMMA)[..., None]
 
     def _exposed(
         self,

@@ -21,7 +21,7 @@ from train.data.shards import Dataset
 from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig, simulate_take
 
-pytestmark = pytest.mark.xdist_group("closed loop")  # what they share is made once
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
 SMALL = [
     "--samples",
     "80000",

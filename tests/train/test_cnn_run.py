@@ -33,6 +33,7 @@ def dataset(tmp_path_factory):
     return Dataset(out)
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_is_the_run_that_was_not(dataset, tmp_path):
     class Stopped(Exception):
         pass

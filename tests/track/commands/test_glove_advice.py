@@ -15,6 +15,7 @@ def mine(tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_a_score_is_printed_and_drawn(mine, capsys):
     assert main(["glove", "score", str(mine), "--frames", "120", "--rig", "six"]) == 0
     told = capsys.readouterr().out
