@@ -37,13 +37,14 @@ from machine import describe
 
 from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
+from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.frames.frame import RenderedFrame
 from render.own_poses import PoseFile, load_poses
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.scenery.backgrounds import BackgroundConfig
-from render.session import draw_frames
+from render.session import draw_shard
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 EXAMPLE: Final = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "14_train_a_keypoint_network.py")))
@@ -79,7 +80,7 @@ def draw_no_sensor(count: int, seed: int) -> Any:
 
 
 def draw_plain(count: int, seed: int) -> Any:
-    """Pictures by pyrender alone; the poses, cameras and cuts are those of `draw_ours`."""
+    """Pictures by pyrender alone; poses, cameras and cuts are drawn as those of `draw_ours`."""
     rng, found = np.random.default_rng(seed), []
     config: RenderConfig = replace(EXAMPLE.CONFIG, passes=("ids",), seed=seed)
     renderer = offscreen_renderer(640, 480)
@@ -88,9 +89,10 @@ def draw_plain(count: int, seed: int) -> Any:
             path = Path(name) / f"{side}.npz"
             EXAMPLE.write_poses(path, count // 2, rng)
             take = load_poses(PoseFile(path, sides=(side,)), seed=seed)
-            step = config.frames_per_shard
+            step, view = config.frames_per_shard, Viewpoints(config.view, take, rng=rng)
             for shard in range(count // 2 // step):
-                for frame in draw_frames(take, config, range(step * shard, step * shard + step), shard=shard):
+                frames = range(step * shard, step * shard + step)
+                for frame in draw_shard(take, view, config, shard, frames):
                     picture = plain_picture(frame, renderer, rng)
                     found.append(EXAMPLE.cut_out(picture, frame.hands[0].pixels, rng))
     return EXAMPLE.Pictures(*(np.stack(values) for values in zip(*found, strict=True)))

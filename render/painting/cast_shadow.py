@@ -6,16 +6,17 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import cv2
+import numba
 import numpy as np
 
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
-from render.painting.rasterizer import NEAR, join, nearest_faces, project
+from render.painting.rasterizer import NEAR, nearest_faces, project
 from render.scenery.backdrops import Backdrop
 from render.scenery.lights import Lighting
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Float32
+    from jaxtyping import Float32
     from numpy.typing import NDArray
 
 _COARSE: Final = 4  # pixels of the picture a pixel of the shadow's mask: its edges are soft
@@ -37,42 +38,82 @@ def light_behind(
     """
     if not drawn or not lighting.lamps:
         return None
-    surface = join([one.triangles for one in drawn])
-    points = camera.local(surface.vertices)
     normal = np.array([*backdrop.recedes, -1.0]) / np.linalg.norm([*backdrop.recedes, 1.0])
     towards = np.array(lighting.lamps[0].direction) / np.linalg.norm(lighting.lamps[0].direction)
-    steep = float(normal @ towards)
-    near = _in_picture(camera, points)
-    if steep < _FLATTEST or not near.any():
+    if normal @ towards < _FLATTEST:
         return None
-    heights = points @ normal
-    heights += backdrop.gap - heights[near].min()
-    # What is behind the backdrop, or so far aside that its shadow is too, casts none.
-    heights[heights < 0.0] = np.nan
-    fallen = points - (heights / steep)[:, None] * towards
+    surfaces = [one.triangles for one in drawn]
+    points = camera.local(np.concatenate([surface.vertices for surface in surfaces]))
+    first = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
+    faces = np.concatenate([one.faces + start for one, start in zip(surfaces, first, strict=False)])
+    size = np.array(camera.size, dtype=np.float64)
+    fallen, distance = np.full_like(points, np.nan), np.zeros(2)
+    _fall(points, normal, towards, backdrop.gap, camera.K, size, fallen, distance)
+    if distance[1] == 0.0:
+        return None
     width, height = (-(-side // _COARSE) for side in camera.size)
     corners = project(fallen, camera.K)
     corners[:, :2] /= _COARSE
-    _, first = nearest_faces(corners, surface.faces, (width, height), farthest=0.0)
-    mask = (first >= 0).astype(np.float32)
+    _, front = nearest_faces(corners, faces, (width, height), farthest=0.0)
+    mask = (front >= 0).astype(np.float32)
     if not mask.any():
         return None
-    blur = backdrop.softness * np.nanmedian(heights[near]) * camera.K[0, 0] / np.nanmedian(fallen[near, 2])
-    mask = cv2.GaussianBlur(mask, (0, 0), max(0.5, float(blur) / _COARSE))
-    whole = cv2.resize(mask, (width * _COARSE, height * _COARSE), interpolation=cv2.INTER_LINEAR)
-    share = np.float32(_SHADED * _key_share(lighting, normal))
-    light: NDArray[np.float32] = 1.0 - share * whole[: camera.size[1], : camera.size[0]]
-    return light
+    blur = backdrop.softness * distance[0] / distance[1] * camera.K[0, 0] / _COARSE
+    mask = cv2.GaussianBlur(mask, (0, 0), max(0.5, float(blur)))
+    light = 1.0 - np.float32(_SHADED * _key_share(lighting, normal)) * mask
+    whole = cv2.resize(light, (width * _COARSE, height * _COARSE), interpolation=cv2.INTER_LINEAR)
+    shown: NDArray[np.float32] = whole[: camera.size[1], : camera.size[0]]
+    return shown
 
 
-def _in_picture(camera: Camera, points: Float[np.ndarray, "V 3"]) -> NDArray[np.bool_]:
-    """Which points (V,) are in the picture, or a little beside it."""
-    depth = np.maximum(points[:, 2], NEAR)
-    pixels = points[:, :2] / depth[:, None] * np.diag(camera.K)[:2] + camera.K[:2, 2]
-    margin = _MARGIN * np.array(camera.size)
-    inside = (pixels > -margin) & (pixels < camera.size + margin)
-    found: NDArray[np.bool_] = inside.all(axis=1) & (points[:, 2] > NEAR)
-    return found
+@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _fall(
+    points: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    towards: NDArray[np.float64],
+    gap: float,
+    K: NDArray[np.float64],
+    size: NDArray[np.float64],
+    fallen: NDArray[np.float64],
+    distance: NDArray[np.float64],
+) -> None:
+    """Where the shadows of points fall on a backdrop, whose place is told by the points in the picture.
+
+    Args:
+        points: In the camera's axes (V, 3) [m].
+        normal: Of the backdrop, towards the camera (3,).
+        towards: Unit vector to the lamp (3,).
+        gap: From the backdrop to the nearest point in the picture [m].
+        K: Camera matrix (3, 3) [px].
+        size: Of the picture (2,) [px].
+        fallen: Written (V, 3) [m]; points behind the backdrop cast none and keep what stands there.
+        distance: Written (2,) [m]: from the points in the picture to the backdrop, and its depth there, both
+            in the mean; zeros where no point is in the picture.
+    """
+    seen = np.zeros(len(points), dtype=np.bool_)
+    nearest = np.inf
+    for number in range(len(points)):
+        x, y, z = points[number]
+        if z > NEAR:
+            across = (K[0, 0] * x / z + K[0, 2]) / size[0]
+            down = (K[1, 1] * y / z + K[1, 2]) / size[1]
+            if -_MARGIN < across < 1.0 + _MARGIN and -_MARGIN < down < 1.0 + _MARGIN:
+                seen[number] = True
+                nearest = min(nearest, x * normal[0] + y * normal[1] + z * normal[2])
+    steep = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
+    count = 0
+    for number in range(len(points)):
+        x, y, z = points[number]
+        height = x * normal[0] + y * normal[1] + z * normal[2] - nearest + gap
+        if height >= 0.0:
+            for axis in range(3):
+                fallen[number, axis] = points[number, axis] - height / steep * towards[axis]
+        if seen[number]:
+            count += 1
+            distance[0] += height
+            distance[1] += fallen[number, 2]
+    if count:
+        distance /= count
 
 
 def _key_share(lighting: Lighting, normal: NDArray[np.float64]) -> float:

@@ -226,7 +226,10 @@ class Studio:
         if backdrop is None or camera.lens.kind != "pinhole":
             return plain
         light = light_behind(camera, drawn, choices.lighting, backdrop)
-        return plain if light is None else plain * cv2.pow(light, 1.0 / GAMMA)[..., None]
+        if light is None:
+            return plain
+        lit: NDArray[np.float32] = cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3))
+        return lit
 
     def _exposed(
         self,
