@@ -1,7 +1,7 @@
 """What drawn pictures teach: a keypoint network that has seen only them, tried on photographs.
 
     python benchmarks/keypoint_network.py OUT --photos FOLDER --reference FILE [--variants ours plain ...]
-        [--pictures 16000 --samples 500000]
+        [--pictures 12000 --samples 240000]
 
 Trains the network of examples/14_train_a_keypoint_network.py once for each variant of the pictures, from
 equal poses and views, and prints the share of keypoints within a tenth of the box of the hand (PCK@0.1), on
@@ -171,8 +171,8 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, required=True)
     parser.add_argument("--reference", type=Path, required=True)
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
-    parser.add_argument("--pictures", type=int, default=16000)
-    parser.add_argument("--samples", type=int, default=500000)
+    parser.add_argument("--pictures", type=int, default=12000)
+    parser.add_argument("--samples", type=int, default=240000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--page", type=Path)
     options = parser.parse_args()

@@ -1,7 +1,7 @@
 """Train a network that finds 21 keypoints of a hand on drawn pictures alone, and look at photographs with it.
 
     python examples/14_train_a_keypoint_network.py            # seconds, too little to learn anything
-    python examples/14_train_a_keypoint_network.py --pictures 20000 --samples 400000 --out network.pt \
+    python examples/14_train_a_keypoint_network.py --pictures 12000 --samples 240000 --out network.pt \
         --photos Dataset --reference reference.json          # hours on two cores
 
 The photographs may be any pictures of single hands; the reference holds keypoints for some of them, by file:
@@ -23,6 +23,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.nn import functional
 
@@ -53,15 +54,18 @@ WIDE = 160  # of a stored crop [px]
 
 
 def write_poses(path: Path, count: int, rng: np.random.Generator) -> None:
-    """A pose file: half random poses, half named gestures, a little changed."""
+    """A pose file: half random poses, half named gestures, a little changed; fingers point up mostly."""
     model = HandModel.named("M")
     qpos = sample_poses(model, count, rng=rng)
     gestures = list(load_gestures().values())
     for row in np.flatnonzero(rng.random(count) < 0.5):
         angles = gestures[rng.integers(len(gestures))] + rng.normal(0.0, np.deg2rad(4.0), 20)
         qpos[row, 7:] = np.clip(angles, *model.skeleton.ranges.T)
+    up = Rotation.from_euler("y", -90.0, degrees=True)  # fingers lie along the wrist's x
+    tilt = Rotation.from_rotvec(np.deg2rad(30.0) * rng.normal(size=(count, 3)) * [1.0, 1.0, 0.0])
+    turned = Rotation.from_euler("z", rng.uniform(0.0, 360.0, (count, 1)), degrees=True) * tilt * up
     qpos[:, :3] = 0.0
-    qpos[:, 3:7] = [1.0, 0.0, 0.0, 0.0]
+    qpos[:, 3:7] = turned.as_quat()[:, [3, 0, 1, 2]]
     np.savez(path, qpos=qpos)
 
 
@@ -208,13 +212,9 @@ def train(pictures: Pictures, samples: int, seed: int = 0, batch: int = 64) -> K
 
 @torch.inference_mode()
 def find(network: KeypointNetwork, pictures: np.ndarray) -> np.ndarray:
-    """Keypoints (N, 21, 2) in pictures (N, 128, 128, 3): the mean of those in each and its mirror image."""
-    found = []
-    for first in range(0, len(pictures), 64):
-        some = pictures[first : first + 64]
-        here, mirrored = (network(to_input(images)).numpy() for images in (some, some[:, :, ::-1]))
-        found.append(SIZE * (here + [1, 0] + mirrored * [-1, 1]) / 2)
-    return np.concatenate(found)
+    """Keypoints (N, 21, 2) in pictures (N, 128, 128, 3) [px]."""
+    parts = [pictures[first : first + 64] for first in range(0, len(pictures), 64)]
+    return SIZE * np.concatenate([network(to_input(part)).numpy() for part in parts])
 
 
 def load_photos(folder: Path, reference: Path) -> Pictures:
