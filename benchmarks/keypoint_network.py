@@ -7,7 +7,7 @@ Trains the network of examples/14_train_a_keypoint_network.py once for each vari
 equal poses and views, and prints the share of keypoints within a tenth of the box of the hand (PCK@0.1), on
 drawn hands that it has not seen and on photographs on which the reference is sure. Variants:
 
-ours: what `handsim render` draws.
+ours: what `handsim render` draws; name it first, and the others are compared with it.
 plain: the loop that a user would write with pyrender: the same skins and cameras, one color of skin a
     picture, one light, a plain background.
 no backgrounds: ours before plain and graded backgrounds.
@@ -187,6 +187,9 @@ def main() -> None:
         drawn, real = 100 * EXAMPLE.pck(network, held_out), 100 * EXAMPLE.pck(network, photos)
         print(f"{variant:15s} drawn {drawn:5.1f}  photographs {real:5.1f}", flush=True)
         result[variant] = {"drawn": drawn, "photographs": real}
+        if "ours" in result and variant != "ours":
+            ratio = (100 - real) / (100 - result["ours"]["photographs"])
+            print(f"misses on photographs, {variant} over ours: {ratio:.2f}", flush=True)
         if options.page is not None:
             page(network, photos, options.page.with_stem(f"{options.page.stem}_{variant.replace(' ', '_')}"))
     (options.out / "result.json").write_text(json.dumps(result, indent=1))
