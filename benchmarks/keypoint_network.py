@@ -11,6 +11,8 @@ ours: what `handsim render` draws; name it first, and the others are compared wi
 plain: the loop that a user would write with pyrender: the same skins and cameras, one color of skin a
     picture, one light, a plain background.
 no backgrounds: ours before plain and graded backgrounds.
+no relief: ours with smooth skin, without knuckles, tendons and creases.
+no shadows: ours without shadows on what is behind the hand.
 no sensor: ours without exposure and noise.
 
 OUT keeps crops and networks, and a run goes on with what is there. `--page` draws fifty photographs, evenly
@@ -28,6 +30,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, Final
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -41,6 +44,7 @@ from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.frames.frame import RenderedFrame
 from render.own_poses import PoseFile, load_poses
+from render.painting.figures import Appearance, sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.scenery.backgrounds import BackgroundConfig
@@ -77,6 +81,20 @@ def draw_no_backgrounds(count: int, seed: int) -> Any:
 
 def draw_no_sensor(count: int, seed: int) -> Any:
     return EXAMPLE.draw(count, seed, replace(EXAMPLE.CONFIG, color_sensor=None))
+
+
+def draw_no_relief(count: int, seed: int) -> Any:
+    def smooth_people(*args: Any, **options: Any) -> tuple[Appearance, ...]:
+        people = sample_people(*args, **options)
+        return tuple(replace(one, skin=replace(one.skin, relief=0.0, creases=0.0)) for one in people)
+
+    with patch("render.session.sample_people", smooth_people):
+        return EXAMPLE.draw(count, seed)
+
+
+def draw_no_shadows(count: int, seed: int) -> Any:
+    with patch("render.studio.studio.light_behind", return_value=None):
+        return EXAMPLE.draw(count, seed)
 
 
 def draw_plain(count: int, seed: int) -> Any:
@@ -121,6 +139,8 @@ VARIANTS: Final[dict[str, Callable[[int, int], Any]]] = {
     "ours": draw_ours,
     "plain": draw_plain,
     "no backgrounds": draw_no_backgrounds,
+    "no relief": draw_no_relief,
+    "no shadows": draw_no_shadows,
     "no sensor": draw_no_sensor,
 }
 
