@@ -157,6 +157,7 @@ def test_a_job_that_ends_every_worker_is_told(tmp_path, cluster, client):
             list(executor.run(die, [7]))
     finally:
         client.run_on_scheduler(lambda dask_scheduler: setattr(dask_scheduler, "allowed_failures", 3))
+        client.wait_for_workers(1, timeout=30)  # its nanny starts another
 
 
 def test_a_worker_of_another_version_is_named(cluster, client, tmp_path):
