@@ -5,7 +5,8 @@ more than its number or its arrival explains, and its number by no more than its
 at most a second: a damaged header may hold any number and time that agree. Any other frame is held until the
 next one shows what it was:
 
-- after a gap in the numbers the missing frame may still arrive, and goes first;
+- after a gap in the numbers the missing frame may still arrive, and goes first; where more than four arrive
+  and the gap is not closed, the held frame's header was wild;
 - a wild time is followed by frames that continue the stream, and the held frame is left out;
 - a longer gap that only the numbers explain is followed by frames that continue the held one;
 - a recording that starts again, or a restarted server, is followed by frames that continue the held one.
@@ -34,6 +35,7 @@ _GAP_WAIT: Final = 0.1  # [s], the most of it
 _SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
 _MOST_CHANGE: Final = 2.0  # factor by which an interval differs from the usual one, at most, as it counts
 _MOST_DOUBTFUL: Final = 4  # frames that are held at once
+_MOST_OVERTAKEN: Final = 4  # frames that arrive after one that they precede, and others still miss
 LATEST: Final = 1e11
 """A time [s] beyond which a clock of doubles does not move on by a frame."""
 
@@ -63,6 +65,7 @@ class FrameOrder:
         """How often the time of the stream began anew."""
         self._last: Arrival | None = None
         self._after_gap: Arrival | None = None  # frames are missing before it
+        self._overtaken = 0  # frames that arrived since, and precede it
         self._doubtful: list[Arrival] = []  # do not continue the stream, or nothing came before them
         self._interval: float | None = None  # [s] per frame number
 
@@ -70,7 +73,8 @@ class FrameOrder:
     def deadline(self) -> float:
         """When `expire` is to be called [s]; infinite when nothing waits."""
         if self._after_gap is not None:
-            return self._after_gap.at + min(_GAP_WAIT, _GAP_INTERVALS * (self._interval or _GAP_WAIT))
+            newest = self._after_gap.at if self._last is None else max(self._after_gap.at, self._last.at)
+            return newest + min(_GAP_WAIT, _GAP_INTERVALS * (self._interval or _GAP_WAIT))
         if self._last is None and self._doubtful:
             return self._doubtful[0].at + _FIRST_WAIT
         return math.inf
@@ -104,8 +108,12 @@ class FrameOrder:
         elif last is not None and self._is_late(last, new):
             self.late += 1
         elif last is not None and self._continues(last, new):
+            following = [one for one in self._doubtful if self._follows(new, one)]
+            self._doubtful = [one for one in self._doubtful if not self._follows(new, one)]
             yield from self._settle(last, new)
             yield from self._line_up(new)
+            for one in following:  # it was doubtful only because of a damaged header before it
+                yield from self._add(one)
         elif gap is not None:
             yield self._pass_after_gap(gap)
             yield from self._add(new)
@@ -120,10 +128,14 @@ class FrameOrder:
             yield from self._add(new)
         elif gap is not None:  # the new one was overtaken
             yield self._pass(new)
+            self._overtaken += 1
             if not self._missing(new, gap):
                 yield self._pass_after_gap(gap)
+            elif self._overtaken > _MOST_OVERTAKEN:  # the stream goes on behind it: its header was wild
+                self._after_gap = None
+                self.wild += 1
         elif last is not None and self._missing(last, new):
-            self._after_gap = new
+            self._after_gap, self._overtaken = new, 0
         else:
             yield self._pass(new)
 
@@ -132,7 +144,8 @@ class FrameOrder:
         doubtful, self._doubtful = self._doubtful, []
         for one in sorted(doubtful, key=lambda arrival: arrival.frame.time):
             ordered = last.frame.time < one.frame.time < new.frame.time
-            if ordered and last.frame.number <= one.frame.number <= new.frame.number:
+            counted = last.frame.number <= one.frame.number <= new.frame.number
+            if ordered and (counted or self._agrees(one, new)):  # or the last number was damaged
                 yield self._pass(one)
             else:
                 self.wild += 1
@@ -184,6 +197,10 @@ class FrameOrder:
         """
         waited = new.at - last.at
         return new.frame.time - last.frame.time <= waited + _LONGEST_GAP and self._agrees(last, new)
+
+    def _follows(self, last: Arrival, new: Arrival) -> bool:
+        """Whether a frame is the next after another."""
+        return self._continues(last, new) and not self._missing(last, new)
 
     def _agrees(self, last: Arrival, new: Arrival) -> bool:
         """Whether time and number go on by no more than they explain each other, or the arrival the time."""

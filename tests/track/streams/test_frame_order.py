@@ -100,6 +100,39 @@ def test_a_frame_with_a_damaged_header_does_not_look_like_a_restart(number, time
     assert order.restarts == 0
 
 
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        # A number that runs ahead, before two frames that were swapped.
+        [(10, 9.0, 9), (12, 10.0, 10), (11, 11.0, 11), (13, 13.0, 13), (12, 12.0, 14)],
+        # A number that runs ahead of one dropped frame: the next number goes back.
+        [(10, 9.0, 9), (13, 11.0, 11), (10, 10.0, 12), (12, 12.0, 13), (13, 13.0, 14)],
+        # A time that falls short: the frame after the next arrives first.
+        [(9, 9.0, 9), (10, 9.355, 10), (12, 12.0, 12), (11, 11.0, 13), (13, 13.0, 14)],
+    ],
+)
+def test_a_damaged_header_takes_no_frame_with_it(damaged):
+    order, before = FrameOrder(), regular(range(9))
+    after = [(number, time, at + INTERVAL) for number, time, at in regular(range(14, 30))]
+    packets = [*before, *((number, time * INTERVAL, at * INTERVAL) for number, time, at in damaged), *after]
+    gone = [round(told / INTERVAL, 3) for _, told in passed(order, packets)]
+    assert set(range(11, 30)) <= set(gone)
+    assert gone == sorted(gone)
+    assert order.restarts == 0
+
+
+@pytest.mark.parametrize("ahead", [(163, 141.75), (120, 119.0), (64, 63.9)])
+def test_a_stream_goes_on_behind_a_header_that_runs_ahead(ahead):
+    """It waits for the frames before it, which come one after the other."""
+    order, packets = FrameOrder(), regular(range(150))
+    packets[61] = (3000, 600.0 * INTERVAL, packets[61][2])
+    packets[62] = (ahead[0], ahead[1] * INTERVAL, packets[62][2])
+    gone = {number for number, _ in passed(order, packets)}
+    assert set(range(150)) - {61, 62} <= gone
+    assert gone <= {*range(150), ahead[0]}
+    assert (order.restarts, order.late) == (0, 0)
+
+
 def test_a_pause_a_burst_and_another_rate_lose_nothing():
     order, packets = FrameOrder(), regular(range(20))
     packets += [(n, 5.0 + n * INTERVAL, 5.0 + n * INTERVAL) for n in range(20, 40)]  # the server paused
