@@ -17,7 +17,7 @@ So a doubtful frame waits for one more frame, and all others are not delayed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -73,7 +73,7 @@ class FrameOrder:
     def deadline(self) -> float:
         """When `expire` is to be called [s]; infinite when nothing waits."""
         if self._after_gap is not None:
-            newest = self._after_gap.at if self._last is None else max(self._after_gap.at, self._last.at)
+            newest = max(one.at for one in (self._last, self._after_gap) if one is not None)
             return newest + min(_GAP_WAIT, _GAP_INTERVALS * (self._interval or _GAP_WAIT))
         if self._last is None and self._doubtful:
             return self._doubtful[0].at + _FIRST_WAIT
@@ -108,11 +108,9 @@ class FrameOrder:
         elif last is not None and self._is_late(last, new):
             self.late += 1
         elif last is not None and self._continues(last, new):
-            following = [one for one in self._doubtful if self._follows(new, one)]
-            self._doubtful = [one for one in self._doubtful if not self._follows(new, one)]
-            yield from self._settle(last, new)
+            following = yield from self._settle(last, new)
             yield from self._line_up(new)
-            for one in following:  # it was doubtful only because of a damaged header before it
+            for one in following:
                 yield from self._add(one)
         elif gap is not None:
             yield self._pass_after_gap(gap)
@@ -139,16 +137,25 @@ class FrameOrder:
         else:
             yield self._pass(new)
 
-    def _settle(self, last: Arrival, new: Arrival) -> Iterator[Arrival]:
-        """The stream continues: doubtful frames between the two were right, all others were wild."""
-        doubtful, self._doubtful = self._doubtful, []
-        for one in sorted(doubtful, key=lambda arrival: arrival.frame.time):
+    def _settle(self, last: Arrival, new: Arrival) -> Generator[Arrival, None, list[Arrival]]:
+        """The stream continues: doubtful frames between the two were right, all others were wild.
+
+        Returns:
+            Those that follow the new one: they were doubtful only because of a damaged header before it.
+        """
+        following: list[Arrival] = []
+        others: list[Arrival] = []
+        for one in self._doubtful:
+            (following if self._follows(new, one) else others).append(one)
+        self._doubtful = []
+        for one in sorted(others, key=lambda arrival: arrival.frame.time):
             ordered = last.frame.time < one.frame.time < new.frame.time
             counted = last.frame.number <= one.frame.number <= new.frame.number
             if ordered and (counted or self._agrees(one, new)):  # or the last number was damaged
                 yield self._pass(one)
             else:
                 self.wild += 1
+        return following
 
     def _begin_anew(self, new: Arrival) -> Iterator[Arrival]:
         """Two frames that fit together begin the stream anew; a frame that fits to none is held."""
