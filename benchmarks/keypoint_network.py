@@ -1,7 +1,7 @@
 """What drawn pictures teach: a keypoint network that has seen only them, tried on photographs.
 
     python benchmarks/keypoint_network.py OUT --photos FOLDER --reference FILE [--variants ours plain ...]
-        [--pictures 12000 --samples 240000]
+        [--pictures 12000 --samples 240000 --seed 0]
 
 Trains the network of examples/14_train_a_keypoint_network.py once for each variant of the pictures, from
 equal poses and views, and prints the share of keypoints within a tenth of the box of the hand (PCK@0.1): on
@@ -16,8 +16,8 @@ no relief: ours with smooth skin, without knuckles, tendons and creases.
 no shadows: ours without shadows on what is behind the hand.
 no sensor: ours without exposure and noise.
 
-OUT keeps crops and networks, and a run goes on with what is there. `--page` draws fifty photographs, evenly
-taken from the folder, with the keypoints that a variant finds.
+OUT keeps crops and networks, and a run goes on with those of the same numbers and seed. `--page` draws fifty
+photographs, evenly taken from the folder, with the keypoints that a variant finds.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ import torch
 import trimesh
 from machine import describe
 
+from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
 from render.cameras.viewpoints import Viewpoints
@@ -148,11 +149,11 @@ VARIANTS: Final[dict[str, Callable[[int, int], Any]]] = {
 
 def pictures_of(variant: str, count: int, seed: int, out: Path) -> Any:
     """Crops of a variant, drawn or from the folder."""
-    path = out / f"{variant.replace(' ', '_')}-{seed}.npz"
+    path = out / f"{variant.replace(' ', '_')}-{count}-{seed}.npz"
     if not path.exists():
         cut = VARIANTS[variant](count, seed)
-        np.savez(path.with_suffix(".part.npz"), **cut._asdict())
-        path.with_suffix(".part.npz").rename(path)
+        with atomic_write(path) as temporary:
+            np.savez(temporary, **cut._asdict())
     with np.load(path, allow_pickle=False) as arrays:
         return EXAMPLE.Pictures(*(arrays[name] for name in EXAMPLE.Pictures._fields))
 
@@ -165,11 +166,14 @@ def learned_by(variant: str, options: argparse.Namespace) -> Any:
 
 def network_of(variant: str, options: argparse.Namespace) -> torch.nn.Module:
     """The network that has seen a variant, trained or from the folder."""
-    path = options.out / f"{variant.replace(' ', '_')}.pt"
+    trained_from = f"{options.pictures}-{options.samples}-{options.seed}"
+    path = options.out / f"{variant.replace(' ', '_')}-{trained_from}.pt"
     network = EXAMPLE.KeypointNetwork()
     if not path.exists():
         cut = pictures_of(variant, options.pictures, LEARNED, options.out)
-        torch.save(EXAMPLE.train(cut, options.samples, seed=options.seed).state_dict(), path)
+        trained = EXAMPLE.train(cut, options.samples, seed=options.seed)
+        with atomic_write(path) as temporary:
+            torch.save(trained.state_dict(), temporary)
     network.load_state_dict(torch.load(path, weights_only=True))
     return network.eval().to(memory_format=torch.channels_last)
 
