@@ -1,0 +1,32 @@
+"""A take of two hands and a controller, and a tracker of them."""
+
+from __future__ import annotations
+
+import pytest
+
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from track.evaluation.take_evaluation import true_users
+from track.tracker import Tracker
+from train.labelers.storage import load_labeler
+from train.simulation.takes import TakeConfig, simulate_take
+
+
+@pytest.fixture(scope="session")
+def labeler():
+    return load_labeler("dense19")
+
+
+@pytest.fixture(scope="session")
+def take() -> Take:
+    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240))
+
+
+@pytest.fixture(scope="session")
+def users(take) -> list[GloveFit]:
+    return true_users(take)
+
+
+@pytest.fixture
+def tracker(users, labeler) -> Tracker:
+    return Tracker(users, labeler)
