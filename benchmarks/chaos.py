@@ -207,7 +207,7 @@ if sys.argv[1:2] == ["--run"]:  # also in worker processes, which read this file
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--run"]:
-        from handsim.app.cli import main as handsim_main
+        from handsim.cli.main import main as handsim_main
 
         sys.exit(handsim_main(sys.argv[2:]))
     sys.exit(main())

@@ -23,7 +23,7 @@ from machine import describe
 from scipy.stats import spearmanr
 
 from gloves.layout import MarkerLayout, list_layouts, load_layout, save_layout
-from handsim.app.cli import main as handsim
+from handsim.cli.main import main as handsim
 from handsim.space.cameras import load_rig
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout

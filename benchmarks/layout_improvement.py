@@ -17,7 +17,7 @@ from layout_forecast import measure, stored
 from machine import describe
 
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout, save_layout
-from handsim.app.cli import main as handsim
+from handsim.cli.main import main as handsim
 from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of
 
 

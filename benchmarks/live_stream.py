@@ -229,7 +229,7 @@ def kill(take: Take, rate: float, folder: Path) -> None:
         part = out.with_name(out.name + ".part")
         points, ids = np.tile(take.points, (20, 1, 1)), np.tile(take.ids, (20, 1))
         with ReplayServer(points, ids, rate) as server:
-            program = "import sys; from handsim.app.cli import main; sys.exit(main(sys.argv[1:]))"
+            program = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
             command = [sys.executable, "-c", program, "track", "--live", server.url, "--out", str(out)]
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             fewest = SETTLED * rate

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from machine import describe
 
-from handsim.app.cli import main as handsim
+from handsim.cli.main import main as handsim
 
 GLOVE = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
 WANTED, LIMIT = 0.93, 15 * 60

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from gloves.captures.collection import read_markers
-
-if TYPE_CHECKING:
-    import numpy as np
 
 
 def right_hands(captures: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:

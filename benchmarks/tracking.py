@@ -37,8 +37,8 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
+from handsim.cli.calibrate import calibrate
 from track.capture_tracking import warm_up
-from track.commands.calibrate import calibrate
 from track.evaluation.hand_errors import hand_errors
 from track.evaluation.take_evaluation import (
     TrackingReport,

@@ -27,7 +27,7 @@ from train.loop import CHECKPOINT
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import generate_dataset
 
-HANDSIM = [sys.executable, "-c", "import sys; from handsim.app.cli import main; sys.exit(main())"]
+HANDSIM = [sys.executable, "-c", "import sys; from handsim.cli.main import main; sys.exit(main())"]
 EVERY = 1.0  # [s] between two looks at the memory
 PARTS = (0.25, 0.5, 0.75, 1.0)  # of the run, where losses are compared
 ROWS = re.compile(r"/rows-\d+\.npy$", re.M)

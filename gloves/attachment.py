@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout, MarkerPlace
 from handsim.errors import ArgumentError, LayoutError
@@ -15,10 +16,7 @@ from handsim.hand.mjcf import Site
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import HandSurface, vertex_normals
 from handsim.hand.topology import BONE_NAMES, NUM_BONES, PALM
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 _MOST_FITTINGS: Final = 20
 _WIDTHS: Final = {"points": 3, "normals": 3, "bone_indices": 4, "bone_weights": 4}
@@ -194,7 +192,7 @@ def _first_exits(
     return rays, faces, weights, distances
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
     """First exits along rays: faces (R,), -1 for none, barycentric weights (R, 3), distances (R,) [m].
 
@@ -234,13 +232,13 @@ def _exits(origins: Any, directions: Any, vertices: Any, faces: Any) -> Any:
     return found, weights, nearest
 
 
-@numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+@kernel(inline=True)
 def _dot(first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> float:
     """Scalar product of two vectors (3,)."""
     return float(first[0] * second[0] + first[1] * second[1] + first[2] * second[2])
 
 
-@numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+@kernel(inline=True)
 def _cross(
     first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"], product: Float[np.ndarray, "3"]
 ) -> None:

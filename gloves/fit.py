@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout
@@ -17,9 +17,6 @@ from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_QPOS, Side
 from handsim.space.cameras import CameraRig
 from handsim.space.transforms import MIRROR
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,17 +12,15 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.errors import HandSimError, LayoutError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, number_of, quoted, tables_of, text_of, written
 from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, PALM, SIDES, Side
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 FEWEST_MARKERS: Final = 5
 MOST_MARKERS: Final = 60

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.attachment import attach_markers
 from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace
@@ -14,10 +16,6 @@ from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONE_NAMES, PALM
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _STEPS: Final = 12
 _NEAR: Final = 1e-5  # [m]

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from handsim.errors import ArgumentError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
 
 
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:

@@ -8,9 +8,11 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
@@ -25,10 +27,6 @@ from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES, Side
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes.couplings import HIGH, LOW
 from render.shown_take import Cast, ShownTake
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
 _MOST_FRAMES: Final = 10_000_000

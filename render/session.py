@@ -7,10 +7,11 @@ import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import TrackedTake
@@ -45,9 +46,6 @@ from render.sensors.shutter import sample_shutter
 from render.shown_take import ShownTake, load_shown_take, show_take
 from render.skin.look import SkinLook
 from render.studio.studio import FrameChoices, Studio
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Progress = Callable[[int, int], None]
 """Called with the numbers of finished pictures and of all pictures."""

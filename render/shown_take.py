@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, attach
 from gloves.takes.motion import load_any_take
@@ -18,10 +20,6 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape, sample_shape
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import pose_matrices
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

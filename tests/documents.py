@@ -41,7 +41,7 @@ for name, kind, code in json.load(sys.stdin):
 print(json.dumps(printed))
 """
 HANDSIM = """#!/bin/sh
-exec '{python}' -c 'import sys; from handsim.app.cli import main; sys.exit(main())' "$@"
+exec '{python}' -c 'import sys; from handsim.cli.main import main; sys.exit(main())' "$@"
 """
 
 

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("handsim", "poses", "gloves", "render", "train", "track")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MOST_MODULES, MOST_LEVELS, MOST_LINES = 14, 8, 400
-LOADERS = {"handsim/app/command_table.py", "handsim/_lazy.py"}
+LOADERS = {"handsim/cli/command_table.py", "handsim/_lazy.py"}
 
 # Identifiers of an earlier vocabulary that mean nothing else; docs/conventions.md has the words in use.
 OLD_WORDS = """

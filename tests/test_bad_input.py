@@ -16,7 +16,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.layout import load_layout, save_layout
 from gloves.takes.archives import write_archive
-from handsim.app.cli import main
+from handsim.cli.main import main
 from train.simulation.takes import TakeConfig, simulate_take
 
 GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"

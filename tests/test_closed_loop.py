@@ -8,6 +8,7 @@ import pytest
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import load_tracked_take
+from handsim.cli.simulate import simulate
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
 from render.cameras.viewpoints import ViewConfig
@@ -16,7 +17,6 @@ from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
-from train.commands.simulate import simulate
 from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig
 

@@ -60,7 +60,7 @@ def test_wheel_carries_license_command_and_one_version(wheel: zipfile.ZipFile) -
     about = f"handsim-{stated.group(1)}.dist-info"
     texts = {name: wheel.read(f"{about}/{name}").decode() for name in ("METADATA", "entry_points.txt")}
     assert f"\nVersion: {stated.group(1)}\n" in texts["METADATA"]
-    assert "handsim = handsim.app.cli:main" in texts["entry_points.txt"]
+    assert "handsim = handsim.cli.main:main" in texts["entry_points.txt"]
     assert f"{about}/licenses/LICENSE" in wheel.namelist()
     assert "version" not in _project_table()  # pyproject.toml repeats no version
     assert f"version: {stated.group(1)}\n" in (ROOT / "CITATION.cff").read_text()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from handsim.app.cli import main
+from handsim.cli.main import main
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "stored_arrays.md"
 ROW = re.compile(r"^\| `(\w+)` \| (\S+) \| \(([^)]*)\) \|", re.M)

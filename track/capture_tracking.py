@@ -10,9 +10,11 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool
+from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.captures.plausibility import check_place, check_unit
@@ -26,12 +28,8 @@ from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 
-if TYPE_CHECKING:
-    from jaxtyping import Bool
-    from numpy.typing import NDArray
-
-    Progress = Callable[[int, int], None]
-    Taken = Callable[[StreamedFrame, TrackedFrame], None]
+Progress = Callable[[int, int], None]
+Taken = Callable[[StreamedFrame, TrackedFrame], None]
 
 _LOOP_GAP: Final = 0.01
 """Time between the last frame of a recording and its first, when it starts again [s]."""

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.corrections import FREE, Correction, applied_corrections, find_pins, pin_labels
 from gloves.takes.tracked_take import LOST, TRACKED, TrackedTake
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.pose_solver import AnglePrior, PoseSolver
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] of hinges that markers leave open, around the tracked ones
 _BAD_RMS: Final = 0.006  # [m] after which a fit from general poses is tried too

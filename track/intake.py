@@ -5,15 +5,13 @@ A bad frame does not stop a stream. What cannot be used is left out, and a note 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.errors import ArgumentError
 from track.config import IntakeConfig
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 
 class IncomingFrame(NamedTuple):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.hand.topology import Side
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 
 class Status(Enum):

@@ -8,9 +8,10 @@ the labeler.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import NUM_QPOS
@@ -27,10 +28,6 @@ from track.config import TrackerConfig
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 
 class Tracker:

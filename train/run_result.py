@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from torch import nn
 
 from handsim._version import __version__
@@ -25,9 +26,6 @@ from train.matching.prior_learning import learn_pose_prior
 from train.reports.model_card import UNKNOWN_LICENSE, write_model_card
 from train.reports.run_page import write_run_page
 from train.training_state import TrainingState
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 MOST_HELD_OUT: Final = 8192
 _CARD_FRAMES: Final[dict[Kind, int]] = {"set": MOST_HELD_OUT, "cnn": 1024}  # of the evaluation

@@ -6,11 +6,12 @@ import dataclasses
 import io
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import torch
 from lightning_fabric import Fabric
+from numpy.typing import NDArray
 from torch import nn
 
 from handsim.errors import HandSimError, WeightsError
@@ -21,9 +22,6 @@ from train.data.mapped_rows import MappedRows
 from train.evaluation.labeler_evaluation import paper_report
 from train.history import History
 from train.labelers.kinds import batch_loss, labeler_of, new_network, prepare_network
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _CURVE: Final = 200  # points of the loss curve
 

@@ -7,17 +7,15 @@ other, the size of the data decides and the user is told; where it does not deci
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.captures._c3d_parameters import FLOAT_DTYPES, INTEGER_DTYPES, Parameters, to_native
 from gloves.captures._text import Tell
 from handsim.errors import CaptureError
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 BLOCK: Final = 512
 MOST_FRAMES: Final = 65535  # of a 16-bit count; longer takes state the rest in TRIAL:ACTUAL_END_FIELD

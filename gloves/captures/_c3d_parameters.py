@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gloves.captures._text import Tell
 from handsim.errors import CaptureError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _INTEL, _DEC, _SGI = 84, 85, 86
 INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}

@@ -6,14 +6,12 @@ import csv
 import math
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.errors import CaptureError, HandSimWarning
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 METERS: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _WORDS: Final = {

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.captures.formats import READABLE, read_capture
 from gloves.captures.markers import select_hands
 from handsim.errors import CaptureError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jaxtyping import Float
 
 
 def find_captures(paths: Sequence[Path]) -> list[Path]:

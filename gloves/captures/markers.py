@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError, choices
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jaxtyping import Float, Int
 
 UNLABELED: Final = "Unlabeled"
 """Columns of points without a marker are called Unlabeled1, Unlabeled2, ..."""

@@ -5,16 +5,14 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""

@@ -8,9 +8,10 @@ rate and the rows themselves are used. Rows may hold more trajectories than line
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.captures._text import (
     Tell,
@@ -24,9 +25,6 @@ from gloves.captures._text import (
 )
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _HEADER_LINES: Final = 5
 _LEADING: Final = 2  # frame number and time

@@ -7,9 +7,10 @@ and a blank line. Sections of other data (Devices, Model Outputs, ...) may prece
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.captures._text import (
     Tell,
@@ -22,9 +23,6 @@ from gloves.captures._text import (
 )
 from gloves.captures.capture import Capture
 from handsim.errors import CaptureError
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 _TITLE: Final = "Trajectories"
 _SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")

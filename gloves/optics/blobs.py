@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba
 import numpy as np
+
+from handsim.kernels.kernel import kernel
 
 MARKER_RADIUS: Final = 0.0032
 """Radius of the spheres of Han et al. 2018 (section 3) [m]: of markers on objects, and of strays."""
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def draw_blobs(
     sources: Any, sizes: Any, seen: Any, T_world_camera: Any, camera: Any, rng: Any, centers: Any, radii: Any
 ) -> None:
@@ -50,7 +51,7 @@ def draw_blobs(
             centers[c, s, 1] = focal * down / depth + noise * rng.standard_normal()
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def cast_rays(
     seen: Any, T_world_camera: Any, camera: Any, centers: Any, radii: Any, directions: Any, usable: Any
 ) -> None:

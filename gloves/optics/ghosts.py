@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.optics.mirrors import cameras_by_mirror, reflect
 from handsim._checks import check_number, check_span
 from handsim.space.cameras import CameraRig
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 MAX_GHOSTS: Final = 4
 """Ghosts kept per frame; more are dropped at random."""

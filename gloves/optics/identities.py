@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import heapq
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int
 
 
 def number_runs(present: Bool[np.ndarray, "T S"]) -> Int[np.ndarray, "T S"]:

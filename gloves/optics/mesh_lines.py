@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-import numba
 import numpy as np
+
+from handsim.kernels.kernel import kernel
 
 _PAD: Final = 1e-9  # around every box [m]: more than rounding, and flat boxes are no special case
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
     """Refit every box to its triangles; written out, because loops over axes take longer.
 
@@ -43,7 +44,7 @@ def refit(vertices: Any, skip: Any, spots: Any, start: Any, boxes: Any) -> None:
         boxes[node, 3], boxes[node, 4], boxes[node, 5] = hx + _PAD, hy + _PAD, hz + _PAD
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _meets(start: Any, end: Any, vertices: Any, nodes: Any, boxes: Any) -> bool:
     """Whether the line from `start` to `end`, each (3,) [m], meets a triangle.
 
@@ -84,7 +85,7 @@ def _meets(start: Any, end: Any, vertices: Any, nodes: Any, boxes: Any) -> bool:
     return False
 
 
-@numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+@kernel(inline=True)
 def _meets_triangle(p: Any, d: Any, vertices: Any, face: Any) -> bool:
     """Moeller and Trumbore 1997, without a division, for both windings; edges count as hit."""
     a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]
@@ -104,7 +105,7 @@ def _meets_triangle(p: Any, d: Any, vertices: Any, face: Any) -> bool:
     )
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def clear_lines(vertices: Any, lines: Any, nodes: Any, spots: Any, boxes: Any) -> Any:
     """Which lines (T, P, C) meet no triangle.
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from gloves.optics.mesh_lines import clear_lines
 from gloves.optics.mesh_tree import MeshTree
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 
 def clear_of_mesh(

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.optics.mesh_lines import refit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.shape import named_shape
 from handsim.hand.skin.surface import build_surface
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 _LEAF: Final = 4  # triangles of a leaf at most
 
@@ -68,7 +66,7 @@ def hand_tree() -> MeshTree:
     return MeshTree(surface.vertices, surface.faces)
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _build(low: Any, high: Any) -> Any:
     """Order of the triangles (F,), first triangle of every node (N + 1,), and `skip` (N,).
 
@@ -102,7 +100,7 @@ def _build(low: Any, high: Any) -> Any:
     return order, first[: nodes + 1], skip[:nodes]
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
     """Sort a node's triangles along an axis and return where to cut them: least sum of count x box area.
 
@@ -138,7 +136,7 @@ def _split(order: Any, low: Any, high: Any, centers: Any) -> int:
     return cut
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _leaf_vertices(faces: Any, first: Any) -> Any:
     """The vertices of every node's own triangles, each once, and where each node's list starts (N + 1,)."""
     nodes = len(first) - 1

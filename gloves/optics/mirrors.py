@@ -6,17 +6,15 @@ optical system reconstructs a point at the image.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numba
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
 from handsim.space.cameras import CameraRig
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 
 def reflect(
@@ -56,7 +54,7 @@ def cameras_by_mirror(
     return seen
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _over_patch(
     images: Any, plane_point: Any, plane_normal: Any, radius: float, T_world_camera: Any, view: float,
     segments: Any, radii: Any, seen: Any,
@@ -105,7 +103,7 @@ def _over_patch(
                 )
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _clear(start: Any, end: Any, segments: Any, radii: Any) -> bool:
     """Whether the line between two points (3,) [m] meets no capsule (axes (K, 2, 3) and radii (K,) [m])."""
     for k in range(len(radii)):

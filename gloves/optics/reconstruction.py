@@ -9,17 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.triangulation import reconstruct_frames
 from handsim.errors import ArgumentError
 from handsim.space.cameras import CameraRig
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
 
 MAX_FALSE_POINTS: Final = 6
 """False intersections kept per frame."""

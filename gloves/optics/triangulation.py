@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from gloves.optics.blobs import cast_rays, draw_blobs
+from handsim.kernels.kernel import kernel
 
 _FALSE_REACH = 0.25  # [m] farther than this from every source is outside the capture volume
 _FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last frame is the same
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def reconstruct_frames(
     sources: Any, sizes: Any, seen: Any, T_world_camera: Any, camera: Any, gates: Any, min_rays: Any,
     rng: Any, positions: Any, rays: Any, false_points: Any,
@@ -50,7 +50,7 @@ def reconstruct_frames(
         _meet_by_chance(sources[t], directions, usable, T_world_camera, gates, min_rays, positions[t], false)
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _meet(directions: Any, usable: Any, T_world_camera: Any, gates: Any, enough: int, point: Any) -> int:
     """Write the point (3,) nearest to a source's rays (C, 3), the worst ones dropped; number of rays."""
     used = usable.copy()
@@ -76,7 +76,7 @@ def _meet(directions: Any, usable: Any, T_world_camera: Any, gates: Any, enough:
     return 0
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _nearest_point(directions: Any, used: Any, T_world_camera: Any, point: Any) -> bool:
     """Least-squares meeting point of rays: sum of (I - d d^T) (x - o) = 0, by Cramer's rule."""
     a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0  # the symmetric matrix [[a, b, c], [b, d, e], [c, e, f]]
@@ -100,7 +100,7 @@ def _nearest_point(directions: Any, used: Any, T_world_camera: Any, point: Any) 
     return True
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _off(point: Any, direction: Any, pose: Any) -> float:
     """Distance [m] of a point from a camera's ray; infinite behind the camera."""
     x, y, z = point[0] - pose[0, 3], point[1] - pose[1, 3], point[2] - pose[2, 3]
@@ -110,7 +110,7 @@ def _off(point: Any, direction: Any, pose: Any) -> float:
     return float(np.sqrt(max(0.0, x * x + y * y + z * z - along * along)))
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _wide(directions: Any, used: Any, min_sine: float) -> bool:
     """Whether the first two used rays cross at a wide enough angle."""
     first = -1
@@ -124,7 +124,7 @@ def _wide(directions: Any, used: Any, min_sine: float) -> bool:
     return False
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
     """Remove the point with fewer rays of any two that are closer than `min_distance` [m]."""
     for s in range(len(rays)):
@@ -139,7 +139,7 @@ def _join_near(positions: Any, rays: Any, min_distance: float) -> None:
                     positions[gone] = np.nan
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> None:
     """Mark the rays of a point as used; a camera without a ray of its source gives its nearest ray."""
     for c in range(len(T_world_camera)):
@@ -157,7 +157,7 @@ def _spend(point: Any, source: int, directions: Any, usable: Any, T_world_camera
             usable[taken, c] = False
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _meet_by_chance(
     sources: Any, directions: Any, usable: Any, T_world_camera: Any, gates: Any, min_rays: Any,
     positions: Any, false: Any,
@@ -193,7 +193,7 @@ def _meet_by_chance(
                 usable[s, c] = usable[o, k] = False
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _support(point: Any, left: Any, directions: Any, usable: Any, T_world_camera: Any, gate: float) -> int:
     """Number of cameras with an unused ray through the point."""
     through = np.zeros(len(T_world_camera), dtype=np.bool_)
@@ -203,7 +203,7 @@ def _support(point: Any, left: Any, directions: Any, usable: Any, T_world_camera
     return int(through.sum())
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float) -> bool:
     """Whether a false point lies in the capture volume and away from all other points."""
     near = False
@@ -218,7 +218,7 @@ def _new_and_near(point: Any, sources: Any, positions: Any, min_distance: float)
     return near
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _false_column(point: Any, before: Any, now: Any) -> int:
     """The column whose false point of the frame before lies near, -1 for none."""
     for column in range(len(before)):
@@ -227,7 +227,7 @@ def _false_column(point: Any, before: Any, now: Any) -> int:
     return -1
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _free_column(before: Any, now: Any) -> int:
     """A column that was empty in the frame before and is empty now, -1 for none."""
     for column in range(len(before)):

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numba
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from handsim.hand.capsules import bounding_spheres
+from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
 from handsim.space.cameras import CameraRig
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 MAX_FACING: Final = np.deg2rad(85.0)
 """Largest angle between a marker's outward direction and the ray to a camera that still sees it [rad]."""
@@ -94,7 +92,7 @@ def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndar
     return bits
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _facing(markers: Any, normals: Any, T_world_camera: Any, cosines: tuple[float, float]) -> Any:
     """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`.
 
@@ -119,7 +117,7 @@ def _facing(markers: Any, normals: Any, T_world_camera: Any, cosines: tuple[floa
     return seen
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _keep_free(
     markers: Float[np.ndarray, "T M 3"],
     cameras: Float[np.ndarray, "C 3"],

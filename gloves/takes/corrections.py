@@ -13,16 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, numbers, quoted, shown, tables_of, text_of, written
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
-
     from gloves.takes.tracked_take import TrackedTake
+
 
 SUFFIX: Final = ".corrections.toml"
 """How the names of such files end."""

@@ -19,15 +19,13 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import CaptureError
 from handsim.files.atomic import atomic_write
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 SUFFIX: Final = ".part"
 """Added to the name of the archive."""

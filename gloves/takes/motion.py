@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gloves.takes.archives import archive_kind
 from gloves.takes.take import KIND, Take, load_take
@@ -14,9 +14,6 @@ from handsim.errors import CaptureError
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand, MovingThing, UpAxis
 from handsim.space.objects import named_object, object_names
 from handsim.space.transforms import pose_matrices
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 def load_motion(path: Path, *, up: UpAxis = "z") -> HandsInMotion:

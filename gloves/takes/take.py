@@ -6,9 +6,10 @@ import dataclasses
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.fit import GlovedHand, attach
@@ -25,9 +26,6 @@ from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
 from handsim.hand.topology import NUM_QPOS
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
 
 KIND: Final = "take"
 SCHEMA: Final = 1

@@ -6,9 +6,11 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import DTypeLike, NDArray
 
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit
@@ -28,10 +30,6 @@ from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, bridge_gaps
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
 from handsim.hand.topology import NUM_QPOS, Side
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import DTypeLike, NDArray
 
 KIND: Final = "tracked take"
 SCHEMA: Final = 2

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, choices
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
 

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import BONES, DIGITS, PALM
+from handsim.kernels.kernel import kernel
 from handsim.space.transforms import MIRROR
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 FIRMNESS: Final = 0.8
 """Capsule radius over skin radius."""
@@ -65,7 +63,7 @@ def _touching_pairs(bones: tuple[int, ...]) -> NDArray[np.int64]:
     return pairs
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _posed(
     transforms: Float[np.ndarray, "T L 4 4"],
     bones: Int[np.ndarray, "K"],
@@ -91,7 +89,7 @@ def _posed(
     return posed
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def bounding_spheres(
     segments: Float[np.ndarray, "K 2 3"],
     radii: Float[np.ndarray, "K"],

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim.hand.capsules import Capsules, bounding_spheres
+from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 
 def penetration_depth(
@@ -38,7 +36,7 @@ def overlap_between(
     return overlap
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _deepest(
     segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
 ) -> Any:
@@ -68,7 +66,7 @@ def _deepest(
     return depth
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _overlap(
     first: Float[np.ndarray, "T K 2 3"],
     first_radii: Float[np.ndarray, "K"],

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONES, JOINTS, NUM_BONES, NUM_JOINTS
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 NUM_VELOCITIES: Final = 6 + NUM_JOINTS
 """MuJoCo's nv: wrist velocity in the world, wrist angular velocity in its own frame, joint rates."""

@@ -6,16 +6,14 @@ of rotation; a tip is the far end of the last bone, on the skin.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS, NUM_JOINTS, PALM, bones_of
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
 KEYPOINT_NAMES: Final[tuple[str, ...]] = (

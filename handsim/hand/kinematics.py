@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.skeleton import Skeleton
 from handsim.hand.topology import BONES, JOINTS
 from handsim.kernels.chain import pose_bones
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _MOVED_BONES: Final = [joint.bone for joint in JOINTS]  # in the order of the bones
 _CHAIN: Final = np.array([(bone.parent, _MOVED_BONES.count(number)) for number, bone in enumerate(BONES)])

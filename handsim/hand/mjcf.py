@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from handsim.hand.capsules import Capsules
 from handsim.hand.skeleton import Skeleton
 from handsim.hand.topology import BONE_NAMES, BONES, JOINTS
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 FLESH_DENSITY: Final = 1100.0
 """Density of the hand [kg/m^3], soft tissue and bone together."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from handsim._checks import check_array
 from handsim.hand.capsules import Capsules, build_capsules
@@ -18,9 +18,6 @@ from handsim.hand.skeleton import Skeleton, build_skeleton
 from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import HandSurface, build_surface
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 
 class HandModel:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.topology import NUM_QPOS
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim._checks import check_array, check_number
 from handsim.errors import ArgumentError, choices
 from handsim.hand.topology import DIGITS, SIDES, Side
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 # A man of hand length 193.9 mm (Buryanov's middle ray on a 37 mm carpus) and breadth 88.3 mm (ANSUR II mean).
 REFERENCE_LENGTH: Final = 0.1939

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import BONES, JOINTS, NUM_BONES
 from handsim.space.transforms import MIRROR, euler_matrix
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,16 +8,14 @@ leaves it free, or fixes it, as it is told to.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, JOINTS
 from handsim.space.transforms import euler_angles, quaternion_matrix
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _SMALL_SHARE: Final = 0.01
 _MOST_TORQUE: Final = 2.0  # [N m], about that of a strong finger's first joint

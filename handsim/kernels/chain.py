@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
+from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import (
     multiply_rotations,
     rotate_about_axis,
@@ -14,11 +15,8 @@ from handsim.kernels.rotations import (
     write_quaternion_matrix,
 )
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
-
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def pose_bones(
     qpos: Float[np.ndarray, "T 27"],
     offsets: Float[np.ndarray, "L 3"],
@@ -61,7 +59,7 @@ def pose_bones(
     return transforms
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def pose_digit_axes(wrist: Any, angles: Any, digit: Any, posed: Any, scratch: Any) -> None:
     """Write the capsule axes of one digit: the forward kinematics of `pose_bones` for three bones.
 

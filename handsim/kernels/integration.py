@@ -6,15 +6,11 @@ up.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numba
 import numpy as np
+from jaxtyping import Float
 
+from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import quaternion_product, rotate_quaternion
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 
 def move(qpos: Float[np.ndarray, "T 27"], step: Float[np.ndarray, "T 26"]) -> Float[np.ndarray, "T 27"]:
@@ -48,7 +44,7 @@ def velocity_of(
     return velocity
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _move(
     qpos: Float[np.ndarray, "T 27"], step: Float[np.ndarray, "T 26"], moved: Float[np.ndarray, "T 27"]
 ) -> None:
@@ -62,7 +58,7 @@ def _move(
         rotate_quaternion(before[3:7], by[3:6], after[3:7])
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _find_velocity(
     before: Float[np.ndarray, "27"],
     after: Float[np.ndarray, "27"],

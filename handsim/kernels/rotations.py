@@ -6,16 +6,13 @@ array.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numba
 import numpy as np
+from jaxtyping import Float
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
+from handsim.kernels.kernel import kernel
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float, y: float, z: float) -> None:
     """Write the rotation matrix of a unit quaternion.
 
@@ -43,7 +40,7 @@ def write_quaternion_matrix(matrix: Float[np.ndarray, "_ _"], w: float, x: float
     )
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def write_axis_angle_matrix(
     matrix: Float[np.ndarray, "_ _"], axis: Float[np.ndarray, "3"], angle: float
 ) -> None:
@@ -58,7 +55,7 @@ def write_axis_angle_matrix(
     write_quaternion_matrix(matrix, cosine, sine * axis[0], sine * axis[1], sine * axis[2])
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def multiply_rotations(
     first: Float[np.ndarray, "_ _"], second: Float[np.ndarray, "_ _"], product: Float[np.ndarray, "_ _"]
 ) -> None:
@@ -75,7 +72,7 @@ def multiply_rotations(
             product[i, j] = x * second[0, j] + y * second[1, j] + z * second[2, j]
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def rotate_about_axis(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float) -> None:
     """Rotate a frame in place about an axis of its own (Rodrigues' formula on its rows).
 
@@ -94,7 +91,7 @@ def rotate_about_axis(rotation: Float[np.ndarray, "3 3"], axis: Float[np.ndarray
         rotation[row, 2] = cosine * c + sine * (a * y - b * x) + along * z
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def quaternion_product(
     w: float, x: float, y: float, z: float, e: float, a: float, b: float, c: float
 ) -> tuple[float, float, float, float]:
@@ -107,7 +104,7 @@ def quaternion_product(
     )
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def rotate_quaternion(
     before: Float[np.ndarray, "4"], vector: Float[np.ndarray, "3"], after: Float[np.ndarray, "4"]
 ) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numba
 import numpy as np
+from jaxtyping import Float
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
+from handsim.kernels.kernel import kernel
 
 
-@numba.njit(cache=True, inline="always")  # type: ignore[untyped-decorator]
+@kernel(inline=True)
 def segment_distance_squared(
     p: Float[np.ndarray, "3"], q: Float[np.ndarray, "3"], a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
 ) -> float:

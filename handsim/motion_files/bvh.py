@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import Final, TextIO
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
@@ -20,10 +22,6 @@ from handsim.hand.topology import BONE_NAMES, BONES, PALM
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
 from handsim.motion_files.local_poses import CHILDREN, local_rotations
 from handsim.space.transforms import euler_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 ROOT: Final = "world_cm"
 _CENTIMETERS: Final = 100.0

@@ -8,9 +8,10 @@ frames has the scale 0 there, which every reader shows as nothing; its other key
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim._version import __version__
 from handsim.files.atomic import atomic_write
@@ -21,9 +22,6 @@ from handsim.motion_files.glb_buffer import GlbBuffer
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand, MovingThing, changes
 from handsim.motion_files.local_poses import CHILDREN, local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals, split_vertices
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _SKIN, _THING = 0, 1  # materials
 _MATERIALS: Final = [

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import struct
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Target = Literal["vertices", "indices"]
 _COMPONENTS: Final = {"|u1": 5121, "<u2": 5123, "<u4": 5125, "<f4": 5126}

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handsim.errors import ArgumentError
@@ -14,10 +16,6 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import NUM_QPOS, Side
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 UpAxis = Literal["y", "z"]
 _MOST_FRAMES: Final = 1 << 22

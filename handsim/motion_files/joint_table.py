@@ -6,18 +6,16 @@ Where a hand has no pose, its row is there and its numbers are missing: empty in
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 NUMBERS: Final[tuple[str, ...]] = (
     *(f"wrist_{axis}_m" for axis in "xyz"),

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.topology import BONES, PALM
 from handsim.space.transforms import rotation_quaternions
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 CHILDREN: Final = tuple(
     tuple(number for number, bone in enumerate(BONES) if bone.parent == parent)

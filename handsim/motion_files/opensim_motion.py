@@ -8,18 +8,15 @@ frames without a pose are NaN.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.topology import JOINT_NAMES
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
 from handsim.space.transforms import euler_angles, quaternion_matrix
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 
 def write_mot(path: Path, motion: HandsInMotion) -> None:

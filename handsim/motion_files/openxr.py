@@ -15,19 +15,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, PALM, bones_of
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
 from handsim.motion_files.local_poses import smooth_quaternions
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 JOINTS: Final[tuple[str, ...]] = (
     "PALM",

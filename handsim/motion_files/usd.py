@@ -8,9 +8,11 @@ some frames is invisible there.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
@@ -20,10 +22,6 @@ from handsim.hand.topology import BONES, NUM_BONES, PALM
 from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand, MovingThing, changes
 from handsim.motion_files.local_poses import local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _SKIN_COLOR: Final = (0.66, 0.38, 0.28)
 _THING_COLOR: Final = (0.16, 0.2, 0.26)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, cast
+from typing import Final, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, RigError
 from handsim.files.atomic import read_toml
@@ -16,9 +17,6 @@ from handsim.space.camera import Camera, pinhole
 from handsim.space.cameras import aimed, load_rig
 from handsim.space.lens import Lens, LensKind
 from handsim.space.rig_file import PLACE_KEYS, parse_place
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _KEYS: Final = ("name", "description", "camera")
 _OWN_KEYS: Final = ("name", "size", "focal", "center", "lens", "coefficients")

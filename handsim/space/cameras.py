@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, RigError, choices
 from handsim.files.atomic import atomic_write
 from handsim.space.rig_file import read_rig_file, rig_lines
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 FEWEST_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32

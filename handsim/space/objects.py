@@ -10,20 +10,18 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import trimesh
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, ObjectError, choices
 from handsim.files.inputs import check_regular
 from handsim.space import solids as object_solids
 from handsim.space.solids import Part
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 MARKER_RADIUS: Final = 0.0032
 """Radius [m] of an object's own markers; their centers lie this far above the surface."""

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, RigError
 from handsim.files.atomic import read_toml
@@ -18,11 +22,6 @@ from handsim.files.toml_values import (
     text_of,
     written,
 )
-
-if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _RIG_KEYS: Final = ("name", "description", "field_of_view", "resolution", "camera")
 PLACE_KEYS: Final = ("position", "target", "T_world_camera")

@@ -5,16 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.space.transforms import axis_angle_matrix
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 PartKind = Literal["sphere", "capsule", "cylinder", "box", "ellipsoid", "mesh"]
 _AROUND: Final = 16  # sides of a capsule

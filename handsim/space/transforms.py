@@ -5,14 +5,10 @@ Quaternions are wxyz (MuJoCo's order). A matrix `T_a_b` maps coordinates of fram
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""

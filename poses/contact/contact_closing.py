@@ -7,7 +7,7 @@ motion can therefore be smoothed afterwards, towards the free side only.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from scipy.ndimage import convolve1d, maximum_filter1d
@@ -26,9 +26,8 @@ from poses.contact.contact_search import (
 
 __all__ = ["NEAREST", "close_fingers", "first_contact", "smooth_above", "smooth_below"]
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 # Fingers close in two stages: what stops a knuckle does not stop the joints beyond it. Each stage has a depth
 # [m] to which a finger presses into the other hand or its own, and the joints of a digit that it moves.

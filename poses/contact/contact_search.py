@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.capsules import bounding_spheres
 from handsim.kernels.chain import pose_digit_axes
+from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 FARTHEST: Final = 0.4
 """Where the search for the first contact begins [m], measured along the axis."""
@@ -74,7 +72,7 @@ class Obstacles(NamedTuple):
     """Depth to which the digit may press into them [m]."""
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def search_contact(
     moving: Float[np.ndarray, "T K 2 3"],
     moving_radii: Float[np.ndarray, "K"],
@@ -118,7 +116,7 @@ def search_contact(
     return reach
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any, axis: Any) -> Any:
     """Pairs (P, 2) whose bounding spheres meet somewhere along the axis; the others never touch.
 
@@ -145,7 +143,7 @@ def _pairs_in_line(moving: Any, moving_radii: Any, still: Any, still_radii: Any,
     return pairs[:count], spheres[:count]
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any:
     """Share (T,) of its path that a digit can follow before it meets something.
 
@@ -184,7 +182,7 @@ def search_closing(paths: DigitPaths, parts: Digit, obstacles: Obstacles) -> Any
     return share
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any) -> int:
     """Write the indices of the obstacles that a digit can reach into `near` (K,), and count them."""
     knuckle = wrist[1].copy()
@@ -201,7 +199,7 @@ def _within_reach(wrist: Any, parts: Any, obstacles: Any, frame: Any, near: Any)
     return count
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any, spheres: Any) -> bool:
     """Whether a digit with capsule axes `bones` (3, 2, 3) [m] meets one of the obstacles `near`.
 
@@ -221,7 +219,7 @@ def _blocked(bones: Any, parts: Any, obstacles: Any, frame: Any, near: Any, sphe
     return False
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def pose_digit(wrists: Any, angles: Any, parts: Any) -> Any:
     """Capsule axes (T, 3, 2, 3) [m] of a digit in the world.
 

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handsim.errors import ArgumentError, choices
@@ -19,10 +21,6 @@ from handsim.space.transforms import MIRROR, euler_matrix
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture, gesture_names
 from poses.shapes.validity import is_valid, make_valid, resting_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _FLEXION_NOISE: Final = np.deg2rad(4.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(1.5)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from handsim.errors import PoseError
@@ -15,9 +16,6 @@ from handsim.space.objects import RigidObject
 from handsim.space.transforms import axis_angle_matrix
 from poses.grasps.grasp_scene import object_penetration, pose_to_qpos, wrist_poses
 from poses.shapes.validity import MAX_PENETRATION
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _MOST_RETREATS: Final = 12
 _RETREAT_STEP: Final = 0.003  # [m] beyond what is needed

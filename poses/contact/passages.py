@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_number, check_span
@@ -14,10 +16,6 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.space.transforms import rotation_quaternions
 from poses.motion.minimum_jerk import PEAK_ACCELERATION, PEAK_SPEED, minimum_jerk
 from poses.shapes.validity import is_valid, sample_valid_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 MAX_OVERLAP: Final = 0.001
 """How deep two hands may press into each other [m]."""

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from handsim._checks import check_number, check_span
 from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _UPRIGHT: Final = np.array([0.36, -0.26, 0.9]) / np.linalg.norm([0.36, -0.26, 0.9])
 """Direction of a pen in the right hand of a person at -y, over a palm that faces down."""

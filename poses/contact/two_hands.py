@@ -8,9 +8,11 @@ and what fails is drawn again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handsim.errors import ArgumentError, PoseError
@@ -24,10 +26,6 @@ from poses.contact.meetings import draw_poses, play_meeting
 from poses.contact.passages import Passage, TwoHandConfig, join_passages, path_between
 from poses.motion.minimum_jerk import PEAK_SPEED, minimum_jerk
 from poses.motion.wrist_paths import along
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 __all__ = [
     "INTERACTIONS",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
@@ -16,10 +18,6 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, JOINTS, NUM_JOINTS, NUM_QPOS, PALM
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import quaternion_matrix, rotation_quaternions
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 MAX_OBJECT_PENETRATION: Final = 0.0015
 """Deepest overlap [m] of a hand and the object it holds that counts as valid."""

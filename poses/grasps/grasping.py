@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel
@@ -17,10 +19,6 @@ from poses.grasps.grasp_scene import MAX_OBJECT_PENETRATION, GraspScene, grasp_s
 from poses.grasps.hold_library import HoldStyle, hold_names, hold_style, place_object
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.validity import is_valid
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _MOST_TRIES: Final = 40
 _LOOSENESS: Final = np.deg2rad([1.0, 2.0, 3.0, 4.0, 5.0])  # spread of the angles between tries

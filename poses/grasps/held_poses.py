@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handsim.errors import PoseError
@@ -16,10 +18,6 @@ from poses.grasps.grasping import Hold
 from poses.grasps.hold_library import HoldStyle, hold_style
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.validity import is_valid
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 _DEEPEST: Final = MAX_OBJECT_PENETRATION - 1e-6  # [m], room for rounding in the world's frame
 _HALVINGS: Final = 4

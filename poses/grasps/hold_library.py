@@ -6,10 +6,12 @@ import json
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, choices
 from handsim.hand.model import HandModel, join_qpos
@@ -19,10 +21,6 @@ from handsim.space.transforms import MIRROR, quaternion_matrix, vector_quaternio
 from poses.grasps.grasp_scene import GraspScene
 from poses.grasps.retargeting import retarget_angles
 from poses.shapes.library import gesture
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _GAP: Final = 0.0005  # [m] between palm and object before the fingers close
 _SLIDE: Final = 0.15  # [m] from where an object comes up to the palm

@@ -7,9 +7,10 @@ checked in every frame: ranges, self-penetration, and penetration of the object.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
@@ -27,9 +28,6 @@ from poses.grasps.held_poses import Held, between, is_held_valid, rotation_betwe
 from poses.grasps.hold_library import HoldStyle, hold_names, hold_style
 from poses.motion.minimum_jerk import PEAK_ACCELERATION, PEAK_SPEED, MotionConfig, minimum_jerk
 from poses.motion.wrist_paths import free_wrist_path
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 __all__ = [
     "MAX_OBJECT_PENETRATION",

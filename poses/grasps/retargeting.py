@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import shape_from_measures
 from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
 from poses.shapes.couplings import HIGH, LOW
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _ROUNDS: Final = 12
 _STIFFNESS: Final = 0.006  # [m/rad]: residual of a tip that weighs as much as a joint's deviation

@@ -7,9 +7,11 @@ path that penetrates the hand goes by way of rest instead, with some digits ahea
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
@@ -20,10 +22,6 @@ from poses.motion.minimum_jerk import MotionConfig, held, minimum_jerk, straight
 from poses.motion.rest_paths import path_to_rest
 from poses.motion.wrist_paths import free_wrist_path
 from poses.shapes.validity import MAX_PENETRATION, is_valid, resting_angles, sample_valid_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 __all__ = ["MotionConfig", "minimum_jerk", "motion_through", "sample_motion"]
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel
@@ -16,10 +18,6 @@ from poses.motion.minimum_jerk import MotionConfig, straight_path
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
 from poses.shapes.validity import is_valid, resting_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 # Which digits move first on a path to rest: all at once, one before the others, one after them.
 _AHEAD: Final = [np.ones(NUM_JOINTS, dtype=bool)] + [

@@ -7,9 +7,11 @@ import dataclasses
 import json
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.model import HandModel
@@ -21,10 +23,6 @@ from poses.motion.rest_paths import can_be_left
 from poses.shapes.library import gesture, gestures_of
 from poses.shapes.touch import touching_angles
 from poses.shapes.validity import make_valid
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 FREE: Final = "free"
 """The name of a motion without a script: what `sample_motion` makes."""

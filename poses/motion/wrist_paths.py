@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_array, check_number, check_span
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.transforms import random_quaternions
 from poses.motion.minimum_jerk import MotionConfig, minimum_jerk
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _FREE_ROTATION: Final = 0.6  # from position to position, standard deviation about each axis [rad]
 _FORWARD: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

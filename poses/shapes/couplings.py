@@ -7,14 +7,12 @@ flexion drags the next.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.hand.topology import JOINTS
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 LOW: Final = np.deg2rad([joint.low for joint in JOINTS])
 HIGH: Final = np.deg2rad([joint.high for joint in JOINTS])

@@ -7,18 +7,16 @@ covered.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from handsim._checks import check_number
 from poses.shapes.couplings import HIGH, LOW, apply_couplings, finger_view
 from poses.shapes.library import all_gestures
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _FLEXION_NOISE: Final = np.deg2rad(6.0)
 _ABDUCTION_NOISE: Final = np.deg2rad(2.0)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim._checks import check_array
 from handsim._plugins import call_plugin, load_plugin
@@ -14,9 +15,6 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS
 from poses.shapes.samplers import sample_angles
 from poses.shapes.validity import make_valid
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 SAMPLERS: Final = "handsim.pose_samplers"
 """Group of entry points of pose samplers."""

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from handsim._checks import check_array
@@ -19,14 +20,11 @@ from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.capsules import Capsules
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
+from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
 from poses.shapes.validity import MAX_PENETRATION, is_valid, make_valid
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 FINGERS: Final = DIGITS[1:]
 MAX_OVERLAP: Final = 0.0006
@@ -222,7 +220,7 @@ def _nearest_points(segments: NDArray[np.float64]) -> NDArray[np.float64]:
     return nearest
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _overlaps(
     segments: Float[np.ndarray, "T K 2 3"], radii: Float[np.ndarray, "K"], pairs: Int[np.ndarray, "P 2"]
 ) -> Any:

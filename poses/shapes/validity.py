@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import PoseError
@@ -13,10 +15,6 @@ from handsim.hand.topology import JOINTS, NUM_QPOS
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
 from poses.shapes.samplers import DEFAULT_MIX, PoseMix, sample_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 MAX_PENETRATION: Final = 0.001
 """Deepest self-penetration [m] of a valid pose: skin yields by about this much."""

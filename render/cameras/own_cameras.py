@@ -5,17 +5,15 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimWarning, RigError
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera
 from render.shown_take import ShownTake
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _CHUNK: Final = 2048  # frames
 

@@ -9,9 +9,11 @@ import dataclasses
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from handsim.errors import ArgumentError, choices
@@ -20,10 +22,6 @@ from handsim.space.cameras import load_rig, look_at
 from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
 from render.shown_take import ShownTake
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 PLACEMENTS: Final[tuple[Placement, ...]] = ("still", "orbit", "head", "anywhere", "rig")

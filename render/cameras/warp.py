@@ -9,18 +9,16 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float32
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float32
-    from numpy.typing import NDArray
 
 Interpolation = Literal["nearest", "linear"]
 _MARGIN: Final = 2  # [px] around what is looked up

@@ -17,18 +17,16 @@ import errno
 import json
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.space.camera import Camera, camera_from_record
 from render.frames.frame import Pictures, RenderedFrame
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, UInt8
-    from numpy.typing import NDArray
 
 _RGB: Final = ("R", "G", "B")
 _NORMALS: Final = ("N.X", "N.Y", "N.Z")

@@ -9,18 +9,16 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import DatasetError, HandSimError
 from render.formats.annotations.common import as_sensed
 from render.frames.frame import Pictures, RenderedFrame
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt8
-    from numpy.typing import NDArray
 
 METERS_PER_UNIT: Final = 1e-4
 """Unit of a depth picture [m], unless its file contains another."""

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from handsim.hand.shape import HandShape
 from handsim.space.camera import Camera
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 PASSES: Final = ("rgb", "depth", "normals", "ids")
 """Kinds of pictures that can be asked for."""

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
 from render.illustrations.palette import BACKGROUND
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, UInt8
-    from numpy.typing import NDArray
-
-    Picture = UInt8[np.ndarray, "H W 3"]
+Picture = UInt8[np.ndarray, "H W 3"]
 
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _INK: Final = (38, 42, 50)

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from handsim.errors import ArgumentError, FileError
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from render.illustrations.drawing import render_rgb
 from render.illustrations.scene import Balls, HandScene, PosedHand, View, view_along
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 SUFFIX: Final = ".mp4"
 _SIZE: Final = (800, 600)  # [px]

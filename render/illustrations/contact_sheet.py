@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
 from handsim.hand.keypoints import KEYPOINT_DIGITS, SKELETON
@@ -16,11 +18,7 @@ from render.frames.frame import HandTruth, RenderedFrame
 from render.illustrations.captions import pad, side_by_side
 from render.illustrations.palette import BACKGROUND, bone_colors
 
-if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt8
-    from numpy.typing import NDArray
-
-    Picture = UInt8[np.ndarray, "H W 3"]
+Picture = UInt8[np.ndarray, "H W 3"]
 
 _GAP: Final = 6  # [px]
 _FRACTION_BITS: Final = 4  # OpenCV draws between pixels in sixteenths

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from numpy.typing import NDArray
 
 from render.illustrations.scene import HandScene, View, scene_surfaces
 from render.painting.painter import paint, put_before
 from render.painting.rasterizer import join, rasterize
 from render.scenery.lights import STUDIO
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Float32, UInt8
-    from numpy.typing import NDArray
 
 _OVERSAMPLING: Final = 2  # colors are painted this much larger and scaled down, for smooth outlines
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
@@ -30,10 +32,8 @@ from render.illustrations.palette import (
 from render.illustrations.scene import Balls, HandScene, PosedHand, view_along
 
 if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
-
     from render.illustrations.captions import Picture
+
 
 FINGERS_UP: Final = np.array([1.0, 0.0, 0.0])
 # Directions of view in the wrist frame of a right hand; mirrored for a left hand.

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, DIGITS
 from render.painting.materials import Material, linear
 from render.skin.glove_look import GLOVE_COLOR
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 Covering = Literal["skin", "glove"]
 BACKGROUND: Final = (0.957, 0.961, 0.969)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim._checks import check_array
@@ -19,10 +21,6 @@ from render.painting.figures import Drawn
 from render.painting.materials import MARKER_COLOR, Material, ball_material, linear
 from render.painting.rasterizer import NEAR, Triangles
 from render.painting.spheres import sphere_surface
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _BALL_LEVEL: Final = 3
 

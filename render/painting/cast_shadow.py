@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
-import numba
 import numpy as np
+from jaxtyping import Float32
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.rasterizer import NEAR, nearest_faces, project
 from render.scenery.backdrops import Backdrop
 from render.scenery.lights import Lighting
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32
-    from numpy.typing import NDArray
 
 _COARSE: Final = 4  # pixels of the picture a pixel of the shadow's mask: its edges are soft
 _MARGIN: Final = 0.15  # of the picture around it where a hand still counts as being in it
@@ -66,7 +64,7 @@ def light_behind(
     return shown
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _fall(
     points: NDArray[np.float64],
     normal: NDArray[np.float64],

@@ -7,21 +7,19 @@ pixel is shaded once, after its nearest face is known, and four times only at ed
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.rasterizer import nearest_faces, project
 from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, read_texels, shade
 from render.painting.shadow_map import shadow_map
 from render.scenery.lights import Lighting
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, UInt8
-    from numpy.typing import NDArray
 
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
 
@@ -94,7 +92,7 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
 
 
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _shade_surface(
     nearness: NDArray[np.float32],
     first: NDArray[np.int32],
@@ -155,7 +153,7 @@ def _shade_surface(
                     sums[row, column, 3] += share
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _samples(
     nearness: NDArray[np.float32], first: NDArray[np.int32], begin: int, end: int, row: int, column: int
 ) -> Any:
@@ -179,7 +177,7 @@ def _samples(
     return count, count == 4 and most - least < _SMOOTH * most
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _interpolate(
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
@@ -214,7 +212,7 @@ def _interpolate(
     _normalize(spot)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _apply_normal_map(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], face: int, spot: NDArray[np.float64]
 ) -> None:
@@ -247,7 +245,7 @@ def _apply_normal_map(
     _normalize(spot)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _normalize(spot: NDArray[np.float64]) -> None:
     """Scale the normal of a surface point (see `shading.SPOT`) to unit length."""
     scale = 1.0 / np.sqrt(spot[6] * spot[6] + spot[7] * spot[7] + spot[8] * spot[8])

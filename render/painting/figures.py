@@ -5,9 +5,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.keypoints import keypoint_flesh
@@ -30,10 +32,6 @@ from render.skin.glove_look import GloveLook, glove_texture, sample_glove_look
 from render.skin.look import SkinLook, sample_skin_look
 from render.skin.mesh import SkinMesh
 from render.skin.texture import skin_texture
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, UInt8
-    from numpy.typing import NDArray
 
 _BALL_LEVEL: Final = 2
 _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)

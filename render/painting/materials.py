@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, UInt8
-    from numpy.typing import NDArray
-
     from render.skin.texture import SkinTexture
+
 
 MARKER_COLOR: Final = (0.98, 0.98, 1.0)
 _SCATTER: Final = (0.30, 0.13, 0.08)

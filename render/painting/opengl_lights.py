@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from render.scenery.lights import Lighting
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
 _SHADOW_DEPTH: Final = 60.0  # [scene diagonals]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import UInt8
+from numpy.typing import NDArray
 
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
@@ -14,10 +16,6 @@ from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import Material
 from render.painting.opengl_lights import add_lights
 from render.scenery.lights import Lighting
-
-if TYPE_CHECKING:
-    from jaxtyping import UInt8
-    from numpy.typing import NDArray
 
 OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""

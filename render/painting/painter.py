@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
-import numba
 import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from render.painting.compiled_painter import paint_compiled
 from render.painting.figures import Drawn
@@ -16,10 +18,6 @@ from render.painting.hardware import opengl_has_hardware
 from render.painting.opengl_painter import paint_opengl
 from render.painting.rasterizer import NEAR
 from render.scenery.lights import Lighting
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt8
-    from numpy.typing import NDArray
 
 Painter = Literal["compiled", "opengl"]
 PainterChoice = Literal["auto", "compiled", "opengl"]
@@ -94,7 +92,7 @@ def put_before(
     return mixed
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _mix(painted: NDArray[np.uint8], background: NDArray[np.float32], mixed: NDArray[np.uint8]) -> None:
     """See `put_before`.
 

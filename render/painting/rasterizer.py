@@ -8,18 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Float32, Int, Int32, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
+from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from render.frames.frame import Pictures
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int, Int32, UInt8
-    from numpy.typing import NDArray
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
@@ -103,7 +101,7 @@ def nearest_faces(
     return nearness, first
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def project(local: NDArray[np.float64], K: NDArray[np.float64]) -> Any:
     """Pixels [px] and one over the depth [1/m] (V, 3) of points; NaN for those nearer than `NEAR`.
 
@@ -121,7 +119,7 @@ def project(local: NDArray[np.float64], K: NDArray[np.float64]) -> Any:
     return corners
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _draw(
     corners: NDArray[np.float64],
     faces: NDArray[np.int64],
@@ -167,7 +165,7 @@ def _draw(
                 w += step_w
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _write(
     inverse: NDArray[np.float32],
     first: NDArray[np.int32],
@@ -199,7 +197,7 @@ def _write(
                 markers[row, column] = labels[face, 2]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _interpolate(
     faces: NDArray[np.int64],
     normals: NDArray[np.float64],

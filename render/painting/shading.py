@@ -6,15 +6,13 @@ glTF 2.0 specification, appendix B), as in pyrender's shader, so that both paint
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from render.painting.shadow_map import lit_share
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 GAMMA: Final = 2.2
 _FACING: Final = 0.04  # specular reflectance of dielectrics at normal incidence
@@ -34,7 +32,7 @@ Pixel and one over the depth (3), position [m] (3) and unit normal (3) in the ca
 coordinates (2), linear color (3), roughness, the texture's normal (3)."""
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def display(light: float, table: NDArray[np.float64]) -> float:
     """The display value of linear light, clipped to [0, 1]; `table` is `TO_DISPLAY` (2048,)."""
     root = np.sqrt(min(max(light, 0.0), 1.0)) * (_LEVELS - 1)
@@ -43,7 +41,7 @@ def display(light: float, table: NDArray[np.float64]) -> float:
     return value
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float64], spot: NDArray[np.float64]) -> None:
     """Multiply a surface point's color and roughness by the texture's, and write its normal; bilinear.
 
@@ -75,7 +73,7 @@ def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float64], spot: NDA
     spot[18], spot[19], spot[20] = x / 127.5 - 1.0, y / 127.5 - 1.0, z / 127.5 - 1.0
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def shade(
     spot: NDArray[np.float64],
     finish: NDArray[np.float64],

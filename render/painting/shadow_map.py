@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, Float32, Int
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from render.painting.rasterizer import nearest_faces
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int
-    from numpy.typing import NDArray
 
 _TEXELS: Final = (
     640  # along a side; hands and forearms are half a meter across, a finger's edge a millimeter soft
@@ -55,7 +53,7 @@ def shadow_map(
     return ShadowMap(to_map, nearest, 1.5 / scale)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def lit_share(
     to_map: NDArray[np.float64], nearest: NDArray[np.float32], bias: float, x: float, y: float, z: float
 ) -> float:

@@ -8,19 +8,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal
 
 import cv2
 import numpy as np
+from jaxtyping import Float32
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, choices
 from render.scenery.backdrops import Backdrop, sample_backdrop
 from render.scenery.photographs import draw_photo, pick_photo
 from render.scenery.rooms import draw_room, paint_tint
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32
-    from numpy.typing import NDArray
 
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")

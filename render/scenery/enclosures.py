@@ -10,20 +10,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Float32, Int8, UInt8
+from numpy.typing import NDArray
 
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
 from render.frames.frame import Pictures
 from render.scenery.backgrounds import Background, draw_background
 from render.scenery.rooms import RoomLight, cast_room
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int8, UInt8
-    from numpy.typing import NDArray
 
 Corner = tuple[float, float, float]
 _MARGIN: Final = (0.8, 2.2)  # [m] between the outermost camera or hand and a wall

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _MOST_LAMPS: Final = 5  # pyrender's shader takes four lamps without a shadow
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import functools
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from handsim.errors import HandSimError
 from handsim.files.inputs import check_regular
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 PHOTO_SUFFIXES: Final = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff")
 _TRIES: Final = 50  # after so many unreadable files in turn, the folder counts as one without photographs

@@ -5,15 +5,14 @@ Half of the picture's resolution is enough: a background is out of focus.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
-import numba
 import numpy as np
+from jaxtyping import Float, Float32, Int8
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int8
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 _REDUCED: Final = 2
 _FURNITURE: Final = (4, 14)
@@ -183,7 +182,7 @@ def _place_boxes(room: NDArray[np.float64], eye: NDArray[np.float64], rng: np.ra
 
 
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the casting.
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _cast(
     rays: NDArray[np.float32],
     eye: NDArray[np.float64],
@@ -231,7 +230,7 @@ def _cast(
             picture[ray, channel] = light * color[channel]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _nearest_box(
     rays: NDArray[np.float32],
     ray: int,
@@ -262,7 +261,7 @@ def _nearest_box(
     return nearest, face, distance
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _wall_color(
     position: NDArray[np.float64],
     wall: int,

@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from render.scenery.backgrounds import Background, BackgroundConfig, draw_background, sample_background
 from render.scenery.lights import Lighting, sample_lighting
 from render.skin.look import SkinLook
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _SIZE: Final = (64, 48)  # of the picture that gives light
 _DIRECTIONS: Final = 1024

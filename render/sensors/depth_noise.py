@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, choices
 from handsim.space.camera import Camera
@@ -16,10 +18,6 @@ from handsim.space.lens import Lens
 from render.sensors import structured_light, time_of_flight
 from render.sensors.structured_light import StructuredLight
 from render.sensors.time_of_flight import TimeOfFlight
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt8
-    from numpy.typing import NDArray
 
 DepthNoise = StructuredLight | TimeOfFlight
 # Numbers and their sources are in docs/sensors.md.

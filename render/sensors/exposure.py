@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from render.sensors.random_images import normal_numbers
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt8
-    from numpy.typing import NDArray
 
 _LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
 _BAND: Final = 32  # rows done at a time, so that they stay in the processor's cache

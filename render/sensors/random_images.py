@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float32, UInt16
+from numpy.typing import NDArray
 from scipy.special import ndtri
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32, UInt16
-    from numpy.typing import NDArray
 
 
 @functools.cache

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from render.sensors.exposure import linear_of
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, UInt8
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float32
+from numpy.typing import NDArray
 
 from render.sensors.random_images import normal_numbers, quantiles, random_words
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float32
-    from numpy.typing import NDArray
 
 _DOTS: Final = (-3, 0, 3)  # one pixel in nine is a dot, so that a window of 9 x 9 holds these
 _FIXED: Final = 32.0  # disparities are compared in 1/32 px, which fit sixteen bits up to 1023 px

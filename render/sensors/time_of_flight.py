@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import cv2
 import numpy as np
+from jaxtyping import Float32
+from numpy.typing import NDArray
 
 from render.sensors.random_images import normal_numbers
-
-if TYPE_CHECKING:
-    from jaxtyping import Float32
-    from numpy.typing import NDArray
 
 _WALL: Final = 0.8  # reflectance of the white walls that noise was published for
 _BANDS: Final = 1024  # of cosines in the tables below

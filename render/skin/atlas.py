@@ -9,15 +9,13 @@ under the tiles.
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.hand.skin.cage_topology import WRIST, cage_topology
 from handsim.hand.skin.subdivision import catmull_clark, subdivided_loop
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 TILE: Final = 16
 """Texels along a tile's side."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 _MOST_KNOTS: Final = 128  # of noise, each way
 
@@ -33,7 +32,7 @@ def noise(
     return total
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _extent(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Least and greatest coordinates (3,) of positions (N, 3)."""
     low, high = positions[0].copy(), positions[0].copy()
@@ -44,7 +43,7 @@ def _extent(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     return low, high
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _add_octave(
     positions: NDArray[np.float64],
     low: NDArray[np.float64],

@@ -9,18 +9,16 @@ tendons, thenar and hypothenar eminences, head of the ulna), chosen by eye.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.topology import JOINT_NAMES
 from handsim.space.transforms import MIRROR
 from render.skin.fields import bump, smooth
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _REFERENCE: Final = 0.0118  # radius of an average finger at its knuckle, for which the lengths below are [m]
 _FINGERS: Final = ("index", "middle", "ring", "little")

@@ -9,19 +9,17 @@ tenth thinner. Elbows, 1.4 hand lengths behind the wrist, are a little thinner, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from handsim.errors import HandSimError
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_BONES
 from handsim.space.transforms import MIRROR
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 FOREARM: Final = NUM_BONES
 """Number of the forearm among a hand's parts, after those of its bones (`topology.BONES`)."""

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import functools
 import itertools
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from render.skin.fields import bump, smooth
 from render.skin.texels import DigitTexels, skin_texels
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 # The palm's three lines on the reference hand [mm], (x, y) of the wrist's frame: heart, head, life.
 _PALM_LINES: Final = (

@@ -8,22 +8,20 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import NUM_BONES, PALM
+from handsim.kernels.kernel import kernel
 from render.skin.atlas import RINGS, skin_atlas
 from render.skin.flexion import Flexion
 from render.skin.forearm import FOREARM, Forearm, forearm_rings
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int, UInt8
-    from numpy.typing import NDArray
 
 _DARKEST: Final = 0.12  # even the deepest folds receive some light
 
@@ -139,7 +137,7 @@ def face_parts() -> UInt8[np.ndarray, "F"]:
     return parts
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _occluded_share(
     points: NDArray[np.float64],
     normals: NDArray[np.float64],

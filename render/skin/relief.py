@@ -9,6 +9,8 @@ import functools
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import UInt8
+from numpy.typing import NDArray
 
 from handsim.hand.shape import named_shape
 from render.skin.atlas import ARM_ROWS, TILE, skin_atlas
@@ -16,10 +18,8 @@ from render.skin.fields import bump, smooth
 from render.skin.texels import skin_texels
 
 if TYPE_CHECKING:
-    from jaxtyping import UInt8
-    from numpy.typing import NDArray
-
     from handsim.hand.topology import Side
+
 
 _STEEPEST: Final = 0.9  # height over distance
 

@@ -6,9 +6,10 @@ It is computed once per process, on a right hand of size M with its fingers stra
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
@@ -17,9 +18,6 @@ from render.skin.atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin.fields import smooth
 from render.skin.forearm import Forearm
 from render.skin.mesh import SkinMesh
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 REFERENCE: Final = Forearm(length=0.5)
 """The forearm whose texels are painted; a longer one is stretched."""

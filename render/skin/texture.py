@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
+from numpy.typing import NDArray
 
 from render.skin.atlas import skin_atlas
 from render.skin.fields import bump, noise, smooth
@@ -17,9 +19,6 @@ from render.skin.relief import normal_map, relief
 from render.skin.texels import REFERENCE, skin_texels
 
 if TYPE_CHECKING:
-    from jaxtyping import UInt8
-    from numpy.typing import NDArray
-
     from handsim.hand.topology import Side
 
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy.typing import NDArray
 
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera
 from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures
 from render.painting.figures import HandFigure
 from render.skin.forearm import FOREARM
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, UInt8
-    from numpy.typing import NDArray
 
 _SLANTING: Final = (
     2.0  # lines of sight may pass this many times a joint's flesh: they meet skin at 30 degrees

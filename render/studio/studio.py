@@ -6,10 +6,12 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand
 from handsim.errors import HandSimError
@@ -30,10 +32,6 @@ from render.sensors.shutter import Shutter, combine, shutter_times
 from render.shown_take import ShownTake
 from render.skin.look import SkinLook
 from render.studio.hand_truth import hand_truth
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int, UInt8
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)

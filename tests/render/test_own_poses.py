@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from gloves.takes.take import load_take
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import CaptureError, HandSimError
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig
@@ -32,7 +32,7 @@ def path(tmp_path_factory):
     return file
 
 
-MAIN = "import sys; from handsim.app.cli import main; sys.exit(main())"
+MAIN = "import sys; from handsim.cli.main import main; sys.exit(main())"
 PLAIN = RenderConfig(
     view=ViewConfig(camera="vga", views=2), depth_sensor=None, color_sensor=None, every=12, frames_per_shard=2
 )

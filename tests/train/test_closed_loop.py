@@ -9,7 +9,7 @@ import pytest
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.hand.keypoints import hand_keypoints
 from render.cameras.viewpoints import ViewConfig
 from render.session import RenderConfig, draw_frames

@@ -10,8 +10,8 @@ import signal
 import pytest
 import torch
 
-from handsim.app.cli import main
 from handsim.app.interrupts import Stopped
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset

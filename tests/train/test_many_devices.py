@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
-from handsim.app.cli import main
 from handsim.app.interrupts import Stopped
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
 from train.config import SetLabelerConfig, TrainConfig, default_config
 from train.data.batches import Part, draw_batch
@@ -40,7 +40,7 @@ ONE = TrainConfig(samples=640, batch=32, network=SMALL)
 TWO = dataclasses.replace(ONE, devices=2)
 OPTIONS = ["--samples", "640", "--batch", "32", "--network.width", "8", "--network.gates", "2"]
 OPTIONS += ["--network.depth", "1"]
-HANDSIM = [sys.executable, "-c", "import sys; from handsim.app.cli import main; sys.exit(main())"]
+HANDSIM = [sys.executable, "-c", "import sys; from handsim.cli.main import main; sys.exit(main())"]
 SRUN = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NAME": "training", "SLURM_NODELIST": "127.0.0.1"}
 SRUN |= {"SLURM_NTASKS": "2", "SLURM_STEP_NUM_TASKS": "2", "SLURM_NNODES": "1", "SLURM_STEP_NUM_NODES": "1"}
 SRUN |= {"SLURM_NODEID": "0"}

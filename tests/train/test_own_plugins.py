@@ -11,8 +11,8 @@ import pytest
 
 from gloves.captures.formats import read_capture
 from handsim._plugins import load_plugin
-from handsim.app.cli import main
 from handsim.app.workers import in_processes
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError
 from poses.shapes.sampling import load_sampler
 from train.data.own_corruption import own_cloud

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
+from handsim.kernels.kernel import kernel
 from track.config import AssociationConfig
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
 
 MAX_CANDIDATES: Final = 7
 """Candidates of a digit at most; the number of hypotheses and the bits of `joint_assignment` grow with it."""
@@ -71,7 +69,7 @@ def find_candidates(
     return found
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _find_candidates(
     points: Float[np.ndarray, "N 3"],
     evidence: Float[np.ndarray, "N"],
@@ -116,7 +114,7 @@ def _find_candidates(
         found.counts[digit] = _add_nearest(distances[digit], rivals, found.candidates[digit], count)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _find_contested(
     points: Float[np.ndarray, "N 3"],
     evidence: Float[np.ndarray, "N"],
@@ -138,7 +136,7 @@ def _find_contested(
     return contested
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _add_nearest(
     distances: Float[np.ndarray, "N"],
     rivals: Bool[np.ndarray, "N"],
@@ -166,7 +164,7 @@ def _add_nearest(
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _distance(one: Float[np.ndarray, "3"], other: Float[np.ndarray, "3"]) -> float:
     """Distance of two points [m]."""
     return np.sqrt((one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2)  # type: ignore[no-any-return]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
+from handsim.kernels.kernel import kernel
 from track.kinematics.marker_kinematics import (
     HandArrays,
     Workspace,
@@ -16,9 +17,6 @@ from track.kinematics.marker_kinematics import (
 )
 from track.kinematics.small_systems import eliminate, solve_positive
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-
 # These four are compiled into fast-math kernels, so they are not part of `track.config.TrackerConfig`.
 _STEPS: Final = 10  # Levenberg-Marquardt steps at most; a digit needs about four
 _SMALL_GAIN: Final = 0.01  # of the cost (half squared standard deviations); no decision hangs on less
@@ -26,7 +24,7 @@ _LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2  # [1/rad^2] of a hinge beyond i
 _ROBUST_SQUARE: Final = 20.0  # squared standard deviations of the prior at which its loss levels off
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def fit_hypothesis(
     hand: HandArrays,
     digit: int,
@@ -113,7 +111,7 @@ def fit_hypothesis(
     return cost, 0.5 * (_log_determinant(normal) - _log_determinant(precision))
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _accumulate_normal_equations(
     hand: HandArrays,
     digit: int,
@@ -176,7 +174,7 @@ def _accumulate_normal_equations(
     return cost  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _log_determinant(matrix: Float[np.ndarray, "4 4"]) -> float:
     """Log determinant of a positive-definite matrix, by elimination."""
     factor, total = matrix.copy(), 0.0

@@ -9,20 +9,18 @@ evidence of IDs and queries.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.hand.topology import DIGITS
+from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
 from track.association.digit_fit import fit_hypothesis
 from track.kinematics.joint_prior import JointPrior, digit_prior
 from track.kinematics.marker_kinematics import HandArrays, compute_markers, workspace
 from track.kinematics.marker_prediction import MarkerPrediction
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 IMPOSSIBLE: Final = 1e9
 """Minus the score of a hypothesis that is excluded."""
@@ -101,7 +99,7 @@ class DigitModel(NamedTuple):
     """See `AssociationConfig` [rad]."""
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def evaluate_digit(
     hand: HandArrays,
     model: DigitModel,
@@ -162,7 +160,7 @@ def evaluate_digit(
     )
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _fit_hypotheses(
     hand: HandArrays,
     model: DigitModel,
@@ -245,7 +243,7 @@ def _fit_hypotheses(
             runners_up[points_used] = score
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _decode(number: int, choices: int, hypothesis: Int[np.ndarray, "K"]) -> int:
     """Write the hypothesis with a number to `hypothesis`, and return the set of points that it uses as bits.
 
@@ -260,7 +258,7 @@ def _decode(number: int, choices: int, hypothesis: Int[np.ndarray, "K"]) -> int:
     return points_used
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _costliest_subset(
     number: int, choices: int, hypothesis: Int[np.ndarray, "K"], costs: Float[np.ndarray, "H"]
 ) -> int:
@@ -274,7 +272,7 @@ def _costliest_subset(
     return costliest
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _best_subset_score(
     points_used: int, scores: Float[np.ndarray, "S"], subset_scores: Float[np.ndarray, "S"]
 ) -> float:
@@ -288,7 +286,7 @@ def _best_subset_score(
     return subset_scores[points_used]  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _upper_bound(
     model: DigitModel,
     markers: Int[np.ndarray, "K"],

@@ -8,14 +8,16 @@ the pose and its bias, which is nearly as accurate for an uncalibrated hand as f
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels.integration import move, velocity_of
+from handsim.kernels.kernel import kernel
 from track.association.digit_hypotheses import DigitModel, digit_ranges
 from track.association.point_matching import peak_log_odds
 from track.config import TrackerConfig
@@ -23,10 +25,6 @@ from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
 from track.kinematics.marker_prediction import MarkerPrediction
 from track.kinematics.pose_solver import PoseSolver
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 
 class Prediction(NamedTuple):
@@ -311,7 +309,7 @@ class HandState:
         )
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _learn_bias(
     residuals: Float[np.ndarray, "M 3"],
     rotations: Float[np.ndarray, "M 3 3"],
@@ -347,7 +345,7 @@ def _learn_bias(
         variance[marker] += (square - variance[marker]) / bias_frames[marker]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _shift_markers(
     bias_frames: Float[np.ndarray, "M"],
     bias: Float[np.ndarray, "M 3"],
@@ -380,7 +378,7 @@ def _shift_markers(
     return np.sqrt(square)  # type: ignore[no-any-return]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _rms_without_bias(
     residuals: Float[np.ndarray, "M 3"],
     rotations: Float[np.ndarray, "M 3 3"],

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fclusterdata
 
 from gloves.fit import GloveFit
@@ -24,10 +26,6 @@ from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseFit
 from train.hands.measures import longest_link
 from train.labelers.protocol import Labeler, Labeling
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 _LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked
 

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
+from handsim.kernels.kernel import kernel
 from track.association.digit_hypotheses import IMPOSSIBLE
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-
     from track.association.candidates import DigitCandidates
     from track.association.digit_hypotheses import DigitHypotheses
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def assign_jointly(
     candidates: DigitCandidates,
     hypotheses: DigitHypotheses,
@@ -51,7 +50,7 @@ def assign_jointly(
         _assign_group(group[:size], candidates, hypotheses, markers, assigned, margins)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _share_points(candidates: DigitCandidates, one: int, other: int) -> bool:
     """Whether two digits have a candidate in common."""
     for index in range(candidates.counts[one]):
@@ -61,7 +60,7 @@ def _share_points(candidates: DigitCandidates, one: int, other: int) -> bool:
     return False
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _assign_group(
     group: Int[np.ndarray, "G"],
     candidates: DigitCandidates,
@@ -107,7 +106,7 @@ def _assign_group(
             margins[point] = min(margins[point], total - alternative)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _sort_rows(scores: Float[np.ndarray, "S"], rows: Int[np.ndarray, "S"]) -> int:
     """Write the rows that are possible to `rows`, the best first, and return how many there are."""
     count = 0
@@ -123,7 +122,7 @@ def _sort_rows(scores: Float[np.ndarray, "S"], rows: Int[np.ndarray, "S"]) -> in
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def best_combination(
     scores: Float[np.ndarray, "D S"],
     sets: Int[np.ndarray, "D S"],

@@ -5,17 +5,15 @@ Labels are indices into the hand's layout; -1 is a point that is none of its mar
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from track.association.hand_state import Estimate, HandState, Prediction
 from track.config import GatingConfig
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
 
@@ -66,7 +64,7 @@ def gate_labels(
     )
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _gate(
     points: NDArray[np.float64],
     labels: NDArray[np.int64],
@@ -120,7 +118,7 @@ def exchange_labels(
     Returns:
         The points whose label has changed.
     """
-    return _exchange(  # type: ignore[no-any-return]
+    return _exchange(
         points,
         assigned,
         positions,
@@ -131,7 +129,7 @@ def exchange_labels(
     )
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _exchange(
     points: NDArray[np.float64],
     assigned: NDArray[np.int64],

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.topology import DIGITS
 from track.association.candidates import MAX_CANDIDATES, DigitCandidates, MarkerTable, find_candidates
@@ -21,10 +22,6 @@ from track.association.frame_state import FrameState
 from track.association.hand_state import Estimate, HandState, Prediction
 from track.association.joint_assignment import assign_jointly
 from track.association.point_matching import match_log_odds, match_points
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +136,7 @@ def _evaluate_hand(
     log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(labels >= 0)
     log_odds[labeled, labels[labeled]] = frame.evidence[labeled]
     confirmed, unconfirmed = state.digit_models(hand.prediction, hand.estimate)
-    for digit in np.flatnonzero(candidates.counts):
+    for digit in np.flatnonzero(candidates.counts).tolist():
         evaluate_digit(
             state.adapted,
             confirmed if state.confirmed[digit] else unconfirmed,

@@ -7,9 +7,11 @@ likelihood of the points: as markers of the fitted hand, or as strays where they
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from track.association.frame_state import FrameState
 from track.association.hand_state import Estimate
@@ -18,10 +20,6 @@ from track.association.label_new_points import HandTrack
 from track.association.point_matching import peak_log_odds
 from track.config import TrackerConfig
 from train.labelers.protocol import Labeler
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 
 class Proposal(NamedTuple):

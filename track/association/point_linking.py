@@ -8,20 +8,17 @@ otherwise than predicted is aligned with its points that were found so far.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from handsim.space.transforms import rigid_fit
 from track.config import LinkingConfig
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
-
-    Predicted = Mapping[int, tuple[int, NDArray[np.float64]]]
-    """Hand and predicted position (3,) [m] of numbered points."""
+Predicted = Mapping[int, tuple[int, NDArray[np.float64]]]
+"""Hand and predicted position (3,) [m] of numbered points."""
 
 
 class PointLinker:

@@ -7,9 +7,11 @@ labeled. Neither can initialize a hand, and neither recovers a lost hand other t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from gloves.fit import GloveFit
@@ -18,10 +20,6 @@ from handsim.kernels.integration import move, velocity_of
 from track.baselines.plain_hand import MOST_RMS, PlainHand
 from track.baselines.proposals import label_by_proximity
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 NEAR: Final = 0.01
 """Upper bound of the distance of a new point from the predicted position of a lost marker [m]."""

@@ -23,9 +23,11 @@ Where the paper gives no details:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from track.baselines.clustering import RADIUS, cluster_points
@@ -33,10 +35,6 @@ from track.baselines.plain_hand import MOST_RMS, PlainHand
 from track.baselines.proposals import label_by_proximity, labeler_cloud
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 GATE: Final = 0.015
 """Largest distance [m] of a point from the expected position of a missing marker."""

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import NUM_QPOS
 from track.kinematics.pose_solver import PoseFit, PoseSolver
 from track.tracked_frame import Status, TrackedHand
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 MOST_RMS: Final = 0.008
 """RMS distance [m] above which a pose is rejected; Han et al. 2018, section 4.4."""

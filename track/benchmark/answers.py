@@ -9,9 +9,10 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
 
 from gloves.fit import GloveFit
 from gloves.takes.tracked_take import keypoints_of
@@ -20,9 +21,6 @@ from handsim.files.arrays import read_npz
 from handsim.files.atomic import atomic_write
 from handsim.hand.keypoints import NUM_KEYPOINTS
 from handsim.hand.topology import NUM_JOINTS, Side
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int, Shaped
 
 SIDES: Final[tuple[Side, ...]] = ("right", "left")
 """The hands of every capture, in the order of labels and arrays."""

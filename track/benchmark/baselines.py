@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
+from jaxtyping import Int
 
 from gloves.captures.capture import Capture
 from gloves.fit import GloveFit, nominal_fit
@@ -29,10 +30,7 @@ from track.tracker import Tracker
 from train.glove_labeler import labeler_for_glove
 from train.labelers.protocol import Labeler
 
-if TYPE_CHECKING:
-    from jaxtyping import Int
-
-    MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]
+MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]
 
 TrackerName = Literal["handsim", "paper", "hungarian", "nearest"]
 Users = Literal["uncalibrated", "calibrated"]

@@ -7,9 +7,10 @@ import functools
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
@@ -41,9 +42,6 @@ from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room import record_take
 from train.simulation.room_settings import Kind
 from train.simulation.takes import sample_scene
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 Progress = Callable[[int, int], None]
 """Called with frames done and frames expected."""

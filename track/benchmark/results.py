@@ -12,9 +12,10 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Int
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
@@ -32,9 +33,6 @@ from track.benchmark.answers import (
     poses_of,
     unpack_answers,
 )
-
-if TYPE_CHECKING:
-    from jaxtyping import Int
 
 SUFFIXES: Final = (".npz", ".csv", ".trc", ".c3d")
 """Endings of results' files."""

@@ -12,9 +12,10 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from handsim.errors import HandSimWarning
 from handsim.hand.keypoints import NUM_KEYPOINTS
@@ -22,9 +23,6 @@ from track.benchmark.answers import Answers
 from track.benchmark.manifest import Benchmark, BenchmarkCapture, label_names
 from track.benchmark.results import find_results, read_result
 from train.evaluation.metrics import LabelCounts
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 NEAR: Final = 0.005
 """Distance from the truth within which a joint counts as found [m]."""

@@ -6,25 +6,21 @@ Arrays of floats are contiguous float64, arrays of integers int64.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numba
 import numpy as np
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import quaternion_product, write_quaternion_matrix
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
-
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def write_transform(pose: NDArray[np.float64], transform: NDArray[np.float64]) -> None:
     """Write a pose (7,) as a matrix (4, 4), whose last row is left as it is."""
     write_quaternion_matrix(transform, pose[3], pose[4], pose[5], pose[6])
     transform[0, 3], transform[1, 3], transform[2, 3] = pose[0], pose[1], pose[2]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def transform_markers(positions: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
     """Markers in the world (Q, 3) [m].
 
@@ -42,7 +38,7 @@ def transform_markers(positions: NDArray[np.float64], pose: NDArray[np.float64])
     return moved
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def predict_pose(
     pose: NDArray[np.float64], velocity: NDArray[np.float64], seconds: float
 ) -> NDArray[np.float64]:
@@ -65,7 +61,7 @@ def predict_pose(
     return later
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def velocity_between(
     first: NDArray[np.float64], second: NDArray[np.float64], seconds: float
 ) -> NDArray[np.float64]:
@@ -85,7 +81,7 @@ def velocity_between(
     return velocity
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def squared_distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     """Squared distance of two points (3,) [m^2]."""
     x, y, z = first[0] - second[0], first[1] - second[1], first[2] - second[2]

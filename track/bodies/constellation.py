@@ -7,23 +7,21 @@ Arrays of floats are contiguous float64, arrays of integers int64.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from track.bodies.body_pose import squared_distance, transform_markers
 from track.kinematics.starting_poses import align_rigid
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 FEWEST: Final = 3
 """Markers that determine a pose."""
 _NEW: Final = 1.5  # gate of a point with a new ID, over the tight gate
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def fit_inliers(
     positions: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -72,7 +70,7 @@ def fit_inliers(
     return count, np.sqrt(total / count)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _fit_pose(
     positions: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -100,7 +98,7 @@ def _fit_pose(
     return count, total, worst
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _worst_outlier(
     positions: NDArray[np.float64], points: NDArray[np.float64], assignment: NDArray[np.int64]
 ) -> tuple[int, bool]:
@@ -121,7 +119,7 @@ def _worst_outlier(
     return outlier, least < 0.1 * second
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def assign_by_id(
     points: NDArray[np.float64],
     ids: NDArray[np.int64],
@@ -152,7 +150,7 @@ def assign_by_id(
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def assign_remaining(
     positions: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -173,7 +171,7 @@ def assign_remaining(
     return fitted
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def nearest_free(
     points: NDArray[np.float64], center: NDArray[np.float64], radius: float, assignment: NDArray[np.int64]
 ) -> int:
@@ -186,7 +184,7 @@ def nearest_free(
     return nearest
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def shift_to_points(
     points: NDArray[np.float64],
     assignment: NDArray[np.int64],
@@ -224,7 +222,7 @@ def shift_to_points(
     return count, np.sqrt(total / count)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def track_by_ids(
     positions: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -259,7 +257,7 @@ def track_by_ids(
     return count, rms
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def write_labels(
     assignment: NDArray[np.int64],
     ids: NDArray[np.int64],

@@ -5,21 +5,19 @@ Shapes and conventions are those of `constellation`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from track.bodies.body_pose import squared_distance
 from track.bodies.constellation import FEWEST, fit_inliers, nearest_free
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _FLAT: Final = 0.1  # height of a triangle over its longest side, below which it determines no rotation
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def search_constellation(
     positions: NDArray[np.float64],
     distances: NDArray[np.float64],
@@ -71,7 +69,7 @@ def search_constellation(
     return int(score[0]), score[1], int(score[2])
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _try_triangles(
     positions: NDArray[np.float64],
     distances: NDArray[np.float64],
@@ -111,7 +109,7 @@ def _try_triangles(
                     _keep_better(positions, points, gate, trial, assignment, pose, score)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _keep_better(
     positions: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -148,7 +146,7 @@ def _keep_better(
         score[2] = count
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _extend_triangle(
     positions: NDArray[np.float64],
     points: NDArray[np.float64],
@@ -186,7 +184,7 @@ def _extend_triangle(
     return count
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _triangle_axes(
     first: NDArray[np.float64],
     second: NDArray[np.float64],

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.takes.tracked_take import MarkedBody
 from handsim._checks import check_array
@@ -30,10 +32,6 @@ from track.bodies.constellation import (
 )
 from track.bodies.constellation_search import search_constellation
 from track.tracked_frame import Status
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 GATE: Final = 0.003
 """Largest distance of a labeled point from its marker [m]: ten times the noise of a good system."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.captures.plausibility import check_unit
@@ -13,9 +14,6 @@ from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate, templ
 from track.calibration.frames import CalibrationError
 from track.capture_tracking import capture_frames
 from track.streams.frame_source import StreamedFrame
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _MOST_MARKERS: Final = 20
 _COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers

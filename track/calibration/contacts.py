@@ -7,9 +7,11 @@ and gets a small weight.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, bones_of
@@ -24,10 +26,6 @@ from track.calibration.skin_coordinates import (
     skin_points,
     skin_weights,
 )
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 PAD_COMPRESSION: Final = 0.001
 """Compression of each pad in a touch [m]: simulated pads overlap by 1.6 to 2.4 mm together."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit
@@ -12,10 +14,6 @@ from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
 from track.calibration.report import ENOUGH_RANGE, still_joints
 from track.kinematics.pose_solver import PoseSolver
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 NUM_FRAMES: Final = 240
 """Frames that a calibration is solved on."""

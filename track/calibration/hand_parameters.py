@@ -7,21 +7,18 @@ the digits, girths and the palm's thickness vary in addition, as in `handsim.han
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import ADULTS, HandShape
 from handsim.hand.skeleton import build_skeleton
 from handsim.hand.topology import DIGITS, NUM_BONES
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from jaxtyping import Float
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 LENGTH, BREADTH = 0, 1  # log factors
 BONE_LENGTHS: Final = slice(2, 17)  # log factors, three per digit
@@ -135,7 +132,7 @@ def _base_angle_axes(shape: HandShape) -> Float[np.ndarray, "5 3 3"]:
     return 0.5 * axes
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _fill_jacobian(
     bones: NDArray[np.float64],
     rest: NDArray[np.float64],
@@ -171,7 +168,7 @@ def _fill_jacobian(
                     )
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _add_bone(
     row: NDArray[np.float64],
     bone: int,
@@ -214,7 +211,7 @@ def _add_bone(
         _add_rotation(row, 30 + 3 * digit + axis, share, bones[0], rotation, axes[digit, axis], carried, arm)
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _add_rotation(
     row: NDArray[np.float64],
     column: int,

@@ -7,9 +7,10 @@ as it was.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import Side
@@ -19,9 +20,6 @@ from track.calibration.hand_parameters import NUM_PARAMETERS
 from track.calibration.skin_coordinates import nearest_coordinates
 from track.calibration.solver import levenberg_marquardt, user_hand
 from track.kinematics.pose_solver import PoseSolver
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
 _ROBUST_SCALE: Final = 0.015  # [m]

@@ -7,9 +7,11 @@ the markers follow as far as the frames tell. `user_calibration` finds the rest 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from gloves.fit import GloveFit, attach
@@ -23,10 +25,6 @@ from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] hands to find the labels with, the likeliest first
 _SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longest in ANSUR II

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.files.atomic import atomic_write
@@ -17,9 +19,7 @@ from handsim.hand.topology import BONES, PALM
 from track.calibration.user_calibration import Calibration
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
     from matplotlib.axes import Axes
-    from numpy.typing import NDArray
 
 _INK, _SOFT, _BEFORE, _AFTER, _TOUCH, _CARD = "#23272f", "#5b6270", "#8a93a0", "#b8572b", "#7a4fa3", "#f4f5f7"
 _SIZE: Final = (12.5, 7.2)  # [inch]

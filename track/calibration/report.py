@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from handsim.hand.model import HandModel
@@ -16,10 +18,6 @@ from track.calibration.energy import Estimate, Fit, Problem
 from track.calibration.hand_parameters import BONE_LENGTHS, LENGTH, NUM_PARAMETERS, shape_jacobian
 from track.calibration.skin_coordinates import SkinPatch, skin_points, skin_weights
 from track.calibration.solver import eliminate_poses
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 ENOUGH_RANGE: Final = 0.3
 """Share of a joint's range that the user has to cover."""

@@ -8,9 +8,11 @@ follows the skin when the shape changes.
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy import sparse
 
 from gloves.attachment import Attachment
@@ -19,10 +21,6 @@ from handsim.hand.shape import HandShape, named_shape
 from handsim.hand.skin.subdivision import catmull_clark
 from handsim.hand.skin.surface import build_surface, vertex_normals
 from handsim.hand.topology import NUM_BONES
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 _MOST_STEPS: Final = 40
 _OUTSIDE: Final = -1e-9  # barycentric coordinate below which a point is outside its triangle

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import HandModel
@@ -18,9 +19,6 @@ from track.calibration.contacts import contact_weights, slide_contacts
 from track.calibration.energy import Estimate, Fit, NormalEquations, Problem
 from track.calibration.hand_parameters import shape_at
 from track.calibration.skin_coordinates import attachment_at
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 Progress = Callable[[int, float, float], None]
 """Called after each step: its number, `marker_rms` and `contact_gap` [m] (NaN: no contacts yet)."""

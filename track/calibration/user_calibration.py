@@ -15,9 +15,11 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import HandModel
@@ -47,10 +49,6 @@ from track.calibration.report import (
 )
 from track.calibration.skin_coordinates import SkinPatch, nearest_coordinates, skin_points
 from track.calibration.solver import Progress, levenberg_marquardt, user_hand
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 __all__ = ["Calibration", "CalibrationError", "Touch", "calibrate", "calibrate_hands"]
 

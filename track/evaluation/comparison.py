@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
@@ -27,10 +28,7 @@ from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
-
-    MakeTracker = Callable[[Take, Sequence[GloveFit]], FrameTracker]
+MakeTracker = Callable[[Take, Sequence[GloveFit]], FrameTracker]
 
 OURS: Final = "handsim"
 PAPERS_LOOP: Final = "paper's loop"

@@ -9,19 +9,17 @@ next joint.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import PALM
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 
 class HandErrors(NamedTuple):

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from rich.markup import escape
 from rich.table import Table
 
 from track.evaluation.comparison import Measurement
 from track.evaluation.paper import CAMERAS, HAN, TABLE5, TABLE7
 from train.simulation.room_settings import KINDS
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _HEAD: Final = ("method", "hands")
 

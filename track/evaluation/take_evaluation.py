@@ -5,9 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
@@ -20,10 +22,6 @@ from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import FrameTracker, TrackedFrame
 from train.labelers.protocol import Labeler
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 OCCLUSIONS: Final = ((0, 0), (1, 2), (3, 5), (6, 99))
 """Classes of a hand's number of missing markers, from and to, for pose errors."""

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.takes.tracked_take import LOST, STATUSES, TrackedTake
 from handsim.hand.topology import Side
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
 _MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.evaluation.take_evaluation import is_right, is_valid, seen_frame
 from track.tracked_frame import FrameTracker
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _FRAMES_BEFORE: Final = 60  # frames that a tracker sees before all points are hidden
 _FRAMES_HIDDEN: Final = 120  # a second

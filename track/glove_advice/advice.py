@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.hand.topology import BONES, DIGITS, JOINTS
 from track.glove_advice.joint_spread import untold_spreads
 from track.glove_advice.layout_score import LayoutScore
 from train.reports.hand_plot import mistakes
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 UNTOLD: Final = 0.6
 """Share of a joint's usual spread from which on the markers are said to tell nothing of it."""

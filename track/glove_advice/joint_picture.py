@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.hand.topology import JOINTS
 from train.reports.flat_hand import FlatHand
 from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
     from matplotlib.figure import Figure
 
 SIZE: Final = (8.4, 6.4)

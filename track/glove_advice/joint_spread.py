@@ -7,9 +7,10 @@ anything may be anywhere in its range. What hands usually do narrows that furthe
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import DIGITS, JOINTS, NUM_JOINTS
@@ -17,9 +18,6 @@ from track.glove_advice.observed_hands import ObservedHand
 from track.kinematics.joint_prior import JointPrior, resting_angles
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.marker_prediction import empty_prediction, predict_markers
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 NOISE: Final = 0.0015
 """Standard deviation of a marker around a calibrated hand's [m]: optics, and the skin that moves."""

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
 from handsim.space.transforms import MIRROR
@@ -17,9 +18,6 @@ from train.data.batches import paper_corruption
 from train.evaluation.labeler_evaluation import Report, evaluate_clouds, evaluate_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _NEAR: Final = 0.003  # between two markers' surfaces [m], where gloves and blobs touch
 _SIDE_FRAMES: Final = 500

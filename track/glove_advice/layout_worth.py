@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from track.glove_advice.worn_places import Columns, WornPlaces
 from train.any_layout.layout_labeler import mean_features, shipped_network
@@ -13,9 +14,6 @@ from train.data.augmentation import Corruption, corrupt
 from train.evaluation.metrics import LabelCounts
 from train.matching.assignment import match_probabilities, pair_probabilities
 from train.threads import labeling_threads
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _TESTED: Final = 240  # frames whose labels are counted
 _GHOSTS: Final = 2  # at most

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
@@ -18,9 +19,6 @@ from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import FrameScene, sample_frame_scene
 from train.simulation.people import sample_hands, wear_gloves
 from train.simulation.training_frames import HandFrames, observe_scene
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _POSES_EACH: Final = 60  # of a person
 

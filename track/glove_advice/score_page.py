@@ -5,9 +5,10 @@ from __future__ import annotations
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.app.page import Section, write_page
 from handsim.hand.topology import DIGITS
@@ -19,9 +20,6 @@ from train.evaluation.metrics import percent
 from train.reports import hand_plot
 from train.reports.flat_hand import flat_hand
 from train.reports.plot_style import picture
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _NOTHING: Final = "-"
 

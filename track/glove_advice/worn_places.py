@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from gloves.attachment import Attachment, wear
 from gloves.fit import GloveFit
@@ -19,10 +21,6 @@ from track.glove_advice.joint_spread import pose_spreads
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import sample_single_hand
 from train.simulation.people import sample_hands
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 _TABLES: Final = ("points", "normals", "bone_indices", "bone_weights")
 _JOINT_POSES: Final = 6  # of a person, from which the joints' spread is taken

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
+from handsim.kernels.kernel import kernel
 from track.kinematics.levenberg_marquardt import MARKER_NOISE, levenberg_marquardt, marker_residuals
 from track.kinematics.marker_kinematics import NUM_UNKNOWNS, HandArrays, Workspace, workspace
 from track.kinematics.starting_poses import RESTING, StartingShapes, initial_poses
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 FEWEST_MARKERS: Final = 4
 """Least number of markers of a frame for a pose to be solved."""
@@ -35,7 +33,7 @@ class SolverWeights(NamedTuple):
     """See `SolverConfig`."""
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def fit_frames(
     hand: HandArrays,
     shapes: StartingShapes,
@@ -128,7 +126,7 @@ def fit_frames(
     return -1, qpos, rms, residuals, steps
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _read_markers(
     digits: Int[np.ndarray, "M"],
     given: Float[np.ndarray, "M 3"],
@@ -151,7 +149,7 @@ def _read_markers(
     return present
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _set_prior(
     seen: Int[np.ndarray, "6"],
     on_part: Int[np.ndarray, "6"],
@@ -184,7 +182,7 @@ def _set_prior(
         prior_mean[7 + hinge], precision[hinge] = rest, weight
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _write_residuals(
     hand: HandArrays,
     target: Float[np.ndarray, "M 3"],

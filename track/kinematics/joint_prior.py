@@ -8,19 +8,17 @@ Neighboring fingers bend together, so the covariance carries information from vi
 from __future__ import annotations
 
 from functools import cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.topology import NUM_JOINTS
+from handsim.kernels.kernel import kernel
 from poses.shapes.library import LIBRARIES, gestures_of
 from track.config import MotionConfig
 from track.kinematics.small_systems import eliminate, invert_positive, solve_positive
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 
 class JointPrior(NamedTuple):
@@ -82,7 +80,7 @@ def predict_joints(
     return prior
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _predict_covariance(
     known: Float[np.ndarray, "20 20"],
     resting: Float[np.ndarray, "20 20"],
@@ -107,7 +105,7 @@ def _predict_covariance(
     invert_positive(prior.precision)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def digit_prior(
     prior: JointPrior,
     information_matrix: Float[np.ndarray, "20 20"],

@@ -6,12 +6,13 @@ they are not part of `track.config.TrackerConfig`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.hand.topology import NUM_JOINTS
+from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import rotate_quaternion
 from track.kinematics.marker_kinematics import (
     NUM_UNKNOWNS,
@@ -20,9 +21,6 @@ from track.kinematics.marker_kinematics import (
     accumulate_normal_equations,
     compute_markers,
 )
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 MARKER_NOISE: Final = 0.001
 """Standard deviation of a marker [m]: the scale of all costs; optical systems and gloves reach about this."""
@@ -33,7 +31,7 @@ _LEAST_DAMPING: Final = 1e-10  # share of the diagonal; keeps the factor positiv
 _MOST_DAMPING: Final = 1e8  # share of the diagonal; steps are nothing from there on
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def levenberg_marquardt(
     hand: HandArrays,
     target: Float[np.ndarray, "M 3"],
@@ -90,7 +88,7 @@ def levenberg_marquardt(
     return cost, steps
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def marker_residuals(
     hand: HandArrays, target: Float[np.ndarray, "M 3"], qpos: Float[np.ndarray, "27"], work: Workspace
 ) -> None:
@@ -118,7 +116,7 @@ def marker_residuals(
         residual[2] = position[2] - c - 2.0 * (w * k + i * y - j * x)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _cost(
     hand: HandArrays,
     target: Float[np.ndarray, "M 3"],
@@ -148,7 +146,7 @@ def _cost(
     return cost
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _linearize(
     hand: HandArrays,
     qpos: Float[np.ndarray, "27"],
@@ -182,7 +180,7 @@ def _linearize(
             work.normal[unknown, unknown] += precision[unknown]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> float:
     """Solve the damped normal equations by a skyline Cholesky factor; `factor` and `step` are filled.
 
@@ -220,7 +218,7 @@ def _solve(skyline: Int[np.ndarray, "26"], damping: float, work: Workspace) -> f
     return gain
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def move_wrist(
     qpos: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"], moved: Float[np.ndarray, "27"]
 ) -> None:
@@ -240,7 +238,7 @@ def move_wrist(
     rotate_quaternion(qpos[3:7], step[NUM_JOINTS + 3 : NUM_JOINTS + 6], moved[3:7])
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def wrist_offsets(
     before: Float[np.ndarray, "27"], now: Float[np.ndarray, "27"], step: Float[np.ndarray, "26"]
 ) -> None:

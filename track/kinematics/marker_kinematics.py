@@ -8,16 +8,14 @@ factor of the normal matrix then keeps its zeros between digits.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.topology import BONES, NUM_BONES, NUM_JOINTS
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+from handsim.kernels.kernel import kernel
 
 NUM_UNKNOWNS: Final = NUM_JOINTS + 6
 """Unknowns of a step: 20 hinges, 3 translations and 3 rotations of the wrist."""
@@ -114,7 +112,7 @@ def hand_arrays(fit: GloveFit) -> HandArrays:
     )
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def workspace(num_markers: int) -> Workspace:
     """A `Workspace` for a hand with some number of markers; what never changes in it is filled in."""
     rotations, jacobian = np.zeros((NUM_BONES, 3, 3)), np.zeros((num_markers, 3, NUM_UNKNOWNS))
@@ -136,7 +134,7 @@ def workspace(num_markers: int) -> Workspace:
     )
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Workspace) -> None:
     """Forward kinematics of all bones, hinge axes and markers, in the wrist's frame.
 
@@ -151,7 +149,7 @@ def compute_markers(hand: HandArrays, angles: Float[np.ndarray, "20"], work: Wor
         compute_marker(hand, marker, work)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], work: Workspace) -> None:
     """Forward kinematics of the bones and hinge axes of one digit, in the wrist's frame.
 
@@ -177,7 +175,7 @@ def compute_digit(hand: HandArrays, digit: int, angles: Float[np.ndarray, "4"], 
             _rotate_bone(own, hand.axes[hinge], angles[number], work.axes[hinge])
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
     """Position of one marker in the wrist's frame [m].
 
@@ -199,7 +197,7 @@ def compute_marker(hand: HandArrays, marker: int, work: Workspace) -> None:
             work.markers[marker, i] += term
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _rotate_bone(
     own: Float[np.ndarray, "3 3"], axis: Float[np.ndarray, "3"], angle: float, outside: Float[np.ndarray, "3"]
 ) -> None:
@@ -223,7 +221,7 @@ def _rotate_bone(
         own[i, 2] = c * cosine + along * z + (a * y - b * x) * sine
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
     """Derivatives of one marker by all unknowns, in the wrist's frame.
 
@@ -257,7 +255,7 @@ def marker_jacobian(hand: HandArrays, marker: int, work: Workspace) -> None:
     jacobian[0, _ROTATION + 2], jacobian[1, _ROTATION + 2] = -y, x
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def accumulate_normal_equations(hand: HandArrays, weights: Float[np.ndarray, "M"], work: Workspace) -> None:
     """Normal matrix and half gradient of the sum of the markers' weighted squared residuals.
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.hand.topology import NUM_JOINTS
+from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
 from track.kinematics.levenberg_marquardt import marker_residuals
 from track.kinematics.marker_kinematics import (
@@ -25,9 +26,8 @@ from track.kinematics.marker_kinematics import (
 from track.kinematics.small_systems import invert_positive, solve_positive
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-
     from track.kinematics.joint_prior import JointPrior
+
 
 _FEWEST_ON_DIGIT: Final = 3  # markers that determine the four hinges of a digit, also when it is straight
 _ARC: Final = 0.04  # [m] usual radius of the arcs that markers move on: the length of a finger's bones
@@ -66,7 +66,7 @@ def empty_prediction(num_markers: int) -> MarkerPrediction:
     )
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def predict_markers(
     hand: HandArrays,
     on_part: Int[np.ndarray, "6"],
@@ -132,7 +132,7 @@ def predict_markers(
                     out.rotations[marker, i, j] += wrist[i, k] * bone[k, j]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _marker_covariance(
     hand: HandArrays,
     marker: int,
@@ -177,7 +177,7 @@ def _marker_covariance(
         covariance[i, i] += variance + bend**2
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _settle(
     hand: HandArrays,
     seen: Int[np.ndarray, "6"],
@@ -229,7 +229,7 @@ def _settle(
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def world_markers(
     hand: HandArrays, pose: Float[np.ndarray, "27"], positions: Float[np.ndarray, "M 3"]
 ) -> None:

@@ -8,9 +8,11 @@ than three: weakly towards the resting angles, and towards predicted angles wher
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike, NDArray
 
 from gloves.fit import GloveFit
 from handsim._checks import check_array
@@ -28,10 +30,6 @@ from track.kinematics.marker_prediction import (
     world_markers,
 )
 from track.kinematics.starting_poses import StartingShapes, starting_shapes
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import ArrayLike, NDArray
 
 _CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
 _NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # a pose, with precision zero

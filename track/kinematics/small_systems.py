@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numba
 import numpy as np
+from jaxtyping import Float
 
-if TYPE_CHECKING:
-    from jaxtyping import Float
+from handsim.kernels.kernel import kernel
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
     """Overwrite a symmetric positive-definite matrix by its inverse; only its lower triangle is read."""
     count = len(matrix)
@@ -38,7 +35,7 @@ def invert_positive(matrix: Float[np.ndarray, "N N"]) -> None:
             matrix[column, row] = entry
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def eliminate(
     matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"], first: int, last: int
 ) -> None:
@@ -62,7 +59,7 @@ def eliminate(
                 right_side[row] -= share * right_side[pivot]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def solve_positive(matrix: Float[np.ndarray, "N N"], right_side: Float[np.ndarray, "N"]) -> None:
     """Solve a symmetric positive-definite system; both are overwritten, the right side by the solution."""
     count = len(matrix)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
 from handsim.hand.topology import NUM_QPOS
+from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)
 """Hinge angles of a relaxed hand [rad]."""
@@ -58,7 +56,7 @@ def starting_shapes(fit: GloveFit) -> StartingShapes:
     return StartingShapes(angles, markers, 1.0 / (_STEADY**2 + markers.var(axis=0).sum(axis=1)))
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def initial_poses(
     shapes: StartingShapes, digits: Int[np.ndarray, "M"], target: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "S 27"]:
@@ -92,7 +90,7 @@ def initial_poses(
     return poses
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _choose_digits(
     shapes: StartingShapes,
     digits: Int[np.ndarray, "M"],
@@ -132,7 +130,7 @@ def _choose_digits(
             markers[marker] = shapes.markers[0, marker]
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def align_rigid(
     source: Float[np.ndarray, "N 3"],
     target: Float[np.ndarray, "N 3"],

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim import __version__
 from handsim._extras import import_extra
 from track.sinks.message import SCHEMA, LiveBody, LiveHand, LiveHeader, LiveMessage
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 Encode = Callable[[dict[str, Any]], bytes]
 FORMATS: Final = ("json", "msgpack")

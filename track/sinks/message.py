@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
 from gloves.takes.tracked_take import label_names
@@ -15,9 +16,6 @@ from handsim.hand.topology import JOINT_NAMES, Side
 from track.bodies.rigid_body import RigidTemplate
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 SCHEMA: Final = 1
 """Version of what is sent; a receiver that knows it knows every later message of the same version."""

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
+from jaxtyping import Float, Int
 
 SILENCE: Final = 2.0
 """Time without a frame [s] after which a stream yields a silent frame."""

@@ -10,13 +10,11 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 Version = tuple[int, int]
 COMMAND_PORT: Final = 1510

@@ -7,9 +7,10 @@ import socket
 import threading
 import time
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.optics.identities import number_runs
@@ -17,9 +18,6 @@ from gloves.takes.take import Take
 from handsim.errors import CaptureError, choices
 from track.streams import natnet
 from track.streams.natnet import DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 LOOPBACK: Final = "127.0.0.1"
 VERSIONS: Final[tuple[Version, ...]] = ((3, 0), (3, 1), (4, 0), (4, 1))

@@ -5,16 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim._extras import import_extra
 from handsim.errors import CaptureError
 from track.streams.frame_source import StreamedFrame
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 PORT: Final = 22223
 """QTM's port for little-endian clients."""

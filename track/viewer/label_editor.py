@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -12,9 +13,8 @@ from track.viewer.recordings.corrector import Corrector, label_of
 from track.viewer.recordings.takes import TrackedRecording
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from viser import ViserServer
+
 
 _NOTHING: Final = "choose"
 _HALO: Final = 2.5  # radius around the chosen point, in radii of a marker

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from handsim.space.cameras import CameraRig
 
+
 _MOST_POINTS: Final = 400
 _TEXT_EVERY: Final = 0.2  # [s]
 

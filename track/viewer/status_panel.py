@@ -8,11 +8,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from track.viewer.recordings.recording import Recording, ShownFrame
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
     from viser import GuiButtonHandle, GuiFolderHandle, GuiUplotHandle, ViserServer, uplot
 
 _EVERY: Final = 0.1  # [s] between two texts while frames follow each other quickly

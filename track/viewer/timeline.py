@@ -9,9 +9,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
     from viser import ViserServer
 
 PICTURES: Final = 60.0

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
-from handsim.app.command_table import VIDEO_WRITER, load
 from track.viewer.recordings.recording import Recording
 from track.viewer.scene.point_balls import GHOST_COLOR, label_colors
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _RATE: Final = 30.0  # [Hz] at most
 
@@ -24,6 +21,7 @@ def write_video(
     recording: Recording,
     shown: Float[np.ndarray, "N 3"],
     *,
+    write_clip: Callable[..., None],
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Write what a recording shows, at its own pace, with points in the colors of the viewer.
@@ -32,6 +30,7 @@ def write_video(
         path: The file, .mp4.
         recording: What is shown.
         shown: Points [m] that the view holds.
+        write_clip: What draws and encodes the pictures, `render.illustrations.clip.write_clip`.
         progress: Called after each picture with the number of pictures and of all.
 
     Returns:
@@ -53,9 +52,8 @@ def write_video(
             if progress is not None:
                 progress(number, len(frames))
 
-    # The drawing is above this package: named in the command table, as the steps of `handsim demo` are.
     there = shown[np.isfinite(shown).all(axis=1)]
-    load(VIDEO_WRITER)(path, pictures(), rate=rate, shown=there, radius=recording.radius)
+    write_clip(path, pictures(), rate=rate, shown=there, radius=recording.radius)
     return len(frames)
 
 

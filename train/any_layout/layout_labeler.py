@@ -10,10 +10,12 @@ import dataclasses
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gloves.layout import MarkerLayout
@@ -27,10 +29,6 @@ from train.labelers.protocol import Labeling, label_by_scores, label_in_batches,
 from train.matching.pose_prior import PosePrior
 from train.matching.prior_learning import learn_pose_prior
 from train.threads import labeling_threads
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 NUM_POSES: Final = 40_000
 """Poses from which a layout is known; fewer make a coarser pose prior."""

@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from train.labelers.set_network import LabelScores, MessageRound, labeling_loss
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 _USUAL: Final = 20.0  # points of a cloud
 _RAREST: Final = 1e-3  # share of poses that a distance counts as having at least

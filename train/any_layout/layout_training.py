@@ -12,10 +12,11 @@ import argparse
 import io
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import torch
+from jaxtyping import Float, Int
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.topology import PALM
@@ -25,9 +26,6 @@ from train.any_layout.skin_bank import SkinBank, sample_skin_bank
 from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.batches import stretched
 from train.threads import torch_threads
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 PLACES, PEOPLE = 480, 1600
 _LAYOUTS, _CLOUDS = 8, 24  # of a batch; clouds of each layout

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Float16, Int
 
 from gloves.attachment import attach_markers, wear
 from gloves.layout import MOST_MARKERS, MarkerLayout, MarkerPlace
@@ -17,9 +18,6 @@ from handsim.space.transforms import MIRROR
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import sample_frame_scene
 from train.simulation.people import sample_hands
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float16, Int
 
 _MOST_MISSED: Final = 500  # draws in a row without a free place
 _APART: Final = 0.0025  # [m] between two places of a bank, at least

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.layout import MarkerLayout
 from handsim.hand.topology import SIDES
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import sample_single_hand
 from train.simulation.people import sample_hands, wear_gloves
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _POSES_EACH: Final = 100  # of a person
 

@@ -7,13 +7,11 @@ Some batches keep what the simulated rig sees of them; the others get the corrup
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)

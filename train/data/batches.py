@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.topology import SIDES
 from train.config import TrainConfig
 from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import own_cloud
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 
 class Weights(NamedTuple):

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jaxtyping import Int, Shaped
-    from numpy.typing import NDArray
+from jaxtyping import Int, Shaped
+from numpy.typing import NDArray
 
 
 class MappedRows:

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from handsim._plugins import call_plugin, load_plugin
 from handsim.errors import ArgumentError
 from train.data.augmentation import Cloud, shuffled
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 CORRUPTIONS: Final = "handsim.corruptions"
 """Group of entry points of corruptions."""

@@ -12,9 +12,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Shaped
+from numpy.typing import NDArray
 
 from gloves.optics.ghosts import MAX_GHOSTS
 from handsim.errors import DatasetError, choices
@@ -26,10 +28,6 @@ from handsim.hand.records import HAND_DTYPE, unpack_hand
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_QPOS
 from train.data.mapped_rows import MappedRows
-
-if TYPE_CHECKING:
-    from jaxtyping import Shaped
-    from numpy.typing import NDArray
 
 SCHEMA: Final = 2
 MANIFEST: Final = "manifest.json"

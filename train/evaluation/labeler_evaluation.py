@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gloves.optics.ghosts import GHOST_REACH
@@ -17,10 +19,6 @@ from train.data.batches import paper_corruption
 from train.evaluation.metrics import LabelCounts
 from train.evaluation.reliability import error_without, expected_calibration_error
 from train.labelers.protocol import Labeler
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 _CHUNK: Final = 4096
 

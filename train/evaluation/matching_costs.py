@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from train.config import CNNConfig
 from train.evaluation.labeler_evaluation import Report, paper_report
@@ -12,10 +15,6 @@ from train.labelers.cnn_labeler import label_by_distance
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import cnn_labeler
 from train.labelers.protocol import Labeling
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 _REJECTS: Final = (0.015, 0.02, 0.03, 0.04, 0.06, 0.08)  # [m]
 _SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # [m]

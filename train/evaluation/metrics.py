@@ -10,12 +10,9 @@ counts it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int
 
 
 @dataclass(slots=True)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
 from rich.table import Table
 
 from train.data.augmentation import Corruption
@@ -17,9 +18,8 @@ from train.simulation.room_settings import KINDS
 from train.simulation.takes import TakeConfig, simulate_take
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-
     from gloves.takes.take import Take
+
 
 FIGURES: Final = {
     "slot_accuracy": "Accuracy (slots)",

@@ -12,15 +12,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from train.hands.frame_hands import Criteria, FoundHand, HandFinder
 from train.hands.links import following_points
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 SIDES: Final = (1, -1)
 """Right, left."""

@@ -10,9 +10,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
 from handsim.hand.topology import Side
@@ -22,11 +24,7 @@ from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
 from train.matching.pose_prior import PosePrior
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
-
-    Group = NDArray[np.int64]
+Group = NDArray[np.int64]
 
 _LEAST_SHARE: Final = 0.4  # of a hand's markers that must be labeled
 _FEWEST: Final = 5

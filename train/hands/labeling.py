@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from train.hands.following import Follower
 from train.hands.frame_hands import FoundHand, HandFinder
@@ -21,11 +23,7 @@ from train.hands.sides import sides_of
 from train.hands.voting import vote
 from train.labelers.protocol import check_clouds
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
-
-    Frames = Sequence[NDArray[np.float64]]
+Frames = Sequence[NDArray[np.float64]]
 
 _CHUNK: Final = 512
 _SPEED, _ACCELERATION = 2.0, 80.0  # of a marker [m/s], [m/s^2]
@@ -102,9 +100,7 @@ def _linked(
 ) -> NDArray[np.int64]:
     """Which point of the frame before each point was, see `previous_points`."""
     first, next_one = _SPEED / rate + _NOISE, 0.5 * _ACCELERATION / rate**2 + _NOISE
-    return previous_points(  # type: ignore[no-any-return]
-        points, starts, labels, min(_FARTHEST, first), min(_FARTHEST, next_one)
-    )
+    return previous_points(points, starts, labels, min(_FARTHEST, first), min(_FARTHEST, next_one))
 
 
 def _two_best(hands: list[FoundHand]) -> list[FoundHand]:

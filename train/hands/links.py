@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
-
+from handsim.kernels.kernel import kernel
 
 AMBIGUOUS: Final = 0.4
 """Share of the second distance above which the nearest point may be another one, so that labels decide."""
@@ -28,7 +26,7 @@ def clusters(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDArray[
     return sorted(groups, key=len, reverse=True)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _single_linkage(points: NDArray[np.float64], distance: float) -> NDArray[np.int64]:
     """Number of the group of each point."""
     number = np.full(len(points), -1)
@@ -50,7 +48,7 @@ def _single_linkage(points: NDArray[np.float64], distance: float) -> NDArray[np.
     return number
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _next_point(
     expected: NDArray[np.float64],
     reach: float,
@@ -84,7 +82,7 @@ def _next_point(
     return (best, least) if least < reach**2 else (-1, np.inf)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _usual_miss(
     expected: NDArray[np.float64],
     before: NDArray[np.int64],
@@ -110,7 +108,7 @@ def _usual_miss(
     return float(np.median(squares[:count])) if count else 0.0
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def previous_points(
     points: Float[np.ndarray, "P 3"],
     starts: Int[np.ndarray, "T+1"],
@@ -163,7 +161,7 @@ def following_points(previous: Int[np.ndarray, "P"]) -> Int[np.ndarray, "P"]:
     return following
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")  # type: ignore[untyped-decorator]
+@kernel(inline=True)
 def _squared(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     squared: float = (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
     return squared

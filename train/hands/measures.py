@@ -7,22 +7,20 @@ many of these.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import pdist, squareform
 
 from gloves.layout import MarkerLayout
 from handsim.hand.model import join_qpos
 from handsim.hand.shape import Population
+from handsim.kernels.kernel import kernel
 from poses.shapes.validity import sample_valid_angles
 from train.simulation.people import sample_hands, wear_gloves
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
 
 _PEOPLE, _POSES = 60, 30
 _EXAMPLES: Final = 180  # hands that are kept
@@ -116,7 +114,7 @@ def longest_link(points: Float[np.ndarray, "N 3"]) -> float:
     return float(minimum_spanning_tree(squareform(pdist(points))).max())
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _fitting(
     points: NDArray[np.float64],
     labels: NDArray[np.int64],

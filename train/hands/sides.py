@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Int
+from numpy.typing import NDArray
 
 from train.hands.frame_hands import FoundHand
-
-if TYPE_CHECKING:
-    from jaxtyping import Int
-    from numpy.typing import NDArray
 
 _FOLLOWED: Final = 0.5  # share of a hand's points that were another's in the frames before, if it is the same
 

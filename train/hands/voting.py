@@ -7,15 +7,14 @@ follow each other in time, no vote is passed on.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 _FADING: Final = 0.1  # time in which a vote fades [s]
 _MARGIN: Final = 5  # of these times, beyond which no vote counts
@@ -95,7 +94,7 @@ def _agreeing(
     return np.where((agreeing < _AGREEING * expected)[frame], -1, previous)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _votes(
     labels: NDArray[np.int64],
     confidence: NDArray[np.float64],

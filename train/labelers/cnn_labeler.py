@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from train.config import CNNConfig
 from train.labelers.depth_image import depth_images
 from train.labelers.protocol import Labeling, check_output, label_in_batches, pad_clouds
 from train.labelers.views import MIRROR_IMAGE, MeanHand, spread_views
 from train.matching.assignment import match_distances
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 _SEARCH_REJECT: Final = 0.04  # cost of a point without a label while views are compared [m]
 _REJECT: Final = _SEARCH_REJECT  # in the labels, before one is chosen [m]

@@ -7,10 +7,11 @@ layout's marker order; labels come from matching them with the points (equation 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -19,9 +20,6 @@ from train.data.batches import Batch, Part
 from train.labelers.depth_image import depth_images
 from train.labelers.sparse_convolution import filter_sparse
 from train.labelers.views import NUM_MOMENTS, MeanHand, random_views
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _SPARSE: Final = 10  # layers up to the third filter, which leave a large part of an image uniform
 

@@ -9,15 +9,12 @@ The images stretch depth to a fixed range; network outputs do not, so that dista
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy.typing import NDArray
 
 from train.labelers.views import centered
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Float32
-    from numpy.typing import NDArray
 
 IMAGE_SIZE = 52
 """Width and height of a depth image [pixel]."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from train.config import CNNConfig, NetworkConfig, TrainConfig
@@ -18,9 +19,6 @@ from train.labelers.protocol import Labeler
 from train.labelers.set_labeler import TrainedSetLabeler, set_loss
 from train.labelers.set_network import SetLabeler
 from train.labelers.views import MeanHand
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _PREPARED: Final = 20_000  # frames
 

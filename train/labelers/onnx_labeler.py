@@ -6,11 +6,14 @@ import base64
 import hashlib
 import json
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
 from handsim._version import __version__
@@ -23,12 +26,9 @@ from train.labelers.views import MeanHand
 from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     import onnx
-    from jaxtyping import Float
-    from numpy.typing import NDArray
     from torch import nn
+
 
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
 _DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32, Int
+from numpy.typing import NDArray
 
 from gloves.captures.plausibility import check_unit
 from handsim._plugins import call_plugin, load_plugin
 from handsim.errors import ArgumentError, WeightsError
 from train.matching.pose_prior import PosePrior
 from train.matching.verification import match_scores
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Float32, Int
-    from numpy.typing import NDArray
 
 LABELERS: Final = "handsim.labelers"
 """Group of entry points of labelers."""

@@ -5,15 +5,11 @@ Names of weights, and the operations in their order, are those of `train.labeler
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from jaxtyping import Float, Float32
+from numpy.typing import NDArray
 
 from train.labelers.set_network import SetLabeler
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32
-    from numpy.typing import NDArray
 
 _EPSILON = np.float32(1e-5)  # of torch's LayerNorm
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from train.data.batches import Batch
 from train.labelers.batch_network import BatchNetwork
@@ -13,12 +15,6 @@ from train.labelers.protocol import Labeling, label_by_scores, label_in_batches,
 from train.labelers.set_inference import CloudScorer
 from train.labelers.set_network import SetLabeler, labeling_loss
 from train.matching.pose_prior import PosePrior
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 
 class TrainedSetLabeler:

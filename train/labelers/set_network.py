@@ -8,17 +8,15 @@ together: the label, or ghost, of each point; and the point, or none, of each la
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from train.config import SetLabelerConfig
 from train.data.batches import WHOLE, Weights
 from train.matching.pose_prior import PosePrior
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 
 class LabelScores(NamedTuple):

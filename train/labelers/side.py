@@ -8,20 +8,18 @@ hands measure this; each group votes with the log-odds of its orientation.
 from __future__ import annotations
 
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
+from handsim.kernels.kernel import kernel
 from poses.shapes.validity import sample_valid_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 _MAX_FOURS: Final = 3000
 _POSES: Final = 100  # of each size
@@ -76,7 +74,7 @@ def _volumes(fours: Float[np.ndarray, "*B 4 3"]) -> NDArray[np.float64]:
     return volumes
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _vote(
     markers: NDArray[np.float64], fours: NDArray[np.int64], votes: NDArray[np.float64]
 ) -> tuple[float, float]:

@@ -9,17 +9,16 @@ every three multiplications of these layers are left out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
+from jaxtyping import Float, Int, Int32
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int, Int32
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 _TAPS = 9  # of a 3x3 filter
 
@@ -139,7 +138,7 @@ def _pool(features: SparseFeatures) -> SparseFeatures:
     return SparseFeatures(pixels, fours.amax(1), features.background)
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _connect(
     pixels: NDArray[np.int32], count: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
@@ -177,7 +176,7 @@ def _connect(
     return reached, sources[:outputs], targets
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _pair(pixels: NDArray[np.int32], count: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Which inputs a 2x2 pooling joins.
 

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import combinations_with_replacement, product
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from handsim.space.transforms import quaternion_matrix, random_quaternions, rigid_fit
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 SIGNS: Final = np.array(list(product((1.0, -1.0), repeat=3)))
 """Signs (8, 3) of the principal axes, four for each side of the body."""

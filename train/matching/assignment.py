@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 GHOST = -1
 """Label of a point that is not a marker."""
@@ -88,7 +87,7 @@ def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[n
     return labels
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _balance(
     point_scores: NDArray[np.float64], label_scores: NDArray[np.float64], weight: float, rounds: int
 ) -> NDArray[np.float64]:

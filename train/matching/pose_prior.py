@@ -9,16 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-import numba
 import numpy as np
+from jaxtyping import Float, Float32, Int
+from numpy.typing import NDArray
 
 from handsim.errors import WeightsError
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Float32, Int
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 _NEAREST: Final = 4  # components that count, of all those whose mean hand is compared with the points
 _LEAST_POINTS: Final = 4  # fewer fit any hand
@@ -130,7 +128,7 @@ def _seen(points: NDArray[np.float64], mirrored: bool) -> NDArray[np.float64]:
     return centered * _MIRROR if mirrored else centered
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _misses(
     cloud: NDArray[np.float64],
     labels: NDArray[np.int64],
@@ -145,7 +143,7 @@ def _misses(
     return errors
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _log_density(
     cloud: NDArray[np.float64],
     labels: NDArray[np.int64],
@@ -167,7 +165,7 @@ def _log_density(
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _center(labels: NDArray[np.int64], mean: NDArray[np.float32]) -> NDArray[np.float64]:
     """Center (3,) of some markers of a mean hand (M, 3)."""
     center = np.zeros(3)
@@ -177,7 +175,7 @@ def _center(labels: NDArray[np.int64], mean: NDArray[np.float32]) -> NDArray[np.
     return center / len(labels)
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _product(
     cloud: NDArray[np.float64], labels: NDArray[np.int64], mean: NDArray[np.float32]
 ) -> tuple[NDArray[np.float64], float]:
@@ -192,7 +190,7 @@ def _product(
     return product, size
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _quaternion_matrix(p: NDArray[np.float64]) -> NDArray[np.float64]:
     """Horn's matrix (4, 4) of a sum of outer products (3, 3): its first eigenvector is the best rotation."""
     k = np.empty((4, 4))
@@ -209,7 +207,7 @@ def _quaternion_matrix(p: NDArray[np.float64]) -> NDArray[np.float64]:
     return k
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _largest_root(k: NDArray[np.float64], above: float) -> float:
     """Largest eigenvalue of Horn's matrix, from a bound above it (Theobald 2005).
 
@@ -232,7 +230,7 @@ def _largest_root(k: NDArray[np.float64], above: float) -> float:
     return root
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _residual(
     cloud: NDArray[np.float64], labels: NDArray[np.int64], mean: NDArray[np.float32]
 ) -> NDArray[np.float64]:
@@ -253,7 +251,7 @@ def _residual(
     return residual
 
 
-@numba.njit(cache=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@kernel
 def _log_normal(
     residual: NDArray[np.float64], labels: NDArray[np.int64], directions: NDArray[np.float32], spread: float
 ) -> float:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from train.matching.pose_prior import PosePrior
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 MOST_COMPONENTS: Final = 400
 _FRAMES_EACH: Final = 400  # of a component; fewer frames give fewer components

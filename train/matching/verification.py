@@ -7,9 +7,11 @@ label's place or a chain of labels shifted by one can be the likeliest labeling 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from train.matching.assignment import (
     IMPOSSIBLE,
@@ -19,10 +21,6 @@ from train.matching.assignment import (
     solve_assignment,
 )
 from train.matching.pose_prior import PosePrior
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 _SURE: Final = 0.95  # a pair of this probability is not taken back
 _MOST_UNSURE: Final = 8  # pairs that are taken back, one at a time; the least sure

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float, Int, Shaped
+from numpy.typing import NDArray
 
 from gloves.captures.gaps import run_lengths
 from handsim.app.page import Section, write_page
@@ -16,10 +18,6 @@ from handsim.space.cameras import load_rig
 from train.data.shards import Dataset, hands_name
 from train.reports import dataset_plots as _plots
 from train.reports.plot_style import picture
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int, Shaped
-    from numpy.typing import NDArray
 
 REPORT: Final = "report.html"
 MOST_ROWS: Final = 50_000

@@ -6,12 +6,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.hand.topology import DIGITS, JOINTS
 from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 

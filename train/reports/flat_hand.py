@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONES, PALM
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 
 class FlatHand(NamedTuple):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from train.reports.flat_hand import FlatHand
 from train.reports.name_placement import DISTANCES, DOT_RADIUS, FONT_SIZE, name_extent, place_names
@@ -12,10 +14,8 @@ from train.reports.plot_style import BAND, BLUE, CARD, INK, LINE, PALE, SOFT, WA
 from train.reports.run_plots import short
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
 HAND_SIZE: Final = (10.8, 9.6)
 """Of the picture [inch]."""

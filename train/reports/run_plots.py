@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Int
 
 from train.evaluation.reliability import BINS, Reliability
 from train.history import History
 from train.reports.plot_style import BAND, BLUE, INK, LINE, PALE, SOFT, WARM
 
 if TYPE_CHECKING:
-    from jaxtyping import Int
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 

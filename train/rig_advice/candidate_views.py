@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, UInt64
+from numpy.typing import NDArray
 
 from gloves.optics.blobs import MARKER_RADIUS
 from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, CameraRig, look_at
@@ -13,10 +15,6 @@ from train.rig_advice.forecast import ROOM
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
 from train.simulation.sight import SceneSight
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, UInt64
-    from numpy.typing import NDArray
 
 _WIDE: Final = float(np.deg2rad(170.0))  # a view in which hands are wherever the camera is aimed
 _SAMPLED: Final = 1200  # marker-frames whose error is looked at

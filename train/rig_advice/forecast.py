@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from gloves.captures.gaps import run_lengths
 from gloves.optics.blobs import MARKER_RADIUS
@@ -20,9 +21,6 @@ from train.simulation.motion import SceneMotion
 from train.simulation.room import label_false_points
 from train.simulation.room_settings import RoomConfig
 from train.simulation.sight import SceneSight
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool
 
 _ERRORS: Final = 4000  # marker-frames of a scene from which the error is taken
 ROOM: Final = RoomConfig(strays=StrayConfig(number=0.0))

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from handsim.space.cameras import HAND_REACH, look_at
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 Mount = Literal["walls", "truss", "tripods"]
 MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)

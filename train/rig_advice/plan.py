@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
 from handsim.space.cameras import CameraRig
@@ -15,10 +17,6 @@ from train.rig_advice.mounts import Mount, places
 from train.rig_advice.planning import Planning
 from train.rig_advice.work import sample_work
 from train.simulation.motion import SceneMotion
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _PEOPLE: Final = 3  # of each kind of work
 _FRAMES: Final = 900  # of each

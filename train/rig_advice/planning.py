@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
 from train.rig_advice.candidate_views import CandidateViews
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 WEIGHTS: Final = (0.02, 0.4, 0.6, 0.05)
 """What the shares of marker-frames that one, two, three and four cameras see are worth. A point begins with

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.optics.blobs import MARKER_RADIUS
 from handsim.space.cameras import HAND_REACH, ROOM_CENTER, CameraRig
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 HALF_SIDE: Final = 0.3
 """Half side of the cube around the rig's middle that hands work in [m]."""

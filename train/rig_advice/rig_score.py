@@ -5,18 +5,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.space.cameras import CameraRig
 from train.rig_advice.forecast import CameraLoss, Forecast, camera_losses, forecast, light
 from train.rig_advice.rig_faults import faults
 from train.rig_advice.volume_map import VolumeMap, map_volume
 from train.simulation.motion import SceneMotion
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)

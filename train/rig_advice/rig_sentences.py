@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.space.cameras import FEWEST_CAMERAS
 from train.rig_advice.rig_score import RigScore
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _MISSING: Final = 0.05  # share of marker-frames without a point, from which on cameras lack
 _CORNER: Final = (

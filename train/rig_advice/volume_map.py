@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand
 from gloves.optics.blobs import MARKER_RADIUS
@@ -16,10 +18,6 @@ from train.rig_advice.rig_faults import cube_points
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
 from train.simulation.sight import SceneSight
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 GRID: Final = 5
 """Points of the map along each side of the volume."""

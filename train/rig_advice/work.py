@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, GloveFit, attach
 from gloves.layout import MarkerLayout
@@ -22,10 +24,6 @@ from train.simulation.motion import MovingObject, SceneMotion
 from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room_settings import KINDS
 from train.simulation.takes import sample_scene
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 _REAL_LIKE: Final = "real-like"
 _MAX_PEOPLE: Final = 10

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, GloveFit
 from gloves.takes.take import Take
@@ -24,9 +25,6 @@ from poses.shapes.validity import make_valid
 from train.simulation.motion import SceneMotion
 from train.simulation.room import record_take
 from train.simulation.room_settings import RoomConfig
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _OFFSETS: Final = (0.22, -0.22)  # of the hands from the room's middle [m], so that they do not meet
 _VOLUME: Final = 0.1  # half side of the cube that a wrist stays in [m]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
@@ -20,9 +21,6 @@ from poses.grasps.object_motion import sample_held_poses, settle_hold
 from poses.shapes.samplers import PoseMix
 from poses.shapes.sampling import PoseSampler
 from poses.shapes.validity import make_valid, sample_valid_angles
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 NO_TOUCH: Final = "two hands: no valid pose, one hand instead"
 """Reason for which a scene of two hands becomes one of a single hand."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.layout import load_layout
 from handsim.space.cameras import load_rig
@@ -12,9 +13,6 @@ from train.data.shards import row_dtype
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.people import sample_hands
 from train.simulation.training_frames import simulate_frames
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 _SPAWN_KEY: Final = 2**32 - 1  # a shard number that no training set reaches
 

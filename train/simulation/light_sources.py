@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float, Int
 
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.mirrors import cameras_by_mirror, reflect
@@ -16,9 +17,6 @@ from handsim.space.cameras import check_outside
 from train.simulation.motion import SceneMotion
 from train.simulation.room_settings import RoomConfig
 from train.simulation.sight import SceneSight
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float, Int
 
 _MIN_BODY_MARKERS: Final = 3  # markers without which an object cannot be tracked as a rigid body
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GlovedHand, GloveFit
 from handsim.hand.model import HandModel
@@ -20,9 +21,6 @@ from poses.grasps.object_motion import sample_object_motion
 from poses.motion.scripts import scripted_motion
 from poses.motion.wrist_paths import WristConfig, wrist_path
 from train.simulation.room_settings import Kind
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 RATE: Final = 120.0
 """Frames per second of simulated takes [Hz]."""

@@ -8,9 +8,10 @@ captures move about twice as far from frame to frame as simulated hands do.
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from gloves.fit import GlovedHand
 from gloves.layout import MarkerLayout
@@ -19,9 +20,6 @@ from handsim.hand.topology import BONES
 from handsim.space.transforms import quaternion_matrix
 from train.simulation.motion import SceneMotion, sample_scene_motion
 from train.simulation.people import sample_hands, wear_gloves
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 NUM_FRAMES: Final = 3000
 """Frames of such a take when no number is given."""

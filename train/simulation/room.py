@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from gloves.optics.identities import number_runs, pack_columns
 from gloves.optics.reconstruction import Reconstruction, reconstruct
@@ -14,9 +15,6 @@ from train.simulation.light_sources import LightSources, sample_light_sources
 from train.simulation.motion import SceneMotion
 from train.simulation.room_settings import RoomConfig
 from train.simulation.sight import SceneSight
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 
 def record_take(

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
 from gloves.optics.mesh_tree import MeshTree, hand_tree
 from gloves.optics.visibility import facing_cameras
 from handsim.space.cameras import CameraRig
 from train.simulation.motion import SceneMotion
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
 
 _CHUNK: Final = 256  # frames whose lines of sight are in memory at once
 SKIN_CHUNK: Final = 16

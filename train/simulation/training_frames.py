@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from functools import cache
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.layout import MarkerLayout
@@ -24,10 +26,6 @@ from poses.shapes.sampling import load_sampler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import FrameScene, sample_frame_scene
 from train.simulation.people import wear_gloves
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
 
 _MAX_LOST_CAMERAS: Final = 6  # that lose their pictures together
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from handsim.hand.skeleton import build_skeleton
 from handsim.hand.skin.cage_topology import (
@@ -26,10 +28,8 @@ from handsim.hand.skin.cage_topology import (
 from handsim.hand.topology import DIGITS
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import ArrayLike
-
     from handsim.hand.shape import HandShape
+
 
 # Height of the back above, and depth of the palm under, the metacarpals, in palm thicknesses, by column.
 _HEIGHTS: Final = np.array(

@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Int
 
 from handsim.hand.topology import DIGITS
-
-if TYPE_CHECKING:
-    from jaxtyping import Int
 
 WRIST_END, WRIST, CARPUS, THENAR, METACARPUS, KNUCKLES, PAST_KNUCKLES, WEB = range(8)
 NUM_ROWS: Final = 8

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from numpy.typing import NDArray
+from handsim.kernels.kernel import kernel
 
 
 def skin_frames(
@@ -36,7 +35,7 @@ def skin_frames(
     return skinned
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _skin(
     points: Float[np.ndarray, "V 3"],
     bones: Int[np.ndarray, "V 4"],

@@ -6,8 +6,8 @@ import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import numba
 import numpy as np
+from jaxtyping import Float, Int
 from scipy import sparse
 
 from handsim.hand.skin.cage import CageScales, cage_vertices, digit_frames, first_scales, ring_girths
@@ -22,12 +22,12 @@ from handsim.hand.skin.cage_topology import (
 from handsim.hand.skin.subdivision import catmull_clark, subdivided_loop
 from handsim.hand.skin.weights import cage_weights, strongest_weights
 from handsim.hand.topology import DIGITS
+from handsim.kernels.kernel import kernel
 from handsim.space.transforms import MIRROR
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-
     from handsim.hand.shape import HandShape
+
 
 _LEVELS: Final = 2
 _FIT_STEPS: Final = 4
@@ -151,7 +151,7 @@ def vertex_normals(
     return normals
 
 
-@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+@kernel
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """See `vertex_normals`; zero for a vertex without faces.
 

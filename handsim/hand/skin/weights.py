@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from handsim.hand.skin.cage_topology import (
     CARPUS,
@@ -18,9 +19,6 @@ from handsim.hand.skin.cage_topology import (
     palmar,
 )
 from handsim.hand.topology import NUM_BONES, PALM
-
-if TYPE_CHECKING:
-    from jaxtyping import Float, Int
 
 # Bone of the digit and its share on each ring past the web; the rest goes to the bone before it.
 _FINGER_RINGS: Final = ((1, 0.0), (1, 0.5), (1, 1.0), (2, 0.0), (2, 1.0), (2, 1.0), (2, 1.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -17,9 +18,8 @@ from handsim.space.rig_formats.opencv_file import read_opencv_cameras
 from handsim.space.rig_formats.xml_tree import read_xml
 
 if TYPE_CHECKING:
-    import xml.etree.ElementTree as ET
-
     from handsim.space.camera import Camera
+
 
 _OPENCV: Final = (".yml", ".yaml", ".json")
 _XML: Final = (".xcp", ".xml", ".txt", ".mcal")

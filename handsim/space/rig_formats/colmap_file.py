@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, RigError, choices
 from handsim.files.inputs import read_bytes
@@ -15,9 +16,6 @@ from handsim.space.camera import Camera
 from handsim.space.camera_file import checked_cameras
 from handsim.space.lens import Lens
 from handsim.space.transforms import quaternion_matrix
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 CAMERAS: Final = "cameras.txt"
 IMAGES: Final = "images.txt"

@@ -5,17 +5,15 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import RigError
 from handsim.files.toml_values import shown
 from handsim.space.camera import Camera
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _LARGEST: Final = 1e9  # in any unit
 _SKEWED: Final = 1e-3  # of a rotation in a file of few digits

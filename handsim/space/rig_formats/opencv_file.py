@@ -12,9 +12,10 @@ import re
 import textwrap
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, RigError
 from handsim.files.inputs import read_bytes
@@ -23,9 +24,6 @@ from handsim.space.camera_file import checked_cameras
 from handsim.space.lens import Lens
 from handsim.space.rig_formats.lab_camera import camera_names, nearest_rotation, rigid
 from handsim.space.transforms import quaternion_matrix, vector_quaternions
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _MOST_BYTES: Final = 1 << 24
 _MOST_NUMBERS: Final = 16

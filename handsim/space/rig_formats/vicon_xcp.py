@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import warnings
 import xml.etree.ElementTree as ET
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimWarning, RigError
 from handsim.files.toml_values import shown
@@ -27,9 +28,6 @@ from handsim.space.rig_formats.lab_camera import (
     rigid,
 )
 from handsim.space.transforms import quaternion_matrix
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 ROOT: Final = "Cameras"
 _MILLIMETER: Final = 1e-3

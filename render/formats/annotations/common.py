@@ -9,9 +9,11 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
 from handsim.hand.shape import HandShape
@@ -20,10 +22,6 @@ from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
 from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
 from render.skin.forearm import FOREARM
-
-if TYPE_CHECKING:
-    from jaxtyping import Bool, Float
-    from numpy.typing import NDArray
 
 CENTER: Final = 0.5
 """Where our count of pixels has the first one's center [px]."""

@@ -8,17 +8,15 @@ it, which takes the lens out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.space.camera import Camera
 from render.formats.annotations.common import by_side, is_seen, rigid_record
 from render.frames.frame import RenderedFrame
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _FILLED: Final = 0.8  # of the crop's half width, by the keypoint that is farthest from its middle
 _WIDEST: Final = np.deg2rad(120.0)  # a flat picture of more is mostly stretching

@@ -8,9 +8,10 @@ from the corner.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
 
 from handsim.hand.shape import HandShape
 from handsim.space.camera import Camera
@@ -26,9 +27,6 @@ from render.formats.annotations.joint_orders import to_order
 from render.formats.annotations.umetrack_hand import umetrack_hand, umetrack_wrist
 from render.formats.png_depth import METERS_PER_UNIT
 from render.frames.frame import HandTruth, RenderedFrame
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
 
 HAND_SHAPES: Final = "__hand_shapes.json__"
 """File of a clip with the hand model; webdataset passes over such names."""

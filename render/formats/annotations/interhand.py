@@ -9,9 +9,10 @@ so a camera that moves becomes many. Each picture has our name of its camera bes
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from handsim.errors import DatasetError
 from handsim.hand.keypoints import NUM_KEYPOINTS
@@ -20,9 +21,6 @@ from handsim.space.camera import Camera
 from render.formats.annotations.common import by_side, centered_K, is_seen, rounded, to_json
 from render.formats.annotations.joint_orders import to_order
 from render.frames.frame import HandTruth, RenderedFrame
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 SPLIT: Final = "train"
 CAPTURE: Final = 0

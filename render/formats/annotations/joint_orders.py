@@ -15,16 +15,14 @@ One table, because a wrong permutation looks almost right. The index `ABSENT` ma
 from __future__ import annotations
 
 from itertools import chain
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, choices
 from handsim.hand.keypoints import NUM_KEYPOINTS
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 ABSENT: Final = -1
 _WRIST: Final = 0

@@ -7,9 +7,11 @@ digit and equal angles for mirrored poses, so that our angles are its angles.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.keypoints import KEYPOINT_DIGITS, hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
@@ -17,10 +19,6 @@ from handsim.hand.shape import HandShape
 from handsim.hand.topology import JOINTS, NUM_BONES, NUM_JOINTS
 from render.formats.annotations.common import rounded
 from render.formats.annotations.joint_orders import joint_order, to_order
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 # Our wrist frame seen from UmeTrack's.
 _UMETRACK_FROM_OURS: Final = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -115,7 +115,7 @@ def test_points_far_away_are_counted(hand):
 
 
 def test_a_path_with_brackets_is_told_as_it_is(hand, tmp_path, capsys):
-    from handsim.app.cli import main
+    from handsim.cli.main import main
 
     folder = tmp_path / "[bold]take[red]"
     folder.mkdir()

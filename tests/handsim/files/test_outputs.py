@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 

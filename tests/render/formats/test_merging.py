@@ -8,7 +8,7 @@ import tarfile
 import pytest
 from pycocotools.coco import COCO
 
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.json_files import save_json
 from render.formats.merging import CONFIG, merge_renderings

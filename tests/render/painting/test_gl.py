@@ -45,7 +45,7 @@ def test_one_renderer_a_process() -> None:
 
 def test_glove_commands_that_draw_nothing_load_no_gl() -> None:
     code = (
-        "import sys\nfrom handsim.app.cli import main\n"
+        "import sys\nfrom handsim.cli.main import main\n"
         "main(['glove', 'list']); main(['glove', 'show', 'dense19'])\n"
         "print(sorted({'pyrender', 'OpenGL', 'torch', 'cv2'} & set(sys.modules)), file=sys.stderr)"
     )

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import FileError
 from track.benchmark.baselines import ABOUT, TRACKERS, run_baseline
 from track.benchmark.scoring import score_results

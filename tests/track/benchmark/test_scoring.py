@@ -10,7 +10,7 @@ import warnings
 import numpy as np
 import pytest
 
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import HandSimWarning
 from handsim.hand.keypoints import KEYPOINT_NAMES
 from track.benchmark.answers import Answers, BenchmarkError, save_answers

@@ -11,7 +11,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import LOST, TrackedTake
-from handsim.app.cli import main
+from handsim.cli.main import main
 from track.capture_tracking import track_capture
 from track.evaluation.take_summary import suspicions
 from track.tracker import Tracker

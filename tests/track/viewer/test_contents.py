@@ -12,7 +12,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.layout import starter_layout
 from gloves.takes.tracked_take import COASTING, LOST
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import named_rig

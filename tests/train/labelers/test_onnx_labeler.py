@@ -12,7 +12,7 @@ import torch
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.layout import load_layout
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import HandSimError, WeightsError
 from train.config import CNNConfig, SetLabelerConfig
 from train.labelers.kinds import labeler_of, new_network
@@ -56,7 +56,7 @@ def test_a_capture_is_labeled_without_torch(exported, tmp_path, rng):
     write_capture(tmp_path / "take.trc", capture)
     arguments = ["label", str(tmp_path / "take.trc"), "--labeler", str(exported)]
     arguments += ["--out", str(tmp_path / "out.trc")]
-    program = NO_TORCH + f"from handsim.app.cli import main\nraise SystemExit(main({arguments!r}))"
+    program = NO_TORCH + f"from handsim.cli.main import main\nraise SystemExit(main({arguments!r}))"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
     assert read_capture(tmp_path / "out.trc").names[:19] == names
 

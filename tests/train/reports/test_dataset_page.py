@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from handsim.app.cli import main
+from handsim.cli.main import main
 from handsim.errors import DatasetError
 from handsim.hand.topology import JOINT_NAMES, JOINTS
 from train.data.shards import Dataset, row_dtype
@@ -162,7 +162,7 @@ def test_generate_leaves_a_report_that_is_no_part_of_the_set(tmp_path, capsys):
 def test_only_drawing_loads_matplotlib_and_nothing_loads_pyplot():
     code = """
 import sys
-import train.commands.generate, train.commands.train, train.simulation.generation
+import handsim.cli.generate, handsim.cli.train, train.simulation.generation
 import train.reports.dataset_page, train.reports.run_page, train.reports.plot_style
 assert not [name for name in sys.modules if name.startswith("matplotlib")]
 train.reports.plot_style.picture((1, 1), lambda figure: figure.subplots())

@@ -240,7 +240,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
 
 
 def test_a_full_disk_is_told_and_leaves_nothing_half_written(tmp_path, monkeypatch, capsys):
-    from handsim.app.cli import main
+    from handsim.cli.main import main
 
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device", str(tmp_path / "set" / rows_name(0)))
@@ -345,7 +345,7 @@ OPTION_ERRORS = {
 
 @pytest.mark.parametrize("options", OPTION_ERRORS)
 def test_options_without_sense_are_told(tmp_path, capsys, options):
-    from handsim.app.cli import main
+    from handsim.cli.main import main
 
     assert main(["generate", "--out", str(tmp_path / "set"), *options.split()]) == 1
     assert capsys.readouterr().err == f"handsim generate: {OPTION_ERRORS[options]}\n"

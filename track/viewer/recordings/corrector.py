@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gloves.takes.corrections import (
     NO_MARKER,
@@ -21,9 +21,6 @@ from gloves.takes.corrections import (
 from gloves.takes.tracked_take import TrackedTake
 from handsim.errors import CaptureError
 from track.corrected_take import correct_take
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 
 class Corrector:

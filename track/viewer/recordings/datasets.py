@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import UInt32
 
 from handsim.hand.model import HandModel
 from handsim.space.cameras import CameraRig
 from track.viewer.recordings.recording import Recording, ShownFrame
 from track.viewer.recordings.takes import shipped_rig
 from train.data.shards import Dataset
-
-if TYPE_CHECKING:
-    from jaxtyping import UInt32
 
 _ROWS_PER_SECOND: Final = 4.0
 """Rows of a training set do not follow each other in time; they are shown at this pace."""

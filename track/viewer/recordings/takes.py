@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import COASTING, LOST, STATUSES, TrackedTake
@@ -12,10 +14,6 @@ from handsim.space.cameras import CameraRig, list_rigs, named_rig
 from handsim.space.objects import named_object, object_names
 from handsim.space.transforms import rotation_quaternions
 from track.viewer.recordings.recording import Curve, Doubt, Recording, ShownBody, ShownFrame, runs_of
-
-if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
 
 _CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
 _MOST_DOUBTS: Final = 12  # rows

@@ -5,17 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.hand.model import HandModel
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
     from viser import MeshSkinnedHandle, ViserServer
 
     from handsim.hand.topology import Side
+
 
 SKIN_COLORS: Final[dict[Side, tuple[int, int, int]]] = {"right": (214, 170, 140), "left": (150, 172, 200)}
 """A right and a left hand look different."""

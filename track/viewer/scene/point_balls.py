@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import trimesh
+from jaxtyping import Bool, Float, Int, UInt8
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jaxtyping import Bool, Float, Int, UInt8
     from viser import LabelHandle, ViserServer
+
 
 GHOST_COLOR: Final = (128, 128, 128)
 """Of points without a label."""

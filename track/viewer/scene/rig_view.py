@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
 
 from handsim.space.cameras import ROOM_CENTER, CameraRig
 from handsim.space.transforms import rotation_quaternions
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
-    from numpy.typing import NDArray
     from viser import ViserServer
 
 _HALF_SIDE: Final = 0.3  # [m] of the cube that wrists move in, as in training sets

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from jaxtyping import Float
 
 if TYPE_CHECKING:
-    from jaxtyping import Float
     from viser import ViserServer
 
 _FROM: Final = np.array([0.62, -0.62, 0.48])  # direction of the first look, from its target

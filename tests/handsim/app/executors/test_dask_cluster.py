@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from handsim.app.cli import main
 from handsim.app.executors.dask_cluster import DaskCluster, _folder_trouble, _Task
 from handsim.app.executors.executor import Processes, choose_executor
 from handsim.app.executors.worker_check import WorkerCheck, check_threads, versions_here
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError, LayoutError
 from handsim.files.inputs import checksum
 from render.config import RenderConfig

@@ -22,7 +22,7 @@ from track.evaluation.sweep.steps import LABELERS, MEASURED, SETS
 from track.evaluation.sweep.sweep_file import Sweep, SweepError, load_sweep
 
 pytestmark = pytest.mark.xdist_group("sweep")  # what they share is made once
-COMMAND = (sys.executable, "-c", "from handsim.app.cli import main; raise SystemExit(main())", "sweep")
+COMMAND = (sys.executable, "-c", "from handsim.cli.main import main; raise SystemExit(main())", "sweep")
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

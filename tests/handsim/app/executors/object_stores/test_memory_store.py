@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from handsim.app.cli import main
 from handsim.app.executors.dask_cluster import DaskCluster, _Task
 from handsim.app.executors.executor import Processes, choose_executor
 from handsim.app.executors.output import StoredOutput, open_output
 from handsim.app.executors.worker_check import WorkerCheck
 from handsim.app.interrupts import Stopped
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError, HandSimError
 from handsim.files.object_folder import ObjectFolder, folder_or_objects
 from render.config import RenderConfig

@@ -21,10 +21,10 @@ from pathlib import Path
 
 import pytest
 
-from handsim.app.cli import main
 from handsim.app.executors.dask_cluster import DaskCluster
 from handsim.app.executors.executor import Processes
 from handsim.app.executors.output import open_output
+from handsim.cli.main import main
 from handsim.errors import HandSimError
 from handsim.files.object_folder import ObjectFolder
 from tests.handsim.app.executors.object_stores.stored_set import (

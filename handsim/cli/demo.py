@@ -1,0 +1,61 @@
+"""The command `handsim demo`: the whole chain on a built-in example, and a page that shows it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from handsim.app.messages import print_line
+from handsim.app.page import Section, write_page
+from handsim.cli.command_table import DEMO_STEPS, load
+from handsim.cli.demo_run import GLOVE, DemoRun
+from handsim.errors import ArgumentError
+
+
+def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> None:
+    """Run the whole chain on a built-in example: generate, label, track, draw; ends with a page of pictures.
+
+    Args:
+        out: Folder for index.html and its pictures.
+        seed: Of the generated frames and of everything drawn at random.
+        num_frames: Frames to generate and label.
+    """
+    if num_frames < 1:
+        raise ArgumentError(f"num_frames is {num_frames}, expected at least 1")
+    if seed < 0:
+        raise ArgumentError(f"seed is {seed}, expected 0 or more")
+    out.mkdir(parents=True, exist_ok=True)
+    console, progress = Console(), Console(stderr=True)
+    sections: list[Section] = []
+    with tempfile.TemporaryDirectory(prefix=".work-", dir=out) as work, progress.status("starting") as status:
+        run = DemoRun(out, Path(work), seed, num_frames, status.update)
+        for step in DEMO_STEPS:
+            section: Section | None = load(step)(run)
+            if section is not None:
+                sections.append(section)
+    figures = sections[-1]
+    _print_table(console, figures.table, title=f"{num_frames} generated frames, glove {GLOVE}")
+    page = out / "index.html"
+    write_page(
+        page,
+        sections,
+        title="handsim demo",
+        lead="A hand in a marker glove takes poses in front of simulated cameras. A labeler that was trained "
+        "on simulation alone labels the points that the cameras see.",
+    )
+    console.print(figures.notes[0])
+    print_line(f"page: {page.resolve()}")
+
+
+def _print_table(console: Console, table: Sequence[Sequence[str]], *, title: str) -> None:
+    printed = Table(title=title)
+    for number, column in enumerate(table[0]):
+        printed.add_column(Text(column), justify="right" if number else "left")
+    for row in table[1:]:
+        printed.add_row(*row)
+    console.print(printed)

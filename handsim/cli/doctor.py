@@ -1,0 +1,227 @@
+"""`handsim doctor`: what is missing on this machine, and how to get it."""
+
+from __future__ import annotations
+
+import ctypes.util
+import operator
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import metadata, util
+from pathlib import Path
+from typing import Final
+
+from handsim._kernel_cache import VARIABLE, kernel_cache
+from handsim._siblings import SIBLINGS, shadowed_siblings
+from handsim.app.system_packages import EGL_PACKAGES
+
+_PROBE_SECONDS: Final = 120.0
+# These run in processes of their own: a broken driver ends its process, and torch and GL stay out of ours.
+_DRAW: Final = """
+import os
+os.environ["PYOPENGL_PLATFORM"] = "egl"
+import numpy, pyrender
+from OpenGL.GL import GL_RENDERER, glGetString
+scene = pyrender.Scene()
+scene.add(pyrender.PerspectiveCamera(yfov=1.0), pose=numpy.eye(4))
+renderer = pyrender.OffscreenRenderer(16, 16)
+renderer.render(scene, flags=pyrender.RenderFlags.DEPTH_ONLY)
+print(glGetString(GL_RENDERER).decode())
+"""
+_FIND_GPU: Final = """
+import torch
+print(torch.cuda.get_device_name(0) if torch.cuda.is_available() else "none; the CPU does it, slower")
+"""
+_COMPARE: Final = {
+    ">=": operator.ge,
+    "<=": operator.le,
+    "==": operator.eq,
+    "!=": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report."""
+
+    what: str
+    found: str
+    expected: str = ""
+    """What is needed, in words or as limits of a version; empty when anything will do."""
+    remedy: str = ""
+    """What to do about it; empty when all is well."""
+    needed: bool = True
+    """Whether commands fail until the remedy is followed."""
+
+
+def doctor() -> int:
+    """Say what is missing on this machine, and how to get it.
+
+    Returns:
+        0 when everything that the commands need is there, else 1.
+    """
+    from rich.console import Console
+
+    with Console(stderr=True).status("drawing a picture and looking for a GPU"):
+        findings = examine()
+    _print_report(findings)
+    return int(any(finding.needed and finding.remedy for finding in findings))
+
+
+def examine() -> list[Finding]:
+    """Every finding about this machine, in the order of the report; takes a few seconds."""
+    drawing, gpu = _start(_DRAW), _start(_FIND_GPU)
+    return [
+        *check_requirements(),
+        *check_names(metadata.packages_distributions(), shadowed_siblings()),
+        check_drawing(*_finish(drawing)),
+        check_gpu(*_finish(gpu)),
+        check_kernel_cache(),
+        *check_room(),
+    ]
+
+
+def check_requirements() -> Iterator[Finding]:
+    """Python itself and each dependency, as the installed handsim asks for them."""
+    try:
+        limits = metadata.metadata("handsim")["Requires-Python"]
+    except metadata.PackageNotFoundError:
+        yield Finding("handsim", "not installed", remedy="run `pip install -e .` in handsim's folder")
+        return
+    python = ".".join(map(str, sys.version_info[:3]))
+    remedy = "" if satisfies(python, limits) else "make a virtual environment with one of these versions"
+    yield Finding("Python", python, limits, remedy)
+    for requirement in metadata.requires("handsim") or ():
+        if ";" not in requirement:  # what has a marker belongs to an extra
+            yield check_requirement(requirement)
+
+
+def check_requirement(requirement: str) -> Finding:
+    """One dependency, written as in pyproject.toml: a name, then limits joined by commas."""
+    name, limits = re.fullmatch(r"([\w.-]+)\s*(.*)", requirement).groups()  # type: ignore[union-attr]
+    remedy = f"run `pip install '{name}{limits}'`"
+    try:
+        found = metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return Finding(name, "missing", limits, remedy)
+    return Finding(name, found, limits, "" if satisfies(found, limits) else remedy)
+
+
+def satisfies(version: str, limits: str) -> bool:
+    """Whether a version keeps limits such as '>=13,<15'; only the release numbers are compared."""
+    signs_and_bounds = re.findall(r"([<>=!]+)\s*([\d.]+)", limits)
+    return all(_COMPARE[sign](_release(version), _release(bound)) for sign, bound in signs_and_bounds)
+
+
+def _release(version: str) -> tuple[int, ...]:
+    numbers = [int(part) for part in re.findall(r"\d+", re.split(r"[^\d.]", version)[0])]
+    return tuple(numbers + [0] * (4 - len(numbers)))  # 2.8 and 2.8.0 are equal
+
+
+def check_names(owners: Mapping[str, Sequence[str]], shadowed: Mapping[str, str]) -> Iterator[Finding]:
+    """Whether the generic import names, and pyrender's, belong to the right distributions.
+
+    Args:
+        owners: The distributions that install each import name.
+        shadowed: Where each sibling leads that does not lie beside handsim.
+    """
+    for name in ("handsim", *SIBLINGS):
+        strangers = sorted(set(owners.get(name, ())) - {"handsim"})
+        if strangers:
+            remedy = f"run `pip uninstall {' '.join(strangers)}`, then install handsim anew"
+            yield Finding(f"import {name}", f"also owned by {', '.join(strangers)}", "handsim alone", remedy)
+        elif name in shadowed:
+            yield Finding(f"import {name}", shadowed[name], "beside handsim", "rename that, or go elsewhere")
+    remedy = "run `pip uninstall pyrender pyrender-maintained`, then `pip install pyrender-maintained`"
+    flavors = sorted(set(owners.get("pyrender", ())))
+    broken = _pyrender_version() == "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later
+    if broken or len(flavors) > 1:
+        found = "0.1.45" if broken else " and ".join(flavors)
+        yield Finding("import pyrender", found, "pyrender-maintained alone", remedy)
+
+
+def _pyrender_version() -> str:
+    """The version that pyrender's files state, which is not always the one its distribution claims."""
+    spec = util.find_spec("pyrender")
+    if spec is None or spec.origin is None:
+        return ""
+    file = Path(spec.origin).with_name("version.py")
+    stated = re.search(r"__version__ = ['\"](.+)['\"]", file.read_text()) if file.exists() else None
+    return stated.group(1) if stated else ""
+
+
+def check_drawing(code: int, output: str) -> Finding:
+    """Whether pictures can be drawn without a screen, judged by an attempt."""
+    what, expected = "drawing (EGL)", "an OpenGL driver"
+    if code == 0:
+        return Finding(what, output, expected)
+    if sys.platform != "linux":
+        return Finding(what, output, expected, "drawing without a screen needs Linux; all else works here")
+    found = "libEGL is missing" if ctypes.util.find_library("EGL") is None else output
+    return Finding(what, found, expected, f"run `apt-get install {EGL_PACKAGES}` as root")
+
+
+def check_gpu(code: int, output: str) -> Finding:
+    """What torch can compute on; only a torch that cannot be imported is a fault."""
+    remedy = "" if code == 0 else "install torch anew; CONTRIBUTING.md says how to get its CPU build"
+    return Finding("GPU for training", output, remedy=remedy)
+
+
+def check_kernel_cache() -> Finding:
+    """Where numba keeps compiled kernels; without a lasting place each machine start compiles them anew."""
+    folder, lasts = kernel_cache()
+    writable = os.access(folder if folder.exists() else folder.parent, os.W_OK)
+    remedy = "" if lasts and writable else f"set {VARIABLE} to a folder of yours that lasts"
+    found = str(folder) if writable else f"{folder}, which cannot be written"
+    return Finding("compiled kernels", found, "a folder that lasts", remedy, needed=False)
+
+
+def check_room() -> Iterator[Finding]:
+    """Cores for the workers and space on the disk of the current folder."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    yield Finding("CPU cores", str(cores))
+    free = shutil.disk_usage(Path.cwd()).free / 1e9
+    remedy = "" if free >= 1.0 else "free some space, or give --out on another disk"
+    yield Finding("free disk here", f"{free:.1f} GB", "1 GB", remedy, needed=False)
+
+
+def _start(code: str) -> subprocess.Popen[str]:
+    # -P: a file in the current folder must not be imported as numpy or torch
+    command = [sys.executable, "-P", "-c", code]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _finish(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit code and last line of output, or of the errors when it failed."""
+    try:
+        output, errors = process.communicate(timeout=_PROBE_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        return 1, f"no answer in {_PROBE_SECONDS:g} s"
+    lines = (output if process.returncode == 0 else errors).strip().splitlines()
+    return process.returncode, lines[-1] if lines else f"died with code {process.returncode}"
+
+
+def _print_report(findings: Sequence[Finding]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("", "what", "found", "expected", box=None, pad_edge=False)
+    for finding in findings:
+        mark = "[green]ok" if not finding.remedy else "[red]missing" if finding.needed else "[yellow]low"
+        table.add_row(mark, Text(finding.what), Text(finding.found), Text(finding.expected))
+    console = Console()
+    console.print(table)
+    troubles = [finding for finding in findings if finding.remedy]
+    for finding in troubles:
+        console.print(Text(f"{finding.what}: {finding.remedy}."), soft_wrap=True)
+    if not troubles:
+        console.print("Nothing is missing.")

@@ -1,0 +1,135 @@
+"""The command `handsim view`."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from handsim.app.interrupts import interrupt_flag
+from handsim.app.live_status import LiveStatus
+from handsim.app.messages import print_line
+from handsim.app.progress import progress_bar
+from handsim.cli.live import first_frames
+from handsim.cli.track import SHOWN, TrackerStart
+from handsim.cli.user_options import USUAL_SIZE, Size, users_of
+from handsim.errors import ArgumentError
+from handsim.files.outputs import check_outputs
+from handsim.hand.topology import Side
+from handsim.space.cameras import load_rig
+from track.bodies.body_file import load_bodies
+from track.capture_tracking import track_stream, warm_up
+from track.streams.addresses import open_source
+from track.viewer.contents import Content, first_look, open_content
+from track.viewer.live_view import LiveView
+from track.viewer.server import LOOPBACK, address_of, opened_server
+from track.viewer.video import write_video
+from train.glove_labeler import labeler_for_glove
+
+
+def view(
+    file: Annotated[str | None, tyro.conf.Positional] = None,
+    *,
+    host: str = LOOPBACK,
+    port: int | None = None,
+    out: Path | None = None,
+    rig: str | None = None,
+    live: str | None = None,
+    glove: str = "dense19",
+    size: Size | None = None,
+    shape: Path | None = None,
+    hands: tuple[Side, ...] | None = None,
+    body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    labeler: str | None = None,
+    video: Path | None = None,
+) -> None:
+    """Show a file or a live tracker in the browser; Ctrl-C ends it.
+
+    In a tracked take labels can be corrected, and are saved.
+
+    Args:
+        file: A marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture
+            (.trc, .c3d or .csv), a tracked take or a simulated take's truth (.npz), or a user's file (.json).
+        host: Address to serve the page at; only this machine reaches the default. There is no password.
+        port: Port to serve the page at; the first free one from 8080 on when not given.
+        out: File for a layout that was changed; a new name beside the layout when not given.
+        rig: Cameras to show with a capture, a take or a stream: a shipped name or the path of a .toml file.
+        live: Stream to track instead of a file: natnet://host, qtm://host or module:name.
+        glove: Marker layout of a live tracker.
+        size: Size of a live tracker's hands, measured in the first second when not given; or of the hand that
+            wears a layout, M when not given.
+        shape: The user's file from handsim calibrate, for a live tracker.
+        hands: Which hands a live tracker follows; both, or those of --shape, when not given.
+        body: A rigid body for a live tracker, once per body.
+        labeler: Folder of a trained labeler for a live tracker, or an exported .onnx file.
+        video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
+    """
+    if (file is None) == (live is None):
+        given = "neither a file nor --live" if file is None else f"a file, {file}, and --live {live}"
+        raise ArgumentError(f"given {given}, expected a file or --live natnet://host")
+    if live is not None:
+        if video is not None:
+            raise ArgumentError(f"--video is {video}, but a live view is not drawn; see handsim track")
+        if out is not None:
+            raise ArgumentError(f"--out is {out}, but nothing of a live view is saved; see handsim track")
+        start = TrackerStart(
+            users_of(glove, size, shape, hands), labeler_for_glove(glove, labeler), load_bodies(body), glove
+        )
+        _view_live(live, start, host, port, rig, measures=shape is None and size in (None, "auto"))
+        return
+    content = open_content(
+        str(file), out=out, size=USUAL_SIZE if size is None or size == "auto" else size, rig=rig
+    )
+    if video is not None:
+        _draw(str(file), content, video)
+        return
+    with interrupt_flag() as ended, opened_server(host, port, "handsim view") as server:
+        run = content.show(server)
+        print_line(f"{file} ({content.kind}): {address_of(server)} ; Ctrl-C ends it")
+        run(ended)
+
+
+def _draw(name: str, content: Content, video: Path) -> None:
+    """Draw the video of a recording."""
+    check_outputs((name,), (video,))
+    from render.illustrations.clip import write_clip  # OpenCV and the painters
+
+    recording = content.recording
+    if recording is None:
+        raise ArgumentError(f"--video is {video}, but {name} is a {content.kind}: nothing in it moves")
+    with progress_bar("pictures") as (bar, task):
+        count = write_video(
+            video,
+            recording,
+            first_look(recording),
+            write_clip=write_clip,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print_line(f"{video}: {count} pictures of {name} ({content.kind})")
+
+
+def _view_live(
+    url: str, start: TrackerStart, host: str, port: int | None, rig: str | None, *, measures: bool
+) -> None:
+    """Track a stream and show it until a signal or the stream ends it."""
+    cameras = None if rig is None else load_rig(rig)
+    with Console(stderr=True).status("getting ready"):
+        warm_up(start.user, start.labeler)
+    fewest = SHOWN * start.user[0].layout.num_markers if measures else None
+    with (
+        interrupt_flag() as ended,
+        opened_server(host, port, "handsim view") as server,
+        closing(open_source(url, ended=ended)) as stream,
+    ):
+        print_line(f"{url}: {address_of(server)} ; Ctrl-C ends it")
+        with LiveStatus() as status:
+            first = [] if fewest is None else first_frames(stream, fewest, None, status)
+        tracker = start([frame for frame in first if len(frame.points) >= (fewest or 0)])
+        with closing(LiveView(server, tracker, cameras)) as live_view:
+            for frame, tracked in track_stream(stream, tracker):
+                if not frame.silent:
+                    live_view.offer(frame, tracked)
+        print_line(f"{live_view.frames} frames tracked, {live_view.pictures} of them shown")

@@ -1,0 +1,33 @@
+"""The decorator of every compiled function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar, overload
+
+import numba
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+@overload
+def kernel(function: Callable[P, R], /) -> Callable[P, R]: ...
+
+
+@overload
+def kernel(*, inline: bool) -> Callable[[Callable[P, R]], Callable[P, R]]: ...
+
+
+def kernel(function: Callable[P, R] | None = None, /, *, inline: bool = False) -> Any:
+    """Compile a function with numba at its first call, and keep the machine code on disk.
+
+    A division by zero gives infinity or NaN as in numpy. Sums keep their order (no fast-math), so that
+    results are the same on every machine.
+
+    Args:
+        function: The function; its arguments are arrays, numbers and other kernels.
+        inline: Whether its body is copied into each kernel that calls it.
+    """
+    compiled = numba.njit(cache=True, error_model="numpy", inline="always" if inline else "never")
+    return compiled if function is None else compiled(function)

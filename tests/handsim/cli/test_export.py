@@ -1,0 +1,170 @@
+"""`handsim export` from real files of takes: what it writes, what it says, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from gloves.captures.formats import read_capture
+from gloves.fit import GlovedHand, attach
+from gloves.layout import load_layout
+from gloves.takes.motion import load_motion
+from gloves.takes.take import HeldBody, Take
+from gloves.takes.tracked_take import LOST, TRACKED, MarkedBody, TrackedTake
+from handsim.cli.main import main
+from handsim.errors import CaptureError
+from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.model import HandModel, join_qpos
+from handsim.space.transforms import random_quaternions
+
+FRAMES, RATE = 12, 120.0
+ENDINGS = (".glb", ".bvh", ".usda", ".usdc", ".csv", ".parquet", ".trc", ".mot", ".openxr.json")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A tracked take whose left hand is lost in two frames, and the truth of a simulated one with a pen."""
+    rng, folder = np.random.default_rng(3), tmp_path_factory.mktemp("takes")
+    layout = load_layout("dense19")
+    fits = tuple(
+        attach(layout, HandModel.named(size, side=side)) for size, side in (("S", "right"), ("L", "left"))
+    )
+    motions = []
+    for x in (0.0, 0.4):
+        angles = 0.3 + 0.2 * np.sin(np.arange(FRAMES)[:, None] / 8.0 + rng.uniform(0, 6, 20))
+        qpos = join_qpos(angles, position=[x, 0.1, 1.0], quaternion=random_quaternions(1, rng=rng)[0])
+        qpos[:, 0] += 0.002 * np.arange(FRAMES)
+        motions.append(qpos)
+    qpos, status = np.stack(motions, axis=1), np.full((FRAMES, 2), TRACKED, dtype=np.int8)
+    status[3:5, 1] = LOST
+    qpos[3:5, 1] = np.nan
+    poses = np.concatenate(
+        [rng.normal(size=(FRAMES, 1, 3)), random_quaternions(FRAMES, rng=rng)[:, None]], axis=2
+    )
+    TrackedTake(
+        rate=RATE,
+        times=np.arange(FRAMES) / RATE,
+        hands=fits,
+        qpos=qpos,
+        status=status,
+        rms=np.zeros((FRAMES, 2)),
+        markers=np.where((status == LOST)[..., None, None], np.nan, np.zeros((FRAMES, 2, 19, 3))),
+        filled=np.zeros((FRAMES, 2, 19), dtype=bool),
+        points=np.zeros((FRAMES, 0, 3)),
+        ids=np.zeros((FRAMES, 0), dtype=np.int32),
+        labels=np.zeros((FRAMES, 0), dtype=np.int16),
+        confidence=np.zeros((FRAMES, 0)),
+        bodies=(MarkedBody("wand", ("A", "B", "C"), 0.05 * np.eye(3)),),
+        body_poses=poses,
+        body_status=np.full((FRAMES, 1), TRACKED, dtype=np.int8),
+        body_rms=np.zeros((FRAMES, 1)),
+        settings={},
+    ).save(folder / "tracked.npz")
+    nothing = np.zeros((FRAMES, 0), dtype=np.int32)
+    pen = HeldBody("pen", ("Pen1", "Pen2", "Pen3"), np.tile(np.eye(4), (FRAMES, 1, 1)))
+    hands = tuple(GlovedHand(fit, motion) for fit, motion in zip(fits, motions, strict=True))
+    Take(RATE, np.zeros((FRAMES, 0, 3)), nothing, nothing, hands, pen, {}).save(folder / "take.truth.npz")
+    return folder
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_every_ending_is_written_and_tells_what_is_missing(folder, ending, tmp_path, capsys):
+    if ending in (".usda", ".usdc"):
+        pytest.importorskip("pxr", reason="usd-core is not installed")
+    if ending == ".parquet":
+        pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+    out = tmp_path / "new" / f"hands{ending}"
+    assert main(["export", str(folder / "tracked.npz"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert f"{out}: right and left hands, wand; 12 frames at 120 Hz" in said
+    assert "left hand: without a pose in 2 frames, " in said and "right hand: without" not in said
+    assert out.stat().st_size > 1000 and [path.name for path in out.parent.iterdir()] == [out.name]
+
+
+def test_truth_of_a_simulated_take_has_its_pen(folder):
+    motion = load_motion(folder / "take.truth.npz")
+    assert [thing.name for thing in motion.things] == ["pen"] and motion.things[0].shape is not None
+    assert [hand.side for hand in motion.hands] == ["right", "left"]
+    assert all(hand.present.all() for hand in motion.hands)
+    assert load_motion(folder / "tracked.npz", up="y").up == "y"
+
+
+def test_trc_holds_the_keypoints_where_the_take_has_them(folder, tmp_path):
+    out = tmp_path / "joints.trc"
+    assert main(["export", str(folder / "tracked.npz"), "--out", str(out)]) == 0
+    capture, motion = read_capture(out), load_motion(folder / "tracked.npz")
+    assert capture.rate == RATE and capture.names[:2] == ("right_wrist", "right_thumb_CMC")
+    found = capture.positions.reshape(FRAMES, 2, len(KEYPOINT_NAMES), 3)
+    for index, hand in enumerate(motion.hands):
+        expected = hand_keypoints(hand.model, hand.held_qpos)
+        np.testing.assert_allclose(found[hand.present, index], expected[hand.present], atol=1e-8)
+        assert np.isnan(found[~hand.present, index]).all()
+
+
+def test_fps_resamples(folder, tmp_path):
+    out = tmp_path / "hands.csv"
+    assert main(["export", str(folder / "tracked.npz"), "--out", str(out), "--fps", "60"]) == 0
+    with out.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["hand"] == "right"]
+    np.testing.assert_allclose([float(row["time_s"]) for row in rows], np.arange(6) / 60.0, atol=1e-9)
+    qpos = load_motion(folder / "tracked.npz").hands[0].qpos
+    np.testing.assert_allclose([float(row["wrist_x_m"]) for row in rows], qpos[::2, 0], atol=1e-9)
+
+
+def test_up_y_keeps_the_axes(folder, tmp_path):
+    for up in ("y", "z"):
+        arguments = [
+            "export",
+            str(folder / "tracked.npz"),
+            "--out",
+            str(tmp_path / f"{up}.openxr.json"),
+            "--up",
+            up,
+        ]
+        assert main(arguments) == 0
+    wrists = [
+        json.loads((tmp_path / f"{up}.openxr.json").read_text())["frames"][0]["hands"]["right"][1][:3]
+        for up in ("y", "z")
+    ]
+    assert wrists[1] == pytest.approx([wrists[0][0], wrists[0][2], -wrists[0][1]])
+
+
+def test_a_take_without_a_hand_is_refused(folder, tmp_path):
+    from gloves.takes.tracked_take import load_tracked_take
+
+    take = load_tracked_take(folder / "tracked.npz")
+    take.qpos[:], take.status[:], take.markers[:] = np.nan, LOST, np.nan
+    take.save(tmp_path / "none.npz")
+    with pytest.raises(CaptureError, match="there is no hand in any frame, expected one to export"):
+        load_motion(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize(
+    ("source", "out", "words"),
+    [
+        ("tracked.npz", "hands.fbx", ", ".join(ENDINGS)),
+        ("tracked.npz", "hands.onnx", "cannot write the take"),
+        ("dense19", "hands.glb", "expected a name that ends in .onnx; takes, which end in .npz, become .glb"),
+        ("user.json", "hand.xml", "`handsim hand --shape` writes the hand of a user's file"),
+        ("missing.npz", "hands.glb", "cannot be read"),
+        ("tracked.npz", "tracked.npz", "expected a name that ends in"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(folder, source, out, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    given = str(folder / source) if (folder / source).exists() else source
+    assert main(["export", given, "--out", out]) == 1
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+    assert main(["export", str(folder / "tracked.npz"), "--out", "x.glb", "--fps", "0"]) == 1
+
+
+def test_an_output_that_is_the_take_is_refused(folder, tmp_path, capsys):
+    link = tmp_path / "hands.glb"
+    link.symlink_to(folder / "tracked.npz")
+    assert main(["export", str(folder / "tracked.npz"), "--out", str(link)]) == 1
+    assert "is the input" in capsys.readouterr().err

@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gloves.layout import list_layouts, load_layout, starter_layout
+from handsim.cli.glove import LABELED_GLOVES, nearest_pair
+from handsim.cli.main import main
+from train.labelers.storage import shipped_labelers
+
+
+def test_list_names_every_layout(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["glove", "list"]) == 0
+    out = capsys.readouterr().out
+    for name in list_layouts():
+        assert f"{name} " in out
+        assert str(load_layout(name).num_markers) in out
+    assert "doi.org/10.1145/3197517.3201399" in out.replace("\n", "")
+
+
+def test_list_says_which_gloves_have_a_labeler_and_draws_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert LABELED_GLOVES == shipped_labelers()
+    assert main(["glove", "list", "--out", str(tmp_path / "gloves.png")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    having = tuple(line.split()[0] for line in lines if "comes with it" in line)
+    assert having == LABELED_GLOVES
+    picture = cv2.imread(str(tmp_path / "gloves.png"))
+    assert picture.shape[1] == 2000
+    assert (picture.min(axis=(1, 2)) < 120).mean() > 0.6
+
+
+def test_show_and_check_a_left_glove_with_a_stalk(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "left.toml"
+    stalk = starter_layout().replace("radius_mm", 'sides = ["left"]\nradius_mm', 1) + "height_mm = 12.5\n"
+    file.write_text(stalk)
+    assert main(["glove", "show", str(file)]) == 0
+    out = capsys.readouterr().out
+    assert "12.5" in out and "For a left hand only." in out
+    assert main(["glove", "check", str(file)]) == 0
+    assert main(["hand", "--glove", str(file), "--side", "right", "--out", str(tmp_path / "x.xml")]) == 1
+    assert "is for a left hand only" in capsys.readouterr().err
+    assert (
+        main(["simulate", "--glove", str(file), "--num-frames", "3", "--out", str(tmp_path / "x.c3d")]) == 1
+    )
+    assert "is for a left hand only" in capsys.readouterr().err
+
+
+def test_show_lists_every_marker(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["glove", "show", "sparse13"]) == 0
+    out = capsys.readouterr().out
+    assert all(marker.name in out and marker.bone in out for marker in load_layout("sparse13").markers)
+
+
+def test_new_writes_a_file_that_checks_and_keeps_what_is_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.toml"
+    assert main(["glove", "new", str(file)]) == 0
+    before = file.read_bytes()
+    assert main(["glove", "new", str(file)]) == 1
+    assert "exists already" in capsys.readouterr().err
+    assert file.read_bytes() == before
+    assert main(["glove", "check", str(file)]) == 0
+    assert "my_glove: 8 markers" in capsys.readouterr().out
+    picture = cv2.imread(str(tmp_path / "mine.png"))
+    assert picture.shape[1] > picture.shape[0] > 800
+    assert (picture.min(axis=(1, 2)) < 120).mean() > 0.6
+
+
+def test_new_wants_toml(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["glove", "new", str(tmp_path / "mine.txt")]) == 1
+    assert "ends in .toml" in capsys.readouterr().err
+
+
+def test_check_tells_markers_that_overlap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "mine.toml"
+    assert main(["glove", "new", str(file)]) == 0
+    file.write_text(
+        file.read_text()
+        + '\n[[marker]]\nname = "Again"\nbone = "palm"\nalong = 0.56\naround = 0.0\nacross = -0.17\n'
+    )
+    assert main(["glove", "check", str(file), "--out", str(tmp_path / "x.png")]) == 1
+    assert "BackHand1 and Again on size XS" in capsys.readouterr().err
+    assert not (tmp_path / "x.png").exists()
+
+
+def test_check_tells_a_wrong_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["glove", "check", str(tmp_path / "gone.toml")]) == 1
+    assert "gone.toml: cannot be read" in capsys.readouterr().err
+
+
+def test_nearest_pair(rng: np.random.Generator) -> None:
+    points = rng.standard_normal((9, 3))
+    points[7] = points[2] + [0.0, 0.003, 0.004]
+    first, second, distance = nearest_pair(points)
+    assert (first, second) == (2, 7)
+    assert distance == pytest.approx(0.005)

@@ -1,0 +1,69 @@
+"""`handsim label` of captures with two hands, one and none, and `handsim evaluate` of what it writes."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.layout import load_layout
+from handsim.cli.main import main
+from train.simulation.takes import TakeConfig, simulate_take
+
+FRAMES = 40
+NAMES = load_layout("dense19").names
+
+
+@pytest.fixture(scope="module")
+def take():
+    return simulate_take(TakeConfig(num_frames=FRAMES))
+
+
+def label(folder, capture, capsys):
+    """The labeled capture, and what the command said."""
+    write_capture(folder / "in.c3d", capture)
+    assert main(["label", str(folder / "in.c3d"), "--out", str(folder / "out.trc")]) == 0
+    return read_capture(folder / "out.trc"), capsys.readouterr()
+
+
+def test_two_hands_have_columns_of_their_own_and_are_evaluated_each(take, tmp_path, capsys):
+    labeled, said = label(tmp_path, take.capture(), capsys)
+    columns = [f"{side}:{name}" for side in ("right", "left") for name in NAMES]
+    assert list(labeled.names[:38]) == columns
+    assert f"two hands in {FRAMES} frames" in said.out and said.err == ""
+    for first, side in ((0, "right"), (19, "left")):
+        (number,) = (n for n, hand in enumerate(take.hands) if hand.side == side)
+        truth = take.observed(take.hand_labels[number])
+        given = labeled.positions[:, first : first + 19]
+        same = np.isclose(given, truth, atol=1e-5, equal_nan=True).all(axis=-1)
+        assert same.mean() > 0.97
+    figures = tmp_path / "figures.json"
+    assert main(["evaluate", str(tmp_path / "out.trc"), "--json", str(figures)]) == 0
+    found = json.loads(figures.read_text())
+    assert found["frames"] == 2 * FRAMES and found["figures"]["slot_accuracy"] > 0.97
+
+
+def test_one_hand_has_the_names_of_the_markers(take, tmp_path, capsys):
+    (left,) = (n for n, hand in enumerate(take.hands) if hand.side == "left")
+    positions = take.observed(take.hand_labels[left]).copy()
+    positions[30:] = np.nan
+    labeled, said = label(tmp_path, Capture(NAMES[::-1], positions[:, ::-1], take.rate), capsys)
+    assert labeled.names[:19] == NAMES
+    assert "a left hand in 30 frames, no hand in 10 frames" in said.out
+    assert np.isclose(labeled.positions[:30, :19], positions[:30], atol=1e-5, equal_nan=True).mean() > 0.97
+
+
+def test_a_capture_without_a_hand_is_told(take, tmp_path, capsys, rng):
+    body = rng.uniform(-0.9, 0.9, size=(40, 3)) + np.zeros((FRAMES, 1, 1))
+    capture = Capture(tuple(f"*{number}" for number in range(40)), body, take.rate)
+    for given in (capture, dataclasses.replace(capture, positions=np.full_like(body, np.nan))):
+        labeled, said = label(tmp_path, given, capsys)
+        assert not np.isfinite(labeled.positions[:, :19]).any()
+        assert f"0 of {np.isfinite(given.positions[..., 0]).sum()} points labeled; no hand in 40 frames" in (
+            said.out
+        )
+        assert "no hand in " in said.err and "expected hands in glove 'dense19'" in said.err

@@ -1,0 +1,247 @@
+from __future__ import annotations
+
+import io
+import re
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import handsim
+from handsim.app.interrupts import Stopped
+from handsim.cli.main import COMMANDS, main, run
+from handsim.errors import LayoutError
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+@pytest.fixture
+def invoke(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """Runs a function (or dict of functions) as the command `fake` of a table of its own."""
+
+    def invoke(command: Any, *args: str) -> int:
+        module = types.ModuleType("fake_commands")
+        module.command = command  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "fake_commands", module)
+        return run({"fake": ("fake_commands:command", "Do nothing much.")}, ["fake", *args])
+
+    return invoke
+
+
+def raising(error: BaseException) -> Callable[[], None]:
+    def command() -> None:
+        raise error
+
+    return command
+
+
+def greet(name: str, *, times: int = 1) -> None:
+    """Greet somebody.
+
+    Args:
+        name: Who is greeted.
+        times: How often.
+    """
+    print("hello", name * times)
+
+
+@pytest.mark.parametrize("args", [[], ["--help"], ["-h"]])
+def test_overview_lists_every_command(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(args) == 0
+    out = capsys.readouterr().out
+    assert all(f"  {name} " in out for name in COMMANDS)
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"handsim {handsim.__version__}\n"
+
+
+def test_unknown_command_is_usage_and_offers_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["trian"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(
+        "handsim: unknown command 'trian' (did you mean 'train'?); valid names: demo,"
+    )
+
+
+def test_unknown_option_is_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--verison"]) == 2
+    assert "unknown option '--verison' (did you mean '--version'?)" in capsys.readouterr().err
+
+
+def test_arguments_reach_the_function(invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+    assert invoke(greet, "--name", "ab", "--times", "2") == 0
+    assert capsys.readouterr().out == "hello abab\n"
+
+
+def test_help_of_a_command(invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        invoke(greet, "--help")
+    assert stop.value.code in (0, None)
+    out = capsys.readouterr().out
+    assert "usage: handsim fake" in out
+    assert "Greet somebody." in out
+    assert "How often." in out
+
+
+@pytest.mark.parametrize("args", [[], ["--name", "x", "--tims", "3"], ["--name", "x", "--times", "often"]])
+def test_wrong_options_are_usage(
+    args: list[str], invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        invoke(greet, *args)
+    assert stop.value.code == 2
+    assert "handsim fake --help" in capsys.readouterr().err
+
+
+def test_a_table_of_functions_becomes_subcommands(
+    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = {"greet": greet, "fail": raising(LayoutError("no"))}
+    assert invoke(table, "greet", "--name", "x") == 0
+    assert capsys.readouterr().out == "hello x\n"
+    assert invoke(table, "fail") == 1
+    with pytest.raises(SystemExit) as stop:
+        invoke(table, "gret")
+    assert stop.value.code == 2
+
+
+def test_a_returned_number_is_the_exit_code(invoke: Callable[..., int]) -> None:
+    assert invoke(lambda: 1) == 1
+    assert invoke(lambda: None) == 0
+    assert invoke(lambda: Path("out")) == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (LayoutError("marker 'X'\nis not on the hand"), 1, "marker 'X' is not on the hand"),
+        (OSError(28, "No space left on device"), 1, "the disk is full"),
+        (FileNotFoundError(2, "No such file", "a/b.trc"), 1, "a/b.trc: no such file or folder"),
+        (PermissionError(13, "Permission denied", b"out"), 1, "out: permission denied"),
+        (OSError(5, "Input/output error", "x"), 1, "x: input/output error"),
+        (OSError("the server does not answer"), 1, "the server does not answer"),
+        (MemoryError(), 1, "out of memory"),
+        (ImportError("no libEGL"), 1, "no libEGL; `handsim doctor` says what is missing"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_what_a_user_can_set_right_is_told_in_one_line(
+    error: BaseException,
+    code: int,
+    line: str,
+    invoke: Callable[..., int],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert invoke(raising(error)) == code
+    err = capsys.readouterr().err
+    assert err.startswith(f"handsim fake: {line}")
+    assert err.count("\n") == 1
+
+
+def test_our_own_mistakes_are_one_line_and_a_log(
+    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert invoke(lambda: 1 // 0) == 1
+    said = capsys.readouterr().err
+    found = re.fullmatch(
+        r"handsim fake: unexpected ZeroDivisionError: .*; this is a mistake in handsim, please report it "
+        r"with (\S+)\n",
+        said,
+    )
+    assert found is not None, said
+    log = Path(found[1])
+    assert "Traceback (most recent call last)" in log.read_text() and "test_cli.py" in log.read_text()
+    log.unlink()
+
+
+def test_a_signal_is_told_with_what_is_kept(
+    invoke: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert invoke(raising(Stopped(15, "3 of 8 frames are in out"))) == 143
+    assert capsys.readouterr().err == "handsim fake: ended by SIGTERM; 3 of 8 frames are in out\n"
+
+
+def test_names_that_are_no_text_are_printed(
+    invoke: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="utf-8"))
+    assert invoke(lambda: print("take\udcff.trc")) == 0
+    assert raw.getvalue() == b"take\\udcff.trc\n"
+
+
+def test_a_real_missing_file_names_its_path(
+    invoke: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "gone.trc"
+
+    def read() -> None:
+        path.read_text()
+
+    assert invoke(read) == 1
+    assert capsys.readouterr().err == f"handsim fake: {path}: no such file or folder\n"
+
+
+def shell(line: str) -> subprocess.CompletedProcess[str]:
+    line = line.replace(
+        "handsim", f"{sys.executable} -c 'import handsim.cli.main as c; raise SystemExit(c.main())'"
+    )
+    return subprocess.run(["bash", "-c", line], capture_output=True, text=True, cwd=ROOT, check=False)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_on_stdout_is_one_line_and_code_1() -> None:
+    result = shell("handsim --version > /dev/full")
+    assert result.returncode == 1
+    assert result.stderr == "handsim: the disk is full; free some space and run the same command again\n"
+
+
+def test_a_closed_pipe_is_no_traceback() -> None:
+    result = shell("(sleep 0.5; handsim --version) | true; exit ${PIPESTATUS[0]}")
+    assert (result.returncode, result.stderr) == (141, "")
+
+
+def test_help_into_a_closed_pipe_is_no_traceback() -> None:
+    result = shell("(sleep 0.5; handsim train --help) | true; exit ${PIPESTATUS[0]}")
+    assert (result.returncode, result.stderr) == (141, "")
+
+
+def test_closed_streams_are_no_traceback() -> None:
+    assert shell("handsim --help >&-").stderr == ""
+    result = shell("handsim trian >&- 2>&-")
+    assert (result.returncode, result.stdout) == (2, "")
+
+
+def test_overview_loads_nothing_heavy() -> None:
+    code = (
+        "import sys; from handsim.cli.main import main; main(['--help']); "
+        "print(sorted({'torch', 'mujoco', 'numpy', 'pyrender', 'tyro'} & set(sys.modules)), file=sys.stderr)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert result.stderr == "[]\n"
+
+
+def test_completion_knows_commands_and_options(tmp_path: Path) -> None:
+    script = tmp_path / "completion.bash"
+    assert shell(f"handsim --print-completion bash > {script}").returncode == 0
+
+    def complete(*words: str) -> list[str]:
+        typed = " ".join(f"'{word}'" for word in words)
+        line = f"source {script}; COMP_WORDS=({typed}); COMP_CWORD={len(words) - 1}; _handsim; "
+        return subprocess.run(
+            ["bash", "-c", line + 'echo "${COMPREPLY[@]}"'], capture_output=True, text=True, check=True
+        ).stdout.split()
+
+    assert complete("handsim", "tra") == ["train", "track"]
+    assert complete("handsim", "train", "--thr") == ["--threads"]
+    assert "list" in complete("handsim", "glove", "")
+    assert shell("handsim --print-completion fish").returncode == 2

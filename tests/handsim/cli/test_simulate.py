@@ -1,0 +1,197 @@
+"""`handsim simulate`, `handsim reproduce` and `handsim evaluate` of a take, through the command line."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.layout import load_layout
+from gloves.takes.take import load_take
+from handsim.cli.main import main
+from train.simulation.held_out import held_out_markers
+from train.simulation.room_settings import KINDS, TWINS
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("take")
+    out = folder / "take.c3d"
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
+    return out
+
+
+def test_the_capture_and_its_truth_agree(taken):
+    assert sorted(path.name for path in taken.parent.iterdir()) == ["take.c3d", "take.truth.npz"]
+    capture, truth = read_capture(taken), load_take(taken.with_suffix(".truth.npz"))
+    assert capture.positions.shape == truth.points.shape == (FRAMES, truth.points.shape[1], 3)
+    assert capture.rate == truth.rate == 120.0
+    np.testing.assert_array_equal(np.isnan(capture.positions), np.isnan(truth.points))
+    np.testing.assert_allclose(capture.positions, truth.points, rtol=2e-7, atol=2e-7)
+    assert all(name.startswith("Unlabeled") for name in capture.names), "no name tells a marker"
+    assert truth.settings["kind"] == "hand-controller" and truth.settings["seed"] == 0
+    json.dumps(truth.settings)
+
+
+def test_the_same_command_writes_the_same_bytes_and_tells_what(taken, tmp_path, capsys):
+    out = tmp_path / "again" / "take.c3d"
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
+    said = capsys.readouterr().out
+    assert f"{out}: {FRAMES} frames, " in said and str(out.with_suffix(".truth.npz")) in said
+    assert out.read_bytes() == taken.read_bytes()
+    assert main(["simulate", "--num-frames", "20", "--out", str(tmp_path / "text.trc"), "--seed", "4"]) == 0
+    trc, truth = read_capture(tmp_path / "text.trc"), load_take(tmp_path / "text.truth.npz")
+    np.testing.assert_allclose(trc.positions, truth.points, atol=1e-6)
+    assert (tmp_path / "text.trc").read_text().startswith("PathFileType\t4\t(X/Y/Z)\ttext.trc\n")
+    assert main(["simulate", "--num-frames", "20", "--out", str(tmp_path / "text.csv"), "--seed", "4"]) == 0
+    motive = read_capture(tmp_path / "text.csv")
+    np.testing.assert_allclose(motive.positions, truth.points, atol=1e-8)
+    assert ",Take Name,text," in (tmp_path / "text.csv").read_text().splitlines()[0]
+    present = truth.markers_present()
+    assert present.shape == (20, 38) and present.mean() > 0.8
+
+
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("step", ["writing the truth", "renaming the truth"])
+def test_a_full_disk_leaves_no_half_pair(older, step, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "take.c3d"
+    command = ["simulate", "--num-frames", "5", "--out", str(out)]
+    if older:
+        assert main(command) == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    full = OSError(errno.ENOSPC, "No space left on device")
+    replace = os.replace
+
+    def fill(*_arguments, **_rest):
+        raise full
+
+    def rename(source, target):
+        if step.startswith("renaming") and str(target) == str(tmp_path / "take.truth.npz"):
+            raise full
+        replace(source, target)
+
+    if step.startswith("writing"):
+        monkeypatch.setattr(np, "savez_compressed", fill)
+    monkeypatch.setattr(os, "replace", rename)
+    assert main([*command, "--seed", "1"]) == 1
+    said = capsys.readouterr().err
+    assert "the disk is full" in said and said.count("\n") == 1
+    left = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    if step.startswith("writing"):
+        assert left == before, "what was there stays"
+    else:
+        assert "take.c3d" not in left, "no capture with the truth of another"
+
+
+def test_the_optics_are_options_of_the_command(tmp_path, capsys):
+    out = tmp_path / "take.c3d"
+    command = ["simulate", "--num-frames", "20", "--out", str(out)]
+    assert main([*command, "--optics.blob-loss", "0.9"]) == 0
+    truth = load_take(out.with_suffix(".truth.npz"))
+    assert truth.settings["room"]["optics"]["blob_loss"] == 0.9
+    assert truth.markers_present().mean() < 0.8
+    capsys.readouterr()
+    assert main([*command, "--optics.noise", "-1"]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "noise is -1, expected a finite number that is not negative" in said
+
+
+@pytest.mark.parametrize("name", ["take.tsv", "take.npz", "take"])
+def test_another_suffix_is_refused_before_the_work(name, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    # An hour of frames would take minutes.
+    assert main(["simulate", "--num-frames", "432000", "--out", name]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and ".trc, .c3d" in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["simulate", "--kind", "hand-foot", "--out", str(tmp_path / "take.c3d")])
+    assert caught.value.code == 2
+    said = capsys.readouterr().err
+    assert all(kind in said for kind in KINDS)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsys):
+    truth, figures = taken.with_suffix(".truth.npz"), tmp_path / "figures.json"
+    assert main(["evaluate", str(truth), "--json", str(figures)]) == 0
+    assert "1 takes, 120 frames of one hand" in capsys.readouterr().out
+    found = json.loads(figures.read_text())
+    assert found["frames"] == 2 * FRAMES
+    assert found["figures"]["slot_accuracy"] > 0.8
+    assert set(found["slot_accuracy_by_marker"]) == set(load_take(truth).hands[0].layout.names)
+    for option in (["--occlude", "3"], ["--ghosts", "1"], ["--every", "2"]):
+        assert main(["evaluate", str(truth), *option]) == 1
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and "leave out --occlude, --ghosts and --every" in said
+    assert main(["evaluate", str(truth), str(truth)]) == 0
+    assert "2 takes, 240 frames of one hand" in capsys.readouterr().out
+
+
+def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
+    capture, figures = tmp_path / "capture.trc", tmp_path / "figures.json"
+    markers = held_out_markers("dense19", 40, seed=0)
+    write_capture(capture, Capture(load_layout("dense19").names, markers, 100.0))
+    assert main(["evaluate", str(capture), "--every", "15", "--json", str(figures)]) == 0
+    found = json.loads(figures.read_text())
+    assert (found["every"], found["frames"]) == (15, 3)
+    assert main(["evaluate", str(capture), "--every", "0"]) == 1
+    assert "every 0, expected at least 0 and 1" in capsys.readouterr().err
+
+
+def test_a_take_and_a_capture_are_not_measured_together(taken, capsys):
+    assert main(["evaluate", str(taken.with_suffix(".truth.npz")), str(taken)]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and ".npz" in said
+
+
+def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
+    out = tmp_path / "take.c3d"
+    assert main(["simulate", "--num-frames", "5", "--glove", "sparse13", "--out", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 1
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "the labeler knows" in said
+
+
+def test_table_3_has_a_row_a_capture_with_the_papers_figures(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    assert main(["reproduce", "table3"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    for kind in KINDS:
+        row, by_marker = (line for line in lines if line.split("│")[1:2] and kind in line.split("│")[1])
+        paper, ghosts = TWINS[kind].paper, TWINS[kind].ghost_ratio
+        frames, gaps, length, missing, share = (cell.strip() for cell in row.split("│")[2:7])
+        assert frames == f"{paper.frames} ({paper.frames})"
+        for cell, wanted in (
+            (gaps, paper.gaps),
+            (length, paper.average_length),
+            (missing, paper.average_missing),
+        ):
+            ours, theirs = cell.rstrip(")").split(" (")
+            assert float(theirs) == pytest.approx(wanted)
+            assert float(ours) == pytest.approx(wanted, rel=0.4), f"{kind}: {cell}"
+        assert share.endswith(f"({100 * ghosts:.2f} %)")
+        assert by_marker.count("%") == 3
+    assert any("real finger markers" in line for line in lines)
+
+
+def test_a_capture_that_no_memory_holds_is_refused_at_once(tmp_path, capsys):
+    assert main(["simulate", "--num-frames", "1000000000", "--out", str(tmp_path / "take.c3d")]) == 1
+    said = capsys.readouterr().err
+    assert "1000000000 frames need 20 TB of memory" in said and "shorter captures" in said
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,360 @@
+"""`handsim track` and `handsim calibrate` through the command line, on captures and on a live stream."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gloves.attachment import wear
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from gloves.fit import GloveFit, nominal_fit
+from gloves.layout import load_layout
+from gloves.takes.archives import CutOffWarning
+from gloves.takes.corrections import NO_MARKER
+from gloves.takes.growing import GrownArchive
+from gloves.takes.take import load_take
+from gloves.takes.tracked_take import LOST, load_tracked_take
+from handsim.cli.main import main
+from handsim.hand.model import HandModel
+from handsim.hand.shape import sample_shape
+from handsim.space.objects import named_object
+from track.bodies.body_file import load_body
+from track.evaluation.hand_errors import hand_errors
+from track.streams.addresses import open_source
+from track.streams.natnet_server import ReplayServer
+from track.user import load_user
+from track.viewer.recordings.corrector import Corrector
+from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    out = tmp_path_factory.mktemp("take") / "take.c3d"
+    assert (
+        main(["simulate", "--kind", "hand-controller", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    )
+    return out
+
+
+@pytest.fixture(scope="module")
+def user(tmp_path_factory):
+    """A user's capture for calibration, their hand and what the command made of it."""
+    folder, rng = tmp_path_factory.mktemp("user"), np.random.default_rng(5)
+    shape = sample_shape(side="right", rng=rng)
+    model = HandModel(shape)
+    worn = wear(load_layout("dense19"), model, along=0.05, around=0.2, rng=rng)
+    config = CalibrationTakeConfig(free=2.0, rounds=0)
+    take = simulate_calibration((GloveFit(model, worn),), config, rng=rng)
+    write_capture(folder / "user.c3d", take.capture())
+    arguments = [str(folder / "user.c3d"), "--size", "L", "--out", str(folder / "user.json")]
+    assert main(["calibrate", *arguments]) == 0
+    return folder, GloveFit(model, worn)
+
+
+def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
+    folder, true = user
+    (found,) = load_user(folder / "user.json")
+    assert found.side == "right", "the left hand is not in the capture"
+    errors = hand_errors(found, true)
+    start = hand_errors(nominal_fit(load_layout("dense19"), "L", "right"), true)
+    assert np.median(errors.positions) < 0.5 * np.median(start.positions)
+    assert main(["track", str(folder / "user.c3d"), "--shape", str(folder / "user.json"), "--out",
+                 str(folder / "take.npz")]) == 0  # fmt: skip
+    take = load_tracked_take(folder / "take.npz")
+    assert take.sides == ("right",) and take.settings["user"] == "user.json"
+    assert np.nanmedian(take.rms) < 0.0005
+    np.testing.assert_array_equal(take.hands[0].attachment.points, found.attachment.points)
+    assert "right hand: tracked" in capsys.readouterr().out
+
+
+def test_users_that_do_not_fit_are_told(user, capture, tmp_path, capsys):
+    shape, out = str(user[0] / "user.json"), str(tmp_path / "out.npz")
+    for arguments, words in (
+        (["--size", "M"], "expected one of them"),
+        (["--hands", "left"], "unknown hand 'left'; valid names: right"),
+        (["--glove", "sparse13"], "but glove 'sparse13' has"),
+    ):
+        assert main(["track", str(capture), "--shape", shape, "--out", out, *arguments]) == 1
+        assert words in capsys.readouterr().err
+    assert main(["calibrate", str(capture), "--hands", "left", "--out", str(tmp_path / "user.json")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("handsim calibrate: ") and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
+    out, labeled = tmp_path / "new" / "tracked.npz", tmp_path / "labeled.trc"
+    assert main(["track", str(capture), "--out", str(out), "--labeled", str(labeled), "--size", "L"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"{out}: {FRAMES} frames, 0.5 s at 120 Hz"
+    assert lines[1].startswith("right hand: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median")
+    assert lines[2].startswith("left hand: ") and " mm, " in lines[2]
+    assert lines[3].endswith("points are not markers") and lines[4].endswith(" ms per frame")
+    take, truth = load_tracked_take(out), load_take(capture.with_suffix(".truth.npz"))
+    assert take.sides == ("right", "left")
+    assert take.settings["capture"] == "take.c3d" and take.settings["user"] == "L"
+    json.dumps(take.settings)
+    true = np.where(truth.labels < 38, truth.labels, -1)
+    assert np.mean(take.labels == true) > 0.95
+    columns = read_capture(labeled)
+    assert columns.names[:38] == take.label_names
+    seen = columns.positions[:, :19]
+    np.testing.assert_allclose(seen, take.observed("right"), atol=1e-6)
+    unlabeled = np.isfinite(columns.positions[:, 38:, 0]).sum()
+    assert f"{unlabeled} of " in lines[3]
+
+
+def test_corrections_come_back_with_a_new_tracking(capture, tmp_path, capsys):
+    out, labeled = tmp_path / "tracked.npz", tmp_path / "labeled.trc"
+    arguments = ["track", str(capture), "--out", str(out), "--size", "L"]
+    assert main(arguments) == 0
+    first = load_tracked_take(out)
+    corrector = Corrector(out, first)
+    (column,) = np.flatnonzero(first.labels[30] == 5)
+    number = first.ids[30, column]
+    corrector.add(30, column, (20, 40), NO_MARKER)
+    corrector.save()
+    saved = load_tracked_take(out)
+    about = (first.ids == number) & np.isin(np.arange(FRAMES), np.arange(20, 41))[:, None]
+    assert (saved.labels[about] == -1).all() and (first.labels[about] == 5).all()
+    capsys.readouterr()
+    assert main([*arguments, "--labeled", str(labeled)]) == 0
+    beside = tmp_path / "tracked.corrections.toml"
+    assert (
+        f"{beside}: 1 correction applied, {about.sum()} labels in {about.sum()} frames"
+        in capsys.readouterr().out
+    )
+    again = load_tracked_take(out)
+    np.testing.assert_array_equal(again.labels, saved.labels)
+    np.testing.assert_allclose(again.qpos, saved.qpos, atol=1e-9)
+    assert again.settings["corrections"] == saved.settings["corrections"] != []
+    rows = about.any(axis=1)
+    assert np.isnan(read_capture(labeled).positions[rows, 5]).all()
+
+    beside.write_text(re.sub("place_mm = .*", "place_mm = [5000, 0, 0]", beside.read_text()))
+    assert main(arguments) == 0
+    assert "the correction to none in frames 20 to 40 no longer fits" in capsys.readouterr().err
+    np.testing.assert_array_equal(load_tracked_take(out).labels, first.labels)
+
+
+def test_corrections_that_cannot_be_meant_are_told_before_the_work(capture, tmp_path, capsys):
+    out, beside = tmp_path / "tracked.npz", tmp_path / "tracked.corrections.toml"
+    beside.write_text('[[correction]]\nframes = [0, 60]\nplace_mm = [0, 0, 0]\nlabel = "none"\n')
+    assert main(["track", str(capture), "--out", str(out), "--size", "L"]) == 1
+    assert (
+        f"{beside}: correction 1 is for frames 0 to 60, expected frames from 0 to 59"
+        in capsys.readouterr().err
+    )
+    assert main(["track", "--live", "natnet://127.0.0.1", "--out", str(out), "--size", "L"]) == 1
+    assert "corrects the take that --live would replace" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_the_size_of_the_hands_is_measured(capture, tmp_path, capsys):
+    out = tmp_path / "tracked.npz"
+    assert main(["track", str(capture), "--out", str(out)]) == 0
+    said = capsys.readouterr().out.splitlines()[0]
+    length, breadth = (int(word) for word in said.removeprefix("size of the hands: ")[:-3].split(" x "))
+    truth, take = load_take(capture.with_suffix(".truth.npz")), load_tracked_take(out)
+    assert length == pytest.approx(1e3 * truth.hands[0].fit.shape.length, abs=12)
+    assert 0.4 < breadth / length < 0.5
+    assert take.settings["user"] == f"auto, {length} x {breadth} mm"
+    assert np.nanmedian(take.rms) < 0.005
+
+
+def test_hands_that_are_not_there_get_the_usual_size(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    path, out = tmp_path / "clutter.trc", tmp_path / "out.npz"
+    write_capture(path, Capture(tuple(f"U{n}" for n in range(30)), rng.uniform(-1, 1, (60, 30, 3)), 120.0))
+    main(["track", str(path), "--out", str(out)])
+    assert "no hand was found to measure its size; size M is used" in capsys.readouterr().err
+
+
+def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
+    truth = load_take(capture.with_suffix(".truth.npz"))
+    wand, out, labeled = tmp_path / "wand.toml", tmp_path / "take.npz", tmp_path / "labeled.c3d"
+    assert main(["body", str(capture.with_suffix(".truth.npz")), "--out", str(wand)]) == 0
+    assert capsys.readouterr().out == f"{wand}: controller, 6 markers, at most 99.9 mm apart\n"
+    asked = [
+        "--size",
+        "L",
+        "--hands",
+        "right",
+        "--body",
+        str(wand),
+        "--body",
+        "mug",
+        "--labelled",
+        str(labeled),
+    ]  # the earlier spelling holds
+    assert main(["track", str(capture), "--out", str(out), *asked]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].startswith(
+        "controller: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median RMS"
+    )
+    assert lines[3] == (
+        "mug: tracked 0.0 %, found 0.0 %, coasting 0.0 %, lost 100.0 %; it was never found: are these its "
+        "markers?"
+    )
+    take, first = load_tracked_take(out), truth.hand_labels[-1].stop
+    assert [body.name for body in take.bodies] == ["controller", "mug"]
+    np.testing.assert_allclose(take.bodies[0].positions, named_object("controller").markers, atol=1e-12)
+    mine = truth.labels >= first
+    assert np.mean(take.labels[mine] - 19 == truth.labels[mine] - first) > 0.99
+    columns = read_capture(labeled)
+    assert columns.names[: len(take.label_names)] == take.label_names
+    assert take.label_names[19] == "controller:ring_front"
+    seen = columns.positions[:, 19:25]
+    true = truth.observed(range(first, first + 6))
+    there = np.isfinite(true[..., 0])
+    np.testing.assert_array_equal(np.isfinite(seen[..., 0]), there)
+    np.testing.assert_allclose(seen[there], true[there], atol=1e-6)
+
+
+def test_a_body_is_learned_from_a_capture_of_it(capture, tmp_path, capsys):
+    truth = load_take(capture.with_suffix(".truth.npz"))
+    alone = np.where((truth.labels >= truth.hand_labels[-1].stop)[..., None], truth.points, np.nan)
+    alone = alone[:, np.isfinite(alone[..., 0]).any(axis=0)]
+    file, wand = tmp_path / "alone.trc", tmp_path / "wand.toml"
+    write_capture(file, Capture(tuple(f"*{n}" for n in range(alone.shape[1])), alone, truth.rate))
+    assert main(["body", str(file), "--out", str(wand)]) == 0
+    assert capsys.readouterr().out.startswith(f"{wand}: wand, 6 markers, at most 99.9 mm apart")
+    body, true = load_body(wand), load_body("controller")
+    np.testing.assert_allclose(np.sort(body.distances.ravel()), np.sort(true.distances.ravel()), atol=0.0002)
+
+
+def test_a_body_is_followed_through_a_stream(capture, tmp_path, capsys):
+    out = tmp_path / "live.npz"
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+        asked = ["--live", server.url, "--seconds", "0.2", "--body", "controller", "--out", str(out)]
+        assert main(["track", *asked]) == 0
+    assert (load_tracked_take(out).body_status != LOST).all()
+    assert "controller: tracked" in capsys.readouterr().out
+
+
+def test_the_same_command_writes_the_same_bytes(capture, tmp_path):
+    for name in ("one.npz", "two.npz"):
+        assert main(["track", str(capture), "--out", str(tmp_path / name), "--hands", "right"]) == 0
+    take = load_tracked_take(tmp_path / "one.npz")
+    assert take.sides == ("right",) and (take.status != LOST).all()
+    assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
+
+
+def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys):
+    out = tmp_path / "live.npz"
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+        assert main(["track", "--live", server.url, "--seconds", "0.3", "--out", str(out)]) == 0
+    take = load_tracked_take(out)
+    assert take.num_frames == 37 and take.rate == pytest.approx(120.0, rel=1e-3)
+    assert take.settings["capture"] == server.url
+    assert set(take.settings["stream"].values()) == {0}
+    np.testing.assert_array_equal(take.numbers, np.arange(37))
+    assert (take.status[-1] != LOST).all()
+    told = capsys.readouterr()
+    assert "right hand: tracked" in told.out and "missing" not in told.out
+    assert told.out.startswith("size of the hands: ") and take.settings["user"].startswith("auto, ")
+    assert told.err.splitlines()[0] == "waiting for hands, to measure their size"
+    assert (
+        told.err.splitlines()[1] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupt_writes_what_there_is(number, capture, tmp_path):
+    out, before = tmp_path / "live.npz", signal.getsignal(number)
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+
+        def interrupt() -> None:
+            while not server._clients or signal.getsignal(number) is before:
+                time.sleep(0.01)
+            time.sleep(0.3)
+            os.kill(os.getpid(), number)
+
+        thread = threading.Thread(target=interrupt, daemon=True)
+        thread.start()
+        assert main(["track", "--live", server.url, "--out", str(out)]) == 0
+        thread.join()
+    assert 2 <= load_tracked_take(out).num_frames <= FRAMES
+    assert signal.getsignal(number) is before and os.listdir(tmp_path) == ["live.npz"]
+
+
+def _frames_in(part):
+    """Frames of a recording, 0 before its first bytes are written."""
+    return GrownArchive(part).num_frames if part.exists() and part.stat().st_size else 0
+
+
+def test_a_kill_leaves_all_but_the_last_second(capture, tmp_path):
+    out, take = tmp_path / "live.npz", load_take(capture.with_suffix(".truth.npz"))
+    points, ids = np.tile(take.points, (40, 1, 1)), np.tile(take.ids, (40, 1))
+    with ReplayServer(points, ids, 120.0) as server:
+        run = "import sys; from handsim.cli.main import main; main(sys.argv[1:])"
+        live = ["track", "--live", server.url, "--size", "M", "--out", str(out)]
+        process = subprocess.Popen([sys.executable, "-c", run, *live], stderr=subprocess.DEVNULL)
+        part = tmp_path / "live.npz.part"
+        while process.poll() is None and _frames_in(part) <= 60:
+            time.sleep(0.05)
+        sent = server.sent
+        process.kill()
+        process.wait()
+    assert os.listdir(tmp_path) == ["live.npz.part"]
+    with pytest.warns(CutOffWarning):
+        numbers = load_tracked_take(part).numbers
+    assert (numbers[0], len(numbers)) == (0, numbers[-1] + 1) and len(numbers) > sent - 120
+
+
+def test_a_stream_without_frames_is_told(capture, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("handsim.cli.live.open_source", functools.partial(open_source, silence=0.2))
+    take = load_take(capture.with_suffix(".truth.npz"))
+    with ReplayServer(take.points[:1], take.ids[:1], 120.0) as server:
+        arguments = ["track", "--live", server.url, "--seconds", "0.5", "--out", str(tmp_path / "live.npz")]
+        assert main(arguments) == 1
+    assert "1 frames came, expected two or more" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys):
+    """A capture is played at its own rate; every frame reaches a UDP listener."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        one.bind(("127.0.0.1", 0))
+        address = f"udp://127.0.0.1:{one.getsockname()[1]}"
+        out, start = tmp_path / "take.npz", time.monotonic()
+        assert main(["track", str(capture), "--out", str(out), "--size", "M", "--send", address]) == 0
+        assert time.monotonic() - start > (FRAMES - 1) / 120
+        one.setblocking(False)
+        heard = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                heard.append(json.loads(one.recv(1 << 16)))
+    take = load_tracked_take(out)
+    header, frames = heard[0], [one for one in heard if one["type"] == "frame"]
+    assert header["type"] == "header" and header["sides"] == ["right", "left"]
+    assert [one["number"] for one in frames] == list(range(FRAMES))
+    for one, qpos in zip(frames, take.qpos, strict=True):
+        for hand, pose in zip(one["hands"], qpos, strict=True):
+            if hand["wrist"] is not None and np.isfinite(pose).all():
+                np.testing.assert_allclose(hand["wrist"]["position"], pose[:3], atol=2e-6)
+                np.testing.assert_allclose(hand["angles"], pose[7:], atol=2e-6)
+    assert f"{FRAMES} frames sent to {address}" in capsys.readouterr().out
+
+
+def test_an_address_that_is_none_is_told_before_anything_is_done(capture, tmp_path, capsys):
+    arguments = ["track", str(capture), "--out", str(tmp_path / "take.npz"), "--send", "http://localhost:1"]
+    assert main(arguments) == 1
+    assert "'http://localhost:1' is not an address to send to, expected osc://" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,119 @@
+"""`handsim train`: a preset replaces the defaults, and options given beside it hold."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+import train.loop
+from handsim.cli.main import main
+from train.config import EPOCHS, CNNConfig, TrainConfig, default_config, preset_config
+from train.data.augmentation import Corruption
+from train.data.batches import paper_corruption
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.frame_scenes import SceneMix
+from train.simulation.generation import generate_dataset
+from train.training_state import _rate
+
+FRAMES = 16
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    out = tmp_path_factory.mktemp("sets") / "small"
+    generate_dataset(DatasetConfig(num_frames=FRAMES, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    return out
+
+
+@pytest.fixture
+def config_of(dataset, tmp_path, monkeypatch):
+    """The settings that `handsim train` hands to the training loop."""
+
+    def config_of(*options: str) -> TrainConfig:
+        configs = []
+
+        def keep(rows, config, out, *, threads, progress):
+            configs.append(config)
+            return {"held_out_simulated": {"random": {"accuracy": 1.0}}}
+
+        monkeypatch.setattr(train.loop, "train_labeler", keep)
+        assert main(["train", str(dataset), "--out", str(tmp_path / "run"), *options]) == 0
+        return configs[0]
+
+    return config_of
+
+
+def test_a_preset_replaces_the_defaults(config_of):
+    assert config_of() == TrainConfig()
+    config = config_of("--preset", "han2018")
+    assert config == config_of("--preset=han2018") == preset_config("han2018", FRAMES)
+    assert config.optimizer == "sgd" and config.samples == EPOCHS * FRAMES
+
+
+def test_the_preset_is_section_3_3_of_the_paper(config_of):
+    """Each number of Han et al. 2018, section 3.3, and those of 3.1 and 3.2 that training needs."""
+    config = config_of("--preset", "han2018")
+    assert config.labeler == "cnn" and config.cnn.views == "random"
+    assert config.optimizer == "sgd" and config.learning_rate == 0.6 and config.weight_decay == 0.0
+    assert config.batch == 256
+    assert config.samples == 75 * FRAMES
+    rates = [_rate(config, epoch / 75) for epoch in (0, 49, 51, 69, 71, 74)]
+    assert rates == pytest.approx([1, 1, 0.1, 0.1, 0.01, 0.01])
+    assert config.occlude is None and paper_corruption(19).occlude == 5 and paper_corruption(13).occlude == 3
+    assert config.ghosts == 2 and Corruption().margin == 0.1
+    assert config.rig_share == config.anisotropy == config.average == 0.0
+    assert config.knee == 1.0
+    assert config.cnn.reject == 0.015
+    assert config_of("--preset", "han2018", "--cnn.reject", "0.04").cnn.reject == 0.04
+
+
+def test_each_kind_has_defaults_of_its_own(config_of):
+    assert config_of("--labeler", "set") == config_of() == TrainConfig()
+    assert config_of("--labeler", "cnn") == config_of("--labeler=cnn") == default_config("cnn")
+    config = config_of("--labeler", "cnn", "--batch", "256", "--cnn.views", "random")
+    assert config == dataclasses.replace(default_config("cnn"), batch=256, cnn=CNNConfig(views="random"))
+
+
+@pytest.mark.parametrize("option", ["--cnn.reject", "--cnn.spread"])
+def test_distances_of_matching_are_positive(dataset, tmp_path, capsys, option):
+    assert main(["train", str(dataset), "--out", str(tmp_path), "--labeler", "cnn", option, "0"]) != 0
+    assert f"{option[6:]} is 0.0, expected more than 0" in capsys.readouterr().err
+
+
+PRESET, OPTIMIZER = ["--preset", "han2018"], ["--optimizer", "adamw"]
+
+
+@pytest.mark.parametrize("options", [PRESET + OPTIMIZER, OPTIMIZER + PRESET])
+def test_an_option_beside_a_preset_holds_although_it_is_the_usual_default(config_of, options):
+    config = config_of(*options)
+    assert config.optimizer == "adamw" == TrainConfig().optimizer
+    assert config.learning_rate == 0.6 and config.labeler == "cnn"
+
+
+def test_every_usual_default_holds_when_given(config_of):
+    usual = TrainConfig()
+    options = [
+        f"--{name.replace('_', '-')}={getattr(usual, name)}"
+        for name in ("labeler", "samples", "learning_rate", "schedule", "weight_decay", "average")
+    ]
+    config = config_of("--preset", "han2018", *options)
+    assert config.samples == usual.samples and config.average == usual.average and config.labeler == "set"
+    assert config.jitter == preset_config("han2018", FRAMES).jitter
+
+
+def test_unknown_presets_and_missing_sets_are_told(tmp_path, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["train", str(tmp_path), "--out", str(tmp_path / "run"), "--preset", "han2081"])
+    assert caught.value.code == 2
+    assert "han2018" in capsys.readouterr().err
+    assert main(["train", str(tmp_path), "--out", str(tmp_path / "run"), "--preset", "han2018"]) == 1
+    assert "expected a training set with a manifest.json" in capsys.readouterr().err
+
+
+def test_help_shows_the_preset(capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(["train", "--preset", "han2018", "--help"])
+    assert caught.value.code == 0
+    out = capsys.readouterr().out
+    assert "default: sgd" in out and "default: 12774750" in out and "handsim train" in out

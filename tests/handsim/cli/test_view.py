@@ -1,0 +1,135 @@
+"""`handsim view` through the command line, on files and on a live stream."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import threading
+import time
+import urllib.request
+
+import cv2
+import numpy as np
+import pytest
+
+from gloves.takes.take import load_take
+from handsim.cli.main import main
+from track.streams.natnet_server import ReplayServer
+from track.viewer import live_view
+from track.viewer.video import chosen_frames
+
+FRAMES = 120
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    out = tmp_path_factory.mktemp("take") / "take.c3d"
+    assert main(["simulate", "--kind", "hand-pen", "--num-frames", str(FRAMES), "--out", str(out)]) == 0
+    return out
+
+
+def ended_after(condition) -> threading.Thread:
+    """Sends Ctrl-C once a condition holds."""
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt() -> None:
+        end = time.monotonic() + 120.0
+        while not (condition() and signal.getsignal(signal.SIGINT) is not before):
+            if time.monotonic() > end:
+                break
+            time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_file_is_served_until_ctrl_c(capture, capfd):
+    said: list[str] = []
+    pages: list[bytes] = []
+
+    def served() -> bool:
+        said.append(capfd.readouterr().out)
+        found = re.search(r"http://\S+", "".join(said))
+        if found is None:
+            return False
+        pages.append(urllib.request.urlopen(found[0]).read())
+        return True
+
+    thread = ended_after(served)
+    assert main(["view", str(capture), "--port", "0"]) == 0
+    thread.join()
+    assert "".join(said).startswith(f"{capture} (capture): http://127.0.0.1:")
+    assert b"<html" in pages[0]
+
+
+def test_a_live_tracker_is_shown_and_frames_are_never_dropped(capture, capsys, monkeypatch):
+    shown: list[live_view.LiveView] = []
+    offered: list[int] = []
+    plain = live_view.LiveView.offer
+
+    def offer(self, frame, tracked):
+        shown.append(self)
+        offered.append(frame.number)
+        plain(self, frame, tracked)
+
+    monkeypatch.setattr(live_view.LiveView, "offer", offer)
+    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+        thread = ended_after(lambda: len(offered) > 60 and shown[-1].pictures > 5)
+        assert main(["view", "--live", server.url, "--size", "L", "--port", "0"]) == 0
+        thread.join()
+    assert offered == list(range(offered[0], offered[0] + len(offered))), "every frame is tracked"
+    told = re.search(r"(\d+) frames tracked, (\d+) of them", capsys.readouterr().out)
+    frames, pictures = map(int, told.groups())
+    assert frames == len(offered) and 5 < pictures < frames
+
+
+def test_a_video_is_drawn_without_a_page(capture, tmp_path, capsys):
+    out = tmp_path / "take.mp4"
+    truth = capture.with_suffix(".truth.npz")
+    assert main(["view", str(truth), "--video", str(out)]) == 0
+    assert f"{out}: 30 pictures of {truth} (truth)" in capsys.readouterr().out
+    video = cv2.VideoCapture(str(out))
+    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (30, 30)
+    pictures = [video.read()[1].astype(int) for _ in range(30)]
+    paper = pictures[0][0, 0]
+    drawn = [(np.abs(picture - paper).max(axis=-1) > 40).mean() for picture in pictures]
+    assert min(drawn) > 0.01, "a hand is in every picture"
+    assert np.abs(pictures[0] - pictures[-1]).max() > 100, "and it moves"
+
+    assert main(["view", str(truth), "--video", str(tmp_path / "take.avi")]) == 1
+    assert "expected a name that ends in .mp4" in capsys.readouterr().err
+
+    assert not (tmp_path / "take.avi").exists()
+
+
+def test_a_video_keeps_the_time_of_the_take():
+    assert chosen_frames(np.arange(120) / 120.0) == (30.0, list(range(0, 120, 4)))
+    rate, frames = chosen_frames(np.arange(5) / 4.0)
+    assert (rate, frames) == (4.0, [0, 1, 2, 3, 4])
+    gap = np.concatenate([np.arange(12), 60 + np.arange(12)]) / 120.0
+    rate, frames = chosen_frames(gap)
+    assert frames == [0, 4, 8, *[11] * 12, 12, 16, 20], "while nothing came, the last frame stays"
+    assert chosen_frames(np.array([3.0])) == (30.0, [0])
+
+
+def test_what_cannot_be_shown_is_told_in_one_line(tmp_path, capture, capsys):
+    for arguments, words in (
+        ([], "neither a file nor --live, expected a file or --live natnet://host"),
+        ([str(capture), "--live", "natnet://127.0.0.1"], "and --live natnet://127.0.0.1, expected a file or"),
+        (
+            ["--live", "natnet://127.0.0.1", "--out", str(tmp_path / "x.npz")],
+            "nothing of a live view is saved",
+        ),
+        ([str(tmp_path / "take.xyz")], "a file of another kind, expected a marker layout or camera rig"),
+        (["dense91"], "no such file, folder or shipped name"),
+        (["dense19", "--video", str(tmp_path / "x.mp4")], "dense19 is a layout: nothing in it moves"),
+        (["--live", "natnet://127.0.0.1", "--video", "x.mp4"], "a live view is not drawn"),
+        ([str(capture), "--rig", "seven"], "unknown camera rig 'seven'"),
+        ([str(capture), "--port", "70000"], "--port is 70000"),
+    ):
+        assert main(["view", *arguments]) == 1
+        said = capsys.readouterr().err
+        assert said.startswith("handsim view: ") and words in said and said.count("\n") == 1
