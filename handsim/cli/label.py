@@ -20,8 +20,8 @@ from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
 from handsim.files.outputs import check_outputs
 from train.glove_labeler import labeler_for_glove
-from train.hands.frame_hands import HandFinder
-from train.hands.labeling import FrameLabels, label_hands
+from track.finder.frame_hands import HandFinder
+from track.finder.labeling import FrameLabels, label_hands
 from train.threads import label_on
 
 

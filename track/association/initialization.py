@@ -24,7 +24,7 @@ from track.association.label_consistency import targets_of
 from track.association.point_matching import match_log_odds, match_points, peak_log_odds
 from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseFit
-from train.hands.measures import longest_link
+from track.finder.measures import longest_link
 from train.labelers.protocol import Labeler, Labeling
 
 _LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked
