@@ -26,13 +26,13 @@ from pathlib import Path
 
 import numpy as np
 from machine import describe
+from track.live_recording import LiveRecorder
 
 from gloves.takes.growing import GrownArchive
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import load_tracked_take
 from track.capture_tracking import track_stream
 from track.evaluation.take_evaluation import true_users
-from track.live_recording import LiveRecorder
 from track.streams import natnet
 from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer

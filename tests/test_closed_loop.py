@@ -16,8 +16,6 @@ from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0
@@ -37,7 +35,7 @@ def tracked(truth):
     """Tracked from the file of points alone."""
     take, folder = truth
     capture = read_capture(folder / "take.c3d")
-    result = track_capture(capture, Tracker(true_users(take), load_labeler("dense19")))
+    result = track_capture(capture, hands=true_users(take), labeler="dense19")
     result.save(folder / "tracked.npz")
     return load_tracked_take(folder / "tracked.npz"), folder
 

@@ -8,6 +8,7 @@ the labeler.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from time import perf_counter
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -74,6 +75,7 @@ class Tracker:
         Raises:
             ArgumentError: `points` and `ids` do not fit together.
         """
+        began = perf_counter()
         incoming = self._intake.take(points, ids, time)
         if incoming.time - self._last_time > self.config.intake.silence:
             self._labels = {}  # IDs may be those of other points by now
@@ -85,7 +87,8 @@ class Tracker:
         confidence[free] = frame.confidence
         all_labels, all_confidence = np.full(len(points), -1), np.ones(len(points))
         all_labels[incoming.kept], all_confidence[incoming.kept] = labels, confidence
-        return TrackedFrame(time, hands, all_labels, all_confidence, bodies, incoming.notes)
+        seconds = perf_counter() - began
+        return TrackedFrame(time, hands, all_labels, all_confidence, bodies, incoming.notes, seconds)
 
     def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
         """Every body, and the labels (P,) of their points."""

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import DTypeLike, NDArray
 
 from gloves.attachment import Attachment
+from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import (
@@ -163,6 +164,11 @@ class TrackedTake:
         Their names are `handsim.hand.keypoints.KEYPOINT_NAMES`.
         """
         return keypoints_of(self.hands, self.qpos)
+
+    def capture(self) -> Capture:
+        """The points without labels, as an optical system exports them: one trajectory per column."""
+        names = tuple(f"*{column}" for column in range(self.points.shape[1]))
+        return Capture(names, self.points, self.rate)
 
     def save(self, path: Path) -> None:
         """Write the take (.npz), whole or not at all; `load_tracked_take` gives the same numbers again.

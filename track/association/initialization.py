@@ -23,8 +23,8 @@ from track.association.hand_state import HandState
 from track.association.label_consistency import targets_of
 from track.association.point_matching import match_log_odds, match_points, peak_log_odds
 from track.config import TrackerConfig
-from track.kinematics.pose_solver import PoseFit
 from track.finder.measures import longest_link
+from track.kinematics.pose_solver import PoseFit
 from train.labelers.protocol import Labeler, Labeling
 
 _LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked

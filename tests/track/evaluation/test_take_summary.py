@@ -14,8 +14,6 @@ from gloves.takes.tracked_take import LOST, TrackedTake
 from handsim.cli.main import main
 from track.capture_tracking import track_capture
 from track.evaluation.take_summary import suspicions
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig, simulate_take
 
 FRAMES = 40
@@ -28,8 +26,7 @@ def truth() -> Take:
 
 @pytest.fixture(scope="module")
 def tracked(truth) -> TrackedTake:
-    tracker = Tracker([hand.fit for hand in truth.hands], load_labeler("dense19"))
-    return track_capture(truth.capture(), tracker)
+    return track_capture(truth, hands=[hand.fit for hand in truth.hands], labeler="dense19")
 
 
 def test_a_good_take_tells_nothing(tracked):
