@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -235,7 +235,7 @@ def factor_of(
     inner = rows.T @ rows
     for direction in range(rank):
         inner[direction, direction] += spread * spread
-    lower: Any = np.linalg.cholesky(inner)
+    lower: FloatArray = np.linalg.cholesky(inner).astype(np.float64)
     return lower
 
 
