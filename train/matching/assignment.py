@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from handsim.kernels.kernel import kernel
 
@@ -63,13 +62,7 @@ def match_distances(distances: Float[np.ndarray, "N M"], reject: float) -> Int[n
     Returns:
         Label of each point, `GHOST` where none.
     """
-    count, num_labels = distances.shape
-    cost = np.full((count, num_labels + count), np.inf)
-    cost[:, :num_labels] = distances
-    cost[np.arange(count), num_labels + np.arange(count)] = reject
-    _, columns = linear_sum_assignment(cost)
-    labels: NDArray[np.int64] = np.where(columns < num_labels, columns, GHOST)
-    return labels
+    return assign(distances.astype(np.float64), np.full(len(distances), reject))[1]
 
 
 @kernel

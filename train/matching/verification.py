@@ -109,10 +109,8 @@ def _verify(
     columns = np.full((_MOST, _ROUNDS), -1)  # and their labels then
     # Cholesky factors by component and by the set of markers, which most labelings share.
     sets, stored = np.empty((_MOST, len(means[0])), dtype=np.bool_), np.full((_MOST, len(near)), -1)
-    factors, counts = (
-        np.empty((NEAREST * _MOST, directions.shape[3], directions.shape[3])),
-        np.zeros(2, np.int64),
-    )
+    rank = directions.shape[3]
+    factors, counts = np.empty((NEAREST * _MOST, rank, rank)), np.zeros(2, np.int64)
     front, num_front, num_found = np.zeros(_MOST, dtype=np.int64), 1, 0
     for step in range(_ROUNDS + 1):
         first = num_found
