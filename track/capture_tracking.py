@@ -82,7 +82,7 @@ def track_capture(
     setup = TrackerSetup.of(glove, hands, size, labeler, bodies, config)
     source = capture_of(capture)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
-    frames = checked_frames(source, config.intake.farthest)
+    frames = checked_frames(source)
     setup = setup.measured(sample_frames(frames))
     tracker = setup.tracker()
     recorder = TakeRecorder(tracker)

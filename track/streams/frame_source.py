@@ -19,7 +19,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.plausibility import check_place, check_unit
 from gloves.optics.identities import number_runs
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-from track.config import IntakeConfig
+from track.intake import FARTHEST
 from track.streams.frame_order import LATEST
 
 SILENCE: Final = 2.0
@@ -79,20 +79,19 @@ def capture_frames(capture: Capture) -> Iterator[StreamedFrame]:
         yield StreamedFrame(number, number / capture.rate, points[seen], ids[number, seen])
 
 
-def checked_frames(capture: Capture, farthest: float = IntakeConfig().farthest) -> list[StreamedFrame]:
-    """The frames of a capture whose points can be hands' markers.
+def checked_frames(capture: Capture) -> list[StreamedFrame]:
+    """The frames of a capture, if their points can be hands' markers.
 
     Args:
         capture: Positions (T, N, 3) [m].
-        farthest: Distance from the origin beyond which a point is left out [m].
 
     Raises:
         ArgumentError: The capture is not in meters.
-        CaptureError: Most of its points are farther away.
+        CaptureError: Most of its points are far from any room.
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
-    check_place(capture, farthest)
+    check_place(capture, FARTHEST)
     return frames
 
 
