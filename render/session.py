@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
 from handsim.app.executors.executor import Executor, executor_of
 from handsim.app.executors.output import FolderOutput, Make, Output, open_output
 from handsim.app.interrupts import Stopped
@@ -254,7 +253,7 @@ def _render_shard(
 
 
 def draw_frames(
-    take: Take | TrackedTake | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
+    take: Take | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
 ) -> Iterator[RenderedFrame]:
     """Some frames of a take, seen by all its cameras.
 

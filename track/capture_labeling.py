@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from gloves.captures.capture import Capture
 from gloves.captures.markers import labeled_capture, unlabeled_frames
 from gloves.optics.identities import number_runs
-from gloves.takes.tracked_take import LOST, TrackedTake
+from gloves.takes.take import Take
 from handsim.hand.topology import NUM_QPOS
 from track.calibration.hand_size import USUAL_SIZE
 from track.finder.frame_hands import HandFinder
@@ -26,7 +27,7 @@ def label_capture(
     *,
     labeler: AnyLabeler = None,
     progress: Callable[[int, int], None] | None = None,
-) -> TrackedTake:
+) -> Take:
     """Label the hands in every frame of a capture: none, one or two, as `handsim label` does.
 
     Labels alone: no pose is fitted, so that hands are lost in every frame. `track_capture` finds both.
@@ -68,33 +69,16 @@ def label_capture(
         first = np.where(one.sides > 0, firsts.get("right", -1), firsts.get("left", -1))
         row[there] = np.where((one.labels >= 0) & (first >= 0), first + one.labels, -1)
         sure[there] = one.confidence
-    shape = (source.num_frames, len(user))
-    markers = layout.num_markers
-    return TrackedTake(
-        rate=source.rate,
-        times=np.arange(source.num_frames) / source.rate,
-        hands=user.hands,
-        qpos=np.full((*shape, NUM_QPOS), np.nan),
-        status=np.full(shape, LOST, dtype=np.int8),
-        rms=np.full(shape, np.nan),
-        markers=np.full((*shape, markers, 3), np.nan),
-        filled=np.zeros((*shape, markers), dtype=bool),
-        points=source.positions,
-        ids=number_runs(present),
-        labels=labels,
-        confidence=confidence,
-        bodies=(),
-        body_poses=np.zeros((source.num_frames, 0, 7)),
-        body_status=np.zeros((source.num_frames, 0), dtype=np.int8),
-        body_rms=np.zeros((source.num_frames, 0)),
-        settings={
-            **({"capture": Path(capture).name} if isinstance(capture, str | Path) else {}),
-            "glove": str(glove) if isinstance(glove, str | Path) else layout.name,
-        },
+    settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    settings["glove"] = str(glove) if isinstance(glove, str | Path) else layout.name
+    no_poses, ids = np.full((source.num_frames, len(user), NUM_QPOS), np.nan), number_runs(present)
+    take = Take.of_truth(
+        user.hands, no_poses, source.positions, ids, labels, rate=source.rate, settings=settings
     )
+    return dataclasses.replace(take, confidence=confidence)
 
 
-def labeled_points(take: TrackedTake, *, sides: bool = True) -> Capture:
+def labeled_points(take: Take, *, sides: bool = True) -> Capture:
     """The labeled points of a take as a capture: one column per marker, then columns for the other points.
 
     Args:

@@ -1,4 +1,4 @@
-"""Tracking of a whole capture, frame by frame, and its result as a tracked take."""
+"""Tracking of a whole capture, frame by frame, and its result as a take."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from time import monotonic, sleep
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.optics.identities import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
-from gloves.takes.tracked_take import STATUSES, TrackedTake, label_names, usual_rate
+from gloves.takes.take import STATUSES, Take, label_names
 from handsim.errors import CaptureError, HandSimWarning
 from track.calibration.hand_size import sample_frames
 from track.config import TrackerConfig
@@ -31,8 +30,6 @@ from track.tracker import Tracker
 Progress = Callable[[int, int], None]
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
 
-_MISSING: Final = {"points": np.nan, "ids": -1, "labels": -1, "confidence": np.nan}
-"""The arrays with an entry per point, and what stands where there is no point."""
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
@@ -49,7 +46,7 @@ def track_capture(
     sinks: SinkGroup | None = None,
     progress: Progress | None = None,
     on_frame: OnFrame | None = None,
-) -> TrackedTake:
+) -> Take:
     """Track the hands of a capture, as `handsim track` does.
 
     Args:
@@ -116,7 +113,7 @@ def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tu
     return corrections
 
 
-def _corrected(take: TrackedTake, path: Path, corrections: Sequence[Correction]) -> TrackedTake:
+def _corrected(take: Take, path: Path, corrections: Sequence[Correction]) -> Take:
     """The take with its corrections; what does not fit is told."""
     corrected = correct_take(take, corrections)
     for sentence in told(path, corrected.unfitting):
@@ -152,8 +149,8 @@ class TakeRecorder:
         if not frame.silent:
             self._rows.append(frame_values(frame, tracked))
 
-    def take(self, capture: Capture | None = None) -> TrackedTake:
-        """The tracked take so far.
+    def take(self, capture: Capture | None = None) -> Take:
+        """The take so far.
 
         Args:
             capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
@@ -165,32 +162,13 @@ class TakeRecorder:
         rows = self._rows
         if not rows or (capture is None and len(rows) < 2):
             raise CaptureError(f"{len(rows)} frames came, expected two or more")
-        counts = np.array([len(row["points"]) for row in rows])
-        present = np.arange(counts.max(initial=0)) < counts[:, None]
-        if capture is not None:
-            present = np.isfinite(capture.positions[: len(rows), :, 0])
-        per_frame = {name: np.array([row[name] for row in rows]) for name in rows[0] if name not in _MISSING}
-        numbers = per_frame.pop("numbers")
-        return TrackedTake(
-            rate=usual_rate(per_frame["times"]) if capture is None else capture.rate,
-            hands=self._hands,
-            **per_frame,
-            **{
-                name: _spread(present, [row[name] for row in rows], missing)
-                for name, missing in _MISSING.items()
-            },
-            bodies=self._bodies,
-            settings={"tracker": dataclasses.asdict(self._config)},
-            numbers=numbers if capture is None else None,
-        )
+        settings = {"tracker": dataclasses.asdict(self._config)}
+        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=settings)
 
 
 def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
-    """A frame's entries of the arrays of a tracked take, by their names; those of points for its N points."""
+    """A frame's entries of the arrays of a take, by their names; those of points for its N points."""
     hands, bodies = tracked.hands, tracked.bodies
-    filled = np.zeros((len(hands), len(hands[0].markers)), dtype=bool)
-    for row, hand in zip(filled, hands, strict=True):
-        row[hand.filled] = True
     poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
     return {
         "times": np.array(frame.time),
@@ -198,8 +176,6 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "qpos": np.array([hand.qpos for hand in hands]),
         "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
         "rms": np.array([hand.rms for hand in hands]),
-        "markers": np.array([hand.markers for hand in hands]),
-        "filled": filled,
         "body_poses": np.array(poses).reshape(len(bodies), 7),
         "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
@@ -208,11 +184,3 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "labels": tracked.labels.astype(np.int16),
         "confidence": tracked.confidence,
     }
-
-
-def _spread(present: Bool[np.ndarray, "T N"], rows: list[NDArray[Any]], missing: float) -> NDArray[Any]:
-    """A table (T, N, ...) of the values of all frames' points, each in its column; `missing` elsewhere."""
-    values = np.concatenate(rows)
-    table = np.full(present.shape + values.shape[1:], missing, dtype=values.dtype)
-    table[present] = values
-    return table

@@ -7,15 +7,13 @@ from pathlib import Path
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from gloves.layout import MarkerLayout, load_layout
-from gloves.takes.motion import load_any_take
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
+from gloves.takes.take import Take, load_take
 from handsim.errors import WeightsError
 from track.bodies.rigid_body import RigidTemplate
 from train.glove_labeler import labeler_for_glove
 from train.labelers.protocol import Labeler
 
-AnyCapture = Capture | Take | TrackedTake | str | Path
+AnyCapture = Capture | Take | str | Path
 """A capture, or a take, of which only the points are used; or the path of one."""
 AnyGlove = MarkerLayout | str | Path
 AnyLabeler = Labeler | str | Path | None
@@ -35,14 +33,14 @@ def capture_of(capture: AnyCapture) -> Capture:
     return capture if isinstance(capture, Capture) else capture.capture()
 
 
-def read_points(path: str | Path) -> Capture | Take | TrackedTake:
+def read_points(path: str | Path) -> Capture | Take:
     """The capture or take of a file.
 
     Raises:
         CaptureError: The file is missing, damaged or of another kind.
     """
     if str(path).lower().endswith((".npz", ".npz.part")):
-        return load_any_take(Path(path))
+        return load_take(path)
     return read_capture(path)
 
 

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gloves.takes.tracked_take import TrackedTake
+from gloves.takes.take import Take
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.live_status import LiveStatus
 from track.capture_tracking import OnFrame
@@ -36,7 +36,7 @@ _LEFT_OUT: Final = {
 class LiveTake(NamedTuple):
     """What was recorded of a stream."""
 
-    take: TrackedTake
+    take: Take
     """The take; of a long stream, parts of it."""
     num_frames: int
     """Number of all frames."""

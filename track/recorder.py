@@ -12,15 +12,12 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
+from gloves.takes.columns import FRAMES, KEYPOINTS, NUMBERS
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
-from gloves.takes.tracked_take import (
-    KEYPOINTS,
-    KIND,
+from gloves.takes.take import (
     RATED_FRAMES,
-    SCHEMA,
-    TrackedTake,
+    Take,
     keypoints_of,
-    take_columns,
     take_header,
     unpack_take,
     usual_rate,
@@ -62,12 +59,12 @@ class Recorder:
         """The file of the recording."""
         self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
         self._settings = {"tracker": dataclasses.asdict(tracker.config), **settings}
-        markers = tracker.hands[0].layout.num_markers
+        sizes = {"H": len(self._hands), "B": len(self._bodies)}
         self._archive = GrowingArchive(
             self.part,
             self._header(None),
             worn_arrays(self._hands, self._bodies),
-            take_columns(len(self._hands), markers, len(self._bodies)),
+            [column.sized(sizes) for column in (*FRAMES, NUMBERS, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
         self._closed = False
@@ -94,7 +91,7 @@ class Recorder:
                 return
             values = frame_values(frame, tracked)
             keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
-            self._archive.add({**values, KEYPOINTS: keypoints}, len(frame.points))
+            self._archive.add({**values, KEYPOINTS.name: keypoints}, len(frame.points))
         except OSError as error:
             raise CaptureError(
                 f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "
@@ -109,7 +106,7 @@ class Recorder:
 
     def finish(
         self, stream: Mapping[str, int] | None = None, *, told: Callable[[], None] = lambda: None
-    ) -> tuple[TrackedTake, int]:
+    ) -> tuple[Take, int]:
         """Write the take and remove the recording; without at least two frames, remove it only.
 
         Args:
@@ -144,8 +141,7 @@ class Recorder:
         return take, step
 
     def _header(self, rate: float | None) -> dict[str, Any]:
-        header = take_header(self._hands, self._bodies, rate, self._settings)
-        return {"kind": KIND, "schema": SCHEMA, **header}
+        return take_header(self._hands, self._bodies, rate, self._settings)
 
     def __enter__(self) -> Self:
         return self

@@ -11,7 +11,7 @@ import tyro
 from jaxtyping import Bool
 
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-from gloves.takes.tracked_take import TrackedTake
+from gloves.takes.take import Take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
@@ -63,7 +63,7 @@ def label(
         warnings.warn(told, HandSimWarning, stacklevel=2)
 
 
-def _hands_there(take: TrackedTake) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
+def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
     """In which frames there is a right hand, and a left one."""
     side_of = np.array([name.split(":")[0] for name in take.label_names])
     labeled = take.labels >= 0

@@ -13,8 +13,7 @@ from rich.console import Console
 
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.takes.corrections import corrections_path
-from gloves.takes.take import SUFFIX
-from gloves.takes.tracked_take import load_tracked_take
+from gloves.takes.take import SUFFIX, load_take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.cli.options import chosen_hands
@@ -95,7 +94,7 @@ def track(
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
     if labeled is not None:
-        write_capture(labeled, labeled_points(tracked.take if tracked.is_whole else load_tracked_take(out)))
+        write_capture(labeled, labeled_points(tracked.take if tracked.is_whole else load_take(out)))
     _tell(out, tracked, float(np.median(times)))
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.distance import cdist
 
 from gloves.fit import GloveFit, attach
-from gloves.takes.tracked_take import INITIALIZED, TRACKED, TrackedTake
+from gloves.takes.take import INITIALIZED, TRACKED, Take
 from handsim.errors import HandSimWarning
 from handsim.hand.topology import Side
 from track.calibration.frames import CalibrationError
@@ -106,14 +106,12 @@ def _untold(what: str, done: int, total: int) -> None:
 
 def _label(
     source: AnyCapture, known: Sequence[GloveFit], labeler: Labeler, told: CalibrationProgress
-) -> TrackedTake:
+) -> Take:
     """The capture with labels, by the hands that are known so far."""
     return track_capture(source, hands=known, labeler=labeler, progress=partial(told, "frames"))
 
 
-def _calibrate(
-    take: TrackedTake, start: Sequence[GloveFit], told: CalibrationProgress
-) -> tuple[Calibration, ...]:
+def _calibrate(take: Take, start: Sequence[GloveFit], told: CalibrationProgress) -> tuple[Calibration, ...]:
     """The hands that are in a take, calibrated."""
     shown = [side for side in take.sides if _reliable(take, side).mean() > _SHOWN]
     if not shown:
@@ -129,7 +127,7 @@ def _calibrate(
 
 
 def _checked(
-    take: TrackedTake, done: Calibration, before: Sequence[GloveFit], told: CalibrationProgress
+    take: Take, done: Calibration, before: Sequence[GloveFit], told: CalibrationProgress
 ) -> Calibration:
     """A calibration with how it does on held-out frames; a warning says if that is no better than before."""
     side = done.hand.side
@@ -173,27 +171,28 @@ def _held_out(
     return HeldOut(rms[0], rms[1], len(frames))
 
 
-def _markers(take: TrackedTake, side: Side) -> Float[np.ndarray, "T M 3"]:
+def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:
     """The reliably labeled markers of a hand [m]; NaN for the others."""
     markers = take.observed(side)
     markers[~_reliable(take, side)] = np.nan
     return markers
 
 
-def _reliable(take: TrackedTake, side: Side) -> Bool[np.ndarray, "T"]:
+def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
     """Frames whose labels are reliable."""
     reliable: Bool[np.ndarray, "T"] = np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))
     return reliable
 
 
-def _leaves_markers(take: TrackedTake, done: Sequence[Calibration]) -> bool:
+def _leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
     """Whether too many missing markers had an unlabeled point nearby."""
     left, total = 0, 0
     for one in done:
-        hand = take.hand(one.hand.side)
-        total += take.filled[:, hand].size
-        for frame in np.flatnonzero(take.filled[:, hand].any(axis=1) & _reliable(take, one.hand.side)):
+        side = one.hand.side
+        filled, markers = take.filled(side), take.markers(side)
+        total += filled.size
+        for frame in np.flatnonzero(filled.any(axis=1) & _reliable(take, side)):
             free = take.points[frame, take.labels[frame] < 0]
-            expected = take.markers[frame, hand, take.filled[frame, hand]]
+            expected = markers[frame, filled[frame]]
             left += int((cdist(expected, free[np.isfinite(free[:, 0])]) < _NEAR).any(axis=1).sum())
     return left > _LEFT_OVER * total
