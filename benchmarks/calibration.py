@@ -29,9 +29,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.people import right_hands
+from benchmarks.record import describe
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, load_layout

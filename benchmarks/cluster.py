@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from handsim.app.executors.dask_cluster import DaskCluster
 from handsim.app.executors.executor import Executor, Processes
 from render.config import RenderConfig

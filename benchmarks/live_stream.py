@@ -26,8 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
 from benchmarks.paper.take_evaluation import true_users
+from benchmarks.record import describe
 from gloves.takes.growing import GrownArchive
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import load_tracked_take

@@ -28,7 +28,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from handsim.app.workers import in_processes
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig

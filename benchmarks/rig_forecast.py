@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.captures.gaps import run_lengths
 from gloves.layout import load_layout
 from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, look_at, named_rig, save_rig

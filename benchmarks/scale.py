@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from handsim.app.executors.dask_cluster import DaskCluster
 from render.config import RenderConfig
 from render.session import render_take

@@ -14,7 +14,7 @@ import itertools
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.takes.take import Take
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel

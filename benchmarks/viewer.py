@@ -15,7 +15,7 @@ import numpy as np
 import viser
 from websockets.sync.client import ClientConnection, connect
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.takes.tracked_take import load_tracked_take
 from track.viewer.recordings.takes import TrackedRecording
 from track.viewer.scene.frame_view import FrameView
