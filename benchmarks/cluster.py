@@ -26,10 +26,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from machine import describe
-
 from handsim.app.executors.dask_cluster import DaskCluster
 from handsim.app.executors.executor import Executor, Processes
+from machine import describe
+
 from render.config import RenderConfig
 from render.session import render_take
 from train.simulation.dataset_config import DatasetConfig

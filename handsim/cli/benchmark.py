@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 import tyro
 from rich.console import Console
 
-from handsim.app.executors.executor import choose_executor
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimWarning
@@ -41,11 +41,14 @@ def make(
         cluster: Where else to simulate captures: tcp://host:port of a Dask scheduler, its file (.json), or
             local; docs/cluster.md.
     """
-    with progress_bar("frames") as (bar, task):
+    with (
+        progress_bar("frames") as (bar, task),
+        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+    ):
         benchmark = make_benchmark(
             SIZES[size],
             out,
-            workers=choose_executor(cluster, workers, out, print_above(bar)),
+            workers=chosen,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     frames = sum(one.num_frames for one in benchmark.captures)

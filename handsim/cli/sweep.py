@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from handsim.app.executors.executor import choose_executor
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimWarning
@@ -43,11 +43,14 @@ def sweep(
     from track.evaluation.sweep.running import run_sweep
 
     check_outputs((file, *asked.gloves, *asked.rigs), [out / TABLE, out / PAGE])
-    with progress_bar("steps") as (bar, task):
+    with (
+        progress_bar("steps") as (bar, task),
+        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+    ):
         rows = run_sweep(
             asked,
             out,
-            workers=choose_executor(cluster, workers, out, print_above(bar)),
+            workers=chosen,
             progress=lambda what, done, total: bar.update(
                 task, description=what, completed=done, total=total
             ),

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import shutil
 from collections.abc import Callable
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -18,8 +19,8 @@ from gloves.captures.markers import UNLABELED
 from gloves.fit import GloveFit
 from gloves.layout import load_layout, save_layout
 from gloves.takes.take import Take
-from handsim.app.executors.executor import Executor, executor_of
 from handsim.app.interrupts import Stopped
+from handsim.app.workers import run_jobs
 from handsim.files.atomic import atomic_write, remove_leftovers
 from handsim.files.disk import check_free
 from handsim.files.json_files import claim
@@ -63,20 +64,20 @@ def make_benchmark(
     Args:
         plan: Which captures.
         out: Folder to make it in.
-        workers: Processes, all cores when not given; or who else makes the captures.
+        workers: Number of processes, all cores when not given; or an executor.
         progress: Called after every capture.
 
     Raises:
         BenchmarkError: `out` holds something else, or its disk is too small.
     """
-    executor, captures = executor_of(workers), plan.captures
+    captures = plan.captures
     total = sum(one.num_frames for one in captures)
     check_free(out, _BYTES_PER_FRAME * total, f"{total} frames", "ask for --size small", error=BenchmarkError)
     claim(out / PLAN, _settings(plan), noun="benchmark", error=BenchmarkError, result=out / MANIFEST)
     todo = [number for number, one in enumerate(captures) if not _finished(out, one)]
     done = total - sum(captures[number].num_frames for number in todo)
     try:
-        for number in executor.run(functools.partial(make_capture, plan, out), todo):
+        for number in run_jobs(functools.partial(make_capture, plan, out), todo, workers):
             done += captures[number].num_frames
             if progress is not None:
                 progress(done, total)
