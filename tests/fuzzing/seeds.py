@@ -219,12 +219,6 @@ def settings(folder: Path) -> list[Path]:
     return [folder / "config.json"]
 
 
-def receipt(folder: Path) -> list[Path]:
-    files = {f"rows-{number:05d}.npy": {"bytes": 5 * number, "sha256": "ab" * 32} for number in range(3)}
-    (folder / "00000.json").write_text(json.dumps({"files": files}))
-    return [folder / "00000.json"]
-
-
 def packets(folder: Path) -> list[Path]:
     rng = _rng()
     frame = MarkerFrame(7, 1.25, rng.uniform(size=(9, 3)), np.array([*range(8), -1]))

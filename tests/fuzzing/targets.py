@@ -18,7 +18,6 @@ from gloves.layout import load_layout
 from gloves.takes.corrections import load_corrections
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import load_tracked_take
-from handsim.app.executors.output import load_receipt
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
 from handsim.space.cameras import load_rig
@@ -130,7 +129,6 @@ _ALL: Final = (
     Target("dataset", seeds.dataset, _read_dataset),
     Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_archive),
     Target("settings", seeds.settings, _read_settings),
-    Target("receipt", seeds.receipt, load_receipt),
     Target("packet", seeds.packets, _read_packet, refusals=(DamagedPacket,)),
     Target("photo", seeds.photos, _read_photo),
 )
