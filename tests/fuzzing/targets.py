@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from handsim.space.rig_formats.rig_of_cameras import marker_cameras, rig_of_cameras
 
 from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
@@ -24,7 +25,6 @@ from handsim.files.json_files import claim, load_json
 from handsim.space.cameras import load_rig
 from handsim.space.objects import load_object
 from handsim.space.rig_formats.any_file import load_cameras, load_lab_cameras
-from handsim.space.rig_formats.rig_of_cameras import marker_cameras, rig_of_cameras
 from render.own_poses import PoseFile, load_poses
 from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds

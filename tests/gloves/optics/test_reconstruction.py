@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from gloves.optics.identities import number_runs, pack_columns
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.errors import ArgumentError
-from handsim.space.cameras import CameraRig, look_at, named_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import CameraRig, named_rig
 
 STILL = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0)
 RIG = named_rig("figure5")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from handsim.space.camera_file import read_camera_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from handsim.errors import RigError
-from handsim.space.camera_file import read_camera_file
-from handsim.space.cameras import load_rig, look_at, named_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import load_rig, named_rig
 
 TWO = """
 name = "desk"

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population, sample_shape
+from handsim.space.camera import look_at
 from handsim.space.cameras import (
     HAND_REACH,
     CameraRig,
@@ -25,7 +26,6 @@ from handsim.space.cameras import (
     check_outside_volume,
     list_rigs,
     load_rig,
-    look_at,
     named_rig,
     save_rig,
 )

@@ -6,11 +6,11 @@ import itertools
 
 import numpy as np
 import pytest
+from train.rig_advice.candidate_views import view_candidates
 
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
 from handsim.space.cameras import ROOM_CENTER, CameraRig, named_rig
-from train.rig_advice.candidate_views import view_candidates
 from train.rig_advice.forecast import light
 from train.rig_advice.plan import LensKind, plan
 from train.rig_advice.planning import Planning

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from train.rig_advice.point_error import covariances, ellipsoid
 
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
-from handsim.space.cameras import CameraRig, look_at, named_rig
-from train.rig_advice.point_error import covariances, ellipsoid
+from handsim.space.camera import look_at
+from handsim.space.cameras import CameraRig, named_rig
 
 
 @pytest.mark.parametrize("name", ["six", "figure5"])

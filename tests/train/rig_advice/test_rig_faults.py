@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim.space.cameras import CameraRig, list_rigs, look_at, named_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import CameraRig, list_rigs, named_rig
 from train.rig_advice.rig_faults import faults, working_point
 
 

@@ -19,7 +19,8 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.motion import BodyMotion
-from handsim.space.cameras import CameraRig, look_at, named_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import CameraRig, named_rig
 from handsim.space.objects import RigidObject, named_object
 from poses.motion.motions import sample_motion
 from train.simulation.light_sources import sample_light_sources

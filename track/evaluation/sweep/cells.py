@@ -19,14 +19,14 @@ from typing import Any, Final, Literal
 from gloves.layout import load_layout
 from handsim.errors import HandSimError
 from handsim.files.toml_settings import settings_of
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import CameraRig, rig_setting
 from track.config import TrackerConfig
 from track.evaluation.sweep.sweep_file import Sweep
 from train.config import TrainConfig
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.takes import TakeConfig
 
-_Content = Callable[[str, str], dict[str, Any]]
+_Content = Callable[[str, CameraRig | str], dict[str, Any]]
 _MOST_CELLS: Final = 10_000
 _DIGEST: Final = 10  # hexadecimal digits: some millions of steps do not collide
 
@@ -152,12 +152,11 @@ def _measure_step(
     return MeasureStep(_name(capture.glove, settings), capture, track, labeler)
 
 
-def _content(glove: str, rig: str) -> dict[str, Any]:
+def _content(glove: str, rig: CameraRig | str) -> dict[str, Any]:
     """What a glove and a rig are, whose files may change."""
-    cameras = load_rig(rig)
     return {
         "layout": dataclasses.asdict(load_layout(glove)),
-        "cameras": [cameras.T_world_camera.tolist(), cameras.field_of_view],
+        "rig": rig_setting(rig),
     }
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from handsim.space.rig_formats.rig_of_cameras import rig_of_cameras
 
 from handsim.errors import HandSimWarning, RigError
 from handsim.space.rig_formats.any_file import load_cameras, load_lab_cameras
-from handsim.space.rig_formats.rig_of_cameras import rig_of_cameras
 from tests.handsim.space.rig_formats.known_rig import (
     MCAL,
     PIXELS,

@@ -6,18 +6,17 @@ import warnings
 
 import numpy as np
 import pytest
-
-from handsim.errors import HandSimWarning, RigError
-from handsim.space.camera import Camera, pinhole
-from handsim.space.cameras import look_at
-from handsim.space.lens import Lens
-from handsim.space.rig_formats.lab_camera import LabCamera
 from handsim.space.rig_formats.rig_of_cameras import (
     corner_distortion,
     field_of_view,
     marker_cameras,
     rig_of_cameras,
 )
+
+from handsim.errors import HandSimWarning, RigError
+from handsim.space.camera import Camera, look_at, pinhole
+from handsim.space.lens import Lens
+from handsim.space.rig_formats.lab_camera import LabCamera
 
 MIDDLE = np.array([0.0, 0.0, 1.1])
 
