@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from handsim.space.rig_formats.rig_of_cameras import marker_cameras, rig_of_cameras
 
 from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
@@ -22,9 +21,9 @@ from gloves.takes.tracked_take import load_tracked_take
 from handsim.app.executors.output import load_receipt
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
-from handsim.space.rig_formats.any_file import load_cameras, load_lab_cameras
+from handsim.space.rig_formats.any_file import import_cameras, load_cameras
 from render.own_poses import PoseFile, load_poses
 from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
@@ -110,7 +109,7 @@ def _read_checkpoint(path: Path) -> None:
 def _read_calibration(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
-        rig_of_cameras(path, marker_cameras(path, load_lab_cameras(path)))
+        CameraRig("lab", import_cameras(path))
 
 
 def _read_sweep(path: Path) -> None:

@@ -6,12 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from train.rig_advice.rig_sentences import sentences
 
 from handsim.space.cameras import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import CameraLoss
 from train.rig_advice.rig_page import camera_table, work_table, write_rig_page
-from train.rig_advice.rig_score import score_rig
+from train.rig_advice.rig_score import score_rig, sentences
 
 
 @pytest.fixture(scope="module")
