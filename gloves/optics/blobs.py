@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from handsim.kernels.kernel import kernel
-from handsim.space.lens import distort_jacobian
+from handsim.space.lens import PINHOLE, distort_jacobian
 
 MARKER_RADIUS: Final = 0.0032
 """Radius of the spheres of Han et al. 2018 (section 3) [m]: of markers on objects, and of strays."""
@@ -56,7 +56,7 @@ def draw_blobs(
             down = pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z
             noise = optics[0] * np.sqrt(MARKER_RADIUS / sizes[s])
             du, dv = noise * rng.standard_normal(), noise * rng.standard_normal()
-            if lens[0] != 0.0:
+            if lens[0] != PINHOLE:
                 xx, xy, yx, yy = distort_jacobian(lens, right, down, depth)
                 determinant = xx * yy - xy * yx
                 if not determinant > _BLIND:  # also where the lens does not see: NaN

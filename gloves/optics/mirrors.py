@@ -92,7 +92,9 @@ def _over_patch(
                     ahead -= line * normal[i]
                     for k in range(3):
                         local[k] += line * pose[i, k]
-                if ahead <= behind or not in_picture(cameras, c, local[0], local[1], local[2]):
+                if ahead <= behind or not in_picture(
+                    cameras.intrinsics[c], cameras.sizes[c], cameras.lenses[c], local[0], local[1], local[2]
+                ):
                     continue
                 for i in range(3):
                     hit[i] = images[t, p, i] + behind / ahead * (camera[i] - images[t, p, i])

@@ -105,16 +105,17 @@ def _facing(markers: Any, normals: Any, cameras: Any, facing: float) -> Any:
     """
     frames, count = markers.shape[:2]
     seen = np.empty((frames, count, len(cameras.sizes)), dtype=np.bool_)
-    for t in range(frames):
-        for m in range(count):
-            marker, normal = markers[t, m], normals[t, m]
-            for c in range(len(cameras.sizes)):
-                pose = cameras.T_world_camera[c]
+    for c in range(len(cameras.sizes)):
+        pose, inner = cameras.T_world_camera[c], cameras.intrinsics[c]
+        size, lens = cameras.sizes[c], cameras.lenses[c]
+        for t in range(frames):
+            for m in range(count):
+                marker, normal = markers[t, m], normals[t, m]
                 x, y, z = marker[0] - pose[0, 3], marker[1] - pose[1, 3], marker[2] - pose[2, 3]
                 distance = np.sqrt(x * x + y * y + z * z)
                 ahead = -(x * normal[0] + y * normal[1] + z * normal[2])
-                seen[t, m, c] = ahead > facing * distance and in_picture(
-                    cameras, c,
+                seen[t, m, c] = (ahead > facing * distance) & in_picture(
+                    inner, size, lens,
                     x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0],
                     x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1],
                     x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2],

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, choices
 from handsim.kernels.kernel import kernel
-from handsim.space.lens import Lens, distort_ray
+from handsim.space.lens import PINHOLE, Lens, distort_ray
 
 _LARGEST: Final = 8192  # [px]
 _NEAREST: Final = 1e-6  # [m] ahead of a camera, from which on it sees
@@ -207,25 +207,35 @@ def points_in_view(
     return seen
 
 
-@kernel
-def in_picture(cameras: Any, c: int, x: float, y: float, z: float) -> bool:
-    """Whether camera c of `CameraArrays` has a point, in its own axes [m], in its picture."""
-    if not z > _NEAREST:  # also where there is no point: NaN
-        return False
-    u, v = distort_ray(cameras.lenses[c], x, y, z)
-    inner, size = cameras.intrinsics[c], cameras.sizes[c]
+@kernel(inline=True)
+def in_picture(inner: Any, size: Any, lens: Any, x: float, y: float, z: float) -> bool:
+    """Whether a camera has a point in its picture.
+
+    Args:
+        inner: Its row of `CameraArrays.intrinsics`.
+        size: Its row of `CameraArrays.sizes`.
+        lens: Its row of `CameraArrays.lenses`.
+        x: Of the point in the camera's axes [m], right.
+        y: Down.
+        z: Ahead.
+    """
+    u, v = x / z, y / z
+    if lens[0] != PINHOLE:  # the call costs more than all the rest
+        u, v = distort_ray(lens, x, y, z)
     u, v = u * inner[0] + inner[2], v * inner[1] + inner[3]
-    return bool(u >= 0.0 and u < size[0] and v >= 0.0 and v < size[1])
+    inside = (u >= 0.0) & (u < size[0]) & (v >= 0.0) & (v < size[1])  # never so for NaN
+    return bool((z > _NEAREST) & inside)
 
 
 @kernel
 def _points_in_view(cameras: Any, points: Any, seen: Any) -> None:
     for c in range(len(cameras.sizes)):
-        pose = cameras.T_world_camera[c]
+        pose, inner = cameras.T_world_camera[c], cameras.intrinsics[c]
+        size, lens = cameras.sizes[c], cameras.lenses[c]
         for n in range(len(points)):
             x, y, z = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
             seen[n, c] = in_picture(
-                cameras, c,
+                inner, size, lens,
                 pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z,
                 pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z,
                 pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z,

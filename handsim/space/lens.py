@@ -19,7 +19,9 @@ from handsim.kernels.kernel import kernel
 
 LensKind = Literal["pinhole", "brown", "fisheye"]
 _COEFFICIENTS: Final[dict[str, int]] = {"pinhole": 0, "brown": 5, "fisheye": 4}
-_PINHOLE, _BROWN, _FISHEYE = range(3)  # the kinds in the kernels
+PINHOLE: Final = 0
+"""The kind of a pinhole in `Lens.row`; a Brown lens is 1."""
+_FISHEYE: Final = 2
 _STEP: Final = 1e-5  # [focal lengths] of the central differences of a Jacobian
 _NODES: Final = 1024  # of the table that starts the search
 _STEPS: Final = 12  # of Newton's method; three are enough away from a fold
@@ -210,7 +212,7 @@ def distort_ray(lens: Any, x: float, y: float, z: float) -> tuple[float, float]:
     if not z > 0.0:
         return np.nan, np.nan
     u, v = x / z, y / z
-    if lens[0] == _PINHOLE:
+    if lens[0] == PINHOLE:
         return u, v
     square = u * u + v * v
     if not square <= lens[6] * lens[6]:
@@ -226,7 +228,7 @@ def distort_ray(lens: Any, x: float, y: float, z: float) -> tuple[float, float]:
 @kernel
 def distort_jacobian(lens: Any, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """Derivatives of one ray's image point by x/z and y/z, row by row; see `distort_ray`."""
-    if lens[0] == _PINHOLE:
+    if lens[0] == PINHOLE:
         return 1.0, 0.0, 0.0, 1.0
     if not z > 0.0:
         return np.nan, np.nan, np.nan, np.nan
