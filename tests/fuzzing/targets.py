@@ -20,10 +20,9 @@ from gloves.takes.take import load_take
 from gloves.takes.tracked_take import load_tracked_take
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
-from handsim.space.rig_formats.any_file import load_cameras, load_lab_cameras
-from handsim.space.rig_formats.rig_of_cameras import marker_cameras, rig_of_cameras
+from handsim.space.rig_formats.any_file import import_cameras, load_cameras
 from render.own_poses import PoseFile, load_poses
 from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
@@ -105,7 +104,7 @@ def _read_checkpoint(path: Path) -> None:
 def _read_calibration(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
-        rig_of_cameras(path, marker_cameras(path, load_lab_cameras(path)))
+        CameraRig("lab", import_cameras(path))
 
 
 _ALL: Final = (

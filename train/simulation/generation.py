@@ -23,7 +23,7 @@ from handsim.files.json_files import load_json, save_json
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES
-from handsim.space.cameras import ROOM_CENTER, CameraRig, check_outside_volume, list_rigs, load_rig
+from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, rig_setting
 from poses.shapes.sampling import load_sampler
 from train.data.shards import (
     CONFIG,
@@ -76,7 +76,7 @@ def generate_dataset(
         ArgumentError: The rig is unknown or stands in the hands' way, or no hand of the population can rest.
     """
     place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
-    layout, rig = load_layout(config.glove), load_rig(config.rig)
+    layout, rig = load_layout(config.glove), as_rig(config.rig)
     check_outside_volume(rig, np.array(ROOM_CENTER), config.volume)
     if config.min_cameras > len(rig.positions):
         raise DatasetError(
@@ -103,14 +103,13 @@ def generate_dataset(
 def _settings(config: DatasetConfig, layout: MarkerLayout, rig: CameraRig) -> dict[str, Any]:
     """What decides the bytes of a set, as JSON."""
     known = dataclasses.replace(config, optics=config.optics.worn(layout.radius))
-    settings = {**dataclasses.asdict(known), "layout": dataclasses.asdict(layout)}
+    settings = {
+        **dataclasses.asdict(known),
+        "rig": rig_setting(rig),
+        "layout": dataclasses.asdict(layout),
+    }
     if config.sampler is None:
         del settings["sampler"]
-    if config.rig not in list_rigs():  # a file may change
-        settings["cameras"] = {
-            "T_world_camera": rig.T_world_camera.tolist(),
-            "field_of_view": rig.field_of_view,
-        }
     return settings
 
 
@@ -181,7 +180,7 @@ def _shard_size(config: DatasetConfig, shard: int) -> int:
 def make_shard(config: DatasetConfig, out: Path, shard: int) -> int:
     """Write one shard's hands, counts of redraws and rows; they depend on its number and the seed alone."""
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(shard,)))
-    layout, rig = load_layout(config.glove), load_rig(config.rig)
+    layout, rig = load_layout(config.glove), as_rig(config.rig)
     size = _shard_size(config, shard)
     rows = np.zeros(size, dtype=row_dtype(layout.num_markers))
     people = -(-size // config.frames_per_hand)

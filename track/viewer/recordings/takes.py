@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import COASTING, LOST, STATUSES, TrackedTake
-from handsim.space.cameras import CameraRig, list_rigs, named_rig
+from handsim.space.cameras import CameraRig, as_rig, list_rigs
 from handsim.space.objects import named_object, object_names
 from handsim.space.transforms import rotation_quaternions
 from track.viewer.recordings.recording import Curve, Doubt, Recording, ShownBody, ShownFrame, runs_of
@@ -132,7 +132,7 @@ class TruthRecording(Recording):
 
     Args:
         take: The take.
-        rig: The cameras; those that the take names, if they come with handsim, when None.
+        rig: The cameras; those of the take, if it names shipped ones or holds its own, when None.
     """
 
     def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
@@ -151,7 +151,7 @@ class TruthRecording(Recording):
             most_points=int(np.isfinite(take.points[..., 0]).sum(axis=1).max(initial=0)),
             radius=take.hands[0].layout.radius if take.hands else 0.0035,
             bodies=bodies,
-            rig=shipped_rig(take.settings.get("rig")) if rig is None else rig,
+            rig=rig_of_settings(take.settings.get("rig")) if rig is None else rig,
             has_filled=False,
         )
 
@@ -180,9 +180,9 @@ def shown_body(name: str) -> ShownBody:
     return ShownBody(name, obj.vertices, obj.faces)
 
 
-def shipped_rig(name: object) -> CameraRig | None:
-    """A rig that comes with handsim; None for any other: a file's settings are no path to follow."""
-    return named_rig(name) if isinstance(name, str) and name in list_rigs() else None
+def rig_of_settings(rig: object) -> CameraRig | None:
+    """The rig that settings name or hold; None for a path, which is none to follow."""
+    return as_rig(rig) if isinstance(rig, dict) or rig in list_rigs() else None
 
 
 def poses_of(transforms: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float64]:
