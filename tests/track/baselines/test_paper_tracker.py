@@ -150,7 +150,7 @@ def test_markers_that_come_back_elsewhere_are_for_the_labeler(silent, users, sti
     tracker = settled(users, labeler, still)
     labeler.silent = silent
     seen = seen_frame(still, 0)
-    bent = still.hands[0].qpos[:1].copy()
+    bent = still.qpos[:1, 0].copy()
     bent[0, 7 + JOINT_NAMES.index("index_MCP_flexion")] += 0.6
     model, glove = users[0].model, users[0].attachment
     places = glove.centers(model, model.forward_kinematics(bent))[0]

@@ -49,7 +49,9 @@ def test_a_hand_that_is_not_there(tracked):
 def test_markers_that_were_not_seen_and_markers_off_the_pose(tracked):
     rms, first = tracked.rms.copy(), (tracked.labels >= 0) & (tracked.labels < 10)
     rms[:, 1] = 0.0061
-    told = suspicions(dataclasses.replace(tracked, labels=np.where(first, -1, tracked.labels), rms=rms))
+    labels, points = tracked.labels.copy(), tracked.points.copy()
+    labels[first], points[first] = -1, np.nan
+    told = suspicions(dataclasses.replace(tracked, labels=labels, points=points, rms=rms))
     assert [sentence.split(";")[0] for sentence in told] == [
         f"52.6 % of the {tracked.sides[0]} hand's markers were not seen and are filled in from its pose",
         f"the {tracked.sides[1]} hand's markers are 6.1 mm off its pose",
