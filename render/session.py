@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
 from handsim.app.interrupts import Stopped
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
@@ -255,7 +254,7 @@ def _render_shard(
 
 
 def draw_frames(
-    take: Take | TrackedTake | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
+    take: Take | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
 ) -> Iterator[RenderedFrame]:
     """Some frames of a take, seen by all its cameras.
 
