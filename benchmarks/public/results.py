@@ -30,6 +30,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from gloves.captures.markers import UNLABELED
 from gloves.captures.motive_csv import MOTIVE_BEGIN
+from gloves.takes.take import load_take
 from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular, read_bytes
 
