@@ -4,7 +4,7 @@ A simulated capture of two hands is replayed at 120 Hz by a process of its own, 
 clients, which are processes of their own. In the middle the server is restarted, with another data port.
 The latency that is added to the tracker's own time is from the server's `sendto` to the client's `recv`.
 
-python benchmarks/live_output.py [--seconds 600]
+python -m benchmarks.live_output [--seconds 600]
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from machine import describe
 from pythonosc.osc_bundle import OscBundle
 from websockets.sync.client import connect
 
+from benchmarks.paper.take_evaluation import true_users
+from benchmarks.record import describe
 from gloves.takes.take import Take
-from track.evaluation.take_evaluation import true_users
 from track.setup import warm_up
 from track.sinks.addresses import open_sinks
 from track.streams import natnet

@@ -9,7 +9,6 @@ import numpy as np
 from handsim.app.page import Section
 from handsim.cli.demo_run import GLOVE, DemoRun
 from track.capture_tracking import track_capture
-from track.evaluation.take_evaluation import true_users
 from train.simulation.takes import TakeConfig, simulate_take
 
 _FRAMES: Final = 120
@@ -19,7 +18,7 @@ def track_take(run: DemoRun) -> Section:
     """Track a simulated capture and say how far its joints are off."""
     run.report("tracking a simulated capture")
     take = simulate_take(TakeConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
-    tracked = track_capture(take, hands=true_users(take), labeler=GLOVE)
+    tracked = track_capture(take, hands=take.hands, labeler=GLOVE)
     tracked.save(run.tracked_take)
     errors = []
     for number, hand in enumerate(take.hands):

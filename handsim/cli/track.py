@@ -23,11 +23,11 @@ from handsim.hand.topology import Side
 from track.capture_labeling import labeled_points
 from track.capture_tracking import OnFrame, track_capture
 from track.config import TrackerConfig
-from track.evaluation.take_summary import summarize, suspicions
 from track.live import LiveTake, track_live
 from track.setup import AnyHands, Size, TrackerSetup, warm_up
 from track.sinks.addresses import SinkGroup, open_sinks
 from track.streams.frame_source import StreamedFrame
+from track.take_summary import summarize, suspicions
 from track.tracked_frame import TrackedFrame
 
 _TIMED: Final = 100_000  # frames whose computing time is kept

@@ -18,6 +18,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.paper.hand_errors import hand_errors
 from gloves.attachment import wear
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
@@ -33,7 +34,6 @@ from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from track.bodies.body_file import load_body
 from track.capture_tracking import track_capture
-from track.evaluation.hand_errors import hand_errors
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
 from track.user import load_user

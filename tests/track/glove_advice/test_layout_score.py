@@ -39,7 +39,7 @@ def test_joints_are_known_less_without_a_marker(tips, tips_score):
 
 def test_a_blind_rig_sees_fewer_markers(tips):
     rig = load_rig("six")
-    pair = dataclasses.replace(rig, T_world_camera=rig.T_world_camera[:2])
+    pair = dataclasses.replace(rig, cameras=rig.cameras[:2])
     shares = [
         np.isfinite(
             np.concatenate(

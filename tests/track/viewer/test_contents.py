@@ -16,6 +16,7 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import named_rig
+from tests.rigs import mixed_rig
 from track.user import User
 from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings.captures import CaptureRecording
@@ -131,8 +132,10 @@ def test_a_training_set_shows_its_rows_and_who_sees_them(training_set):
             assert row["cameras"][number] >> eye & 1
 
 
-def test_a_rig_of_a_take_is_shown_only_if_it_is_shipped(simulated):
+def test_a_rig_of_a_take_is_shown_if_it_is_shipped_or_in_the_take(simulated):
     assert TakeRecording(simulated).rig.name == "six"
+    own = dataclasses.replace(simulated, settings={"rig": mixed_rig().record()})
+    assert TakeRecording(own).rig == mixed_rig()
     for name in ("/etc/passwd", 3, None):
         assert TakeRecording(dataclasses.replace(simulated, settings={"rig": name})).rig is None
 

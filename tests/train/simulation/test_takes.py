@@ -12,15 +12,16 @@ import pytest
 from gloves.captures.gaps import count_gaps
 from gloves.layout import load_layout, save_layout
 from gloves.optics.reconstruction import OpticsConfig
-from gloves.takes.take import Take
+from gloves.takes.take import Take, load_take
 from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
-from handsim.space.cameras import ROOM_CENTER
+from handsim.space.cameras import ROOM_CENTER, as_rig, named_rig, save_rig
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.object_motion import object_penetration
 from poses.shapes.couplings import HIGH, LOW
+from tests.rigs import mixed_rig
 from train.simulation import takes
 from train.simulation.motion import RATE
 from train.simulation.room_settings import KINDS, TWINS, OpticsOptions
@@ -107,6 +108,24 @@ def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
     for name in ("points", "ids", "labels"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert first.hand_labels == (range(13), range(13, 26))
+
+
+def test_a_rig_of_ones_own_is_kept_in_the_take_with_its_cameras(tmp_path):
+    rig = mixed_rig()
+    save_rig(tmp_path / "mixed.toml", rig)
+    takes = []
+    for given in (rig, str(tmp_path / "mixed.toml")):
+        take = simulate_take(TakeConfig(num_frames=40, rig=given))
+        take.save(tmp_path / "take.truth.npz")
+        takes.append(load_take(tmp_path / "take.truth.npz"))
+        assert as_rig(takes[-1].settings["rig"]) == rig
+    np.testing.assert_array_equal(takes[0].points, takes[1].points)
+    assert takes[0].markers_present().mean() > 0.4
+    six = simulate_take(TakeConfig(num_frames=40, rig=named_rig("six")))
+    assert six.settings["rig"] == "six"
+    np.testing.assert_array_equal(six.points, simulate_take(TakeConfig(num_frames=40, rig="six")).points)
+    with pytest.raises(ArgumentError, match="a rig is int, expected a CameraRig"):
+        simulate_take(TakeConfig(num_frames=40, rig=3))
 
 
 def thick_glove(folder: Path, radius_mm: float) -> str:
@@ -218,7 +237,7 @@ def test_calibration_has_touches_and_free_motion_of_both_hands():
     assert take.num_frames > 45 * RATE, "40 s of free motion after the touches"
     free = simulate_take(TakeConfig(kind="free", num_frames=FRAMES))
     assert len(free.hands) == 2 and free.num_frames == FRAMES
-    apart = np.linalg.norm(free.hands[0].qpos[:, :3] - free.hands[1].qpos[:, :3], axis=1)
+    apart = np.linalg.norm(free.qpos[:, 0, :3] - free.qpos[:, 1, :3], axis=1)
     assert apart.min() > 0.2
 
 
