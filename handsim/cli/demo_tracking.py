@@ -9,8 +9,6 @@ import numpy as np
 from handsim.app.page import Section
 from handsim.cli.demo_run import GLOVE, DemoRun
 from track.capture_tracking import track_capture
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig, simulate_take
 
 _FRAMES: Final = 120
@@ -20,7 +18,7 @@ def track_take(run: DemoRun) -> Section:
     """Track a simulated capture and say how far its joints are off."""
     run.report("tracking a simulated capture")
     take = simulate_take(TakeConfig(kind="hand-hand", num_frames=_FRAMES, seed=run.seed))
-    tracked = track_capture(take.capture(), Tracker(take.hands, load_labeler(GLOVE)))
+    tracked = track_capture(take, hands=take.hands, labeler=GLOVE)
     tracked.save(run.tracked_take)
     errors = []
     for number, hand in enumerate(take.hands):

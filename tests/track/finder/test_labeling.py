@@ -8,9 +8,9 @@ import torch
 
 from gloves.captures.markers import unlabeled_frames
 from gloves.layout import load_layout
+from track.finder.frame_hands import HandFinder
+from track.finder.labeling import label_hands
 from train.evaluation.labeler_evaluation import evaluate_takes
-from train.hands.frame_hands import HandFinder
-from train.hands.labeling import label_hands
 from train.labelers.protocol import Labeling
 from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig, simulate_take
