@@ -1,6 +1,6 @@
 """How near a calibration comes to the truth, on simulated users.
 
-    python benchmarks/calibration.py [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
+    python -m benchmarks.calibration [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
         [--picture FILE.png] [--captures FOLDER]
 
 Each user is one hand, right and left in turn: a size's mean hand made 8 % larger or smaller, with the
@@ -28,9 +28,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from machine import describe
-from people import right_hands
 
+from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.people import right_hands
+from benchmarks.record import describe
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, load_layout
@@ -43,8 +44,7 @@ from poses.shapes.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import SkinPatch, displace_markers
-from track.calibration.user_calibration import calibrate
-from track.evaluation.hand_errors import hand_errors
+from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
@@ -110,7 +110,7 @@ def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: GloveFit, rng: np.ra
 
 def held_out_gaps(hand: GloveFit, true: GloveFit, take: Take) -> np.ndarray:
     """Means over each finger's touches (4, 2) [m]: flesh from touching, skins from the true ones."""
-    markers, qpos = take.observed(take.hand_labels[0]), take.hands[0].qpos
+    markers, qpos = take.observed(true.side), take.qpos[:, 0]
     gaps = np.full((len(FINGERS), 2), np.nan)
     for number, finger in enumerate(FINGERS):
         touching = is_touching(true.model, qpos[:, 7:], finger)
@@ -155,18 +155,18 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
     made = CalibrationTakeConfig(free=arguments.free, rounds=arguments.rounds)
     take = simulate_calibration(worn, made, rng=rng)
     held_out = simulate_calibration(worn, CalibrationTakeConfig(free=3.0, rounds=4), rng=rng)
-    markers = take.observed(take.hand_labels[0])
+    markers = take.observed(true.side)
     ways = {
         "after": (markers, start),
         "from the next size": (markers, farther),
         "1 % wrong labels": (exchange_labels(markers, true, rng), start),
-        "flesh": (move_flesh(markers, take.hands[0].qpos, true, rng), start),
+        "flesh": (move_flesh(markers, take.qpos[:, 0], true, rng), start),
     }
     print(f"user {number}, {true.side}: {take.num_frames} frames")
     rows = {"before": tell("before", start, true, held_out)}
     for name, (seen, begin) in ways.items():
         began = time.perf_counter()
-        result = calibrate(seen, begin, take.rate)
+        result = calibrate_hand(seen, begin, take.rate)
         took = time.perf_counter() - began
         within = (1e3 * hand_errors(result.hand, true).wrist_positions < 2e3 * result.position_errors).mean()
         rows[name] = tell(name, result.hand, true, held_out)
@@ -184,7 +184,7 @@ def tell_people(captures: Path, layout: MarkerLayout) -> None:
     for name, markers in right_hands(captures, layout.names).items():
         half = len(markers) // 2
         seen = markers[half:][np.isfinite(markers[half:, :, 0]).all(axis=1)][::EVERY]
-        result = calibrate(markers[:half], nominal_fit(layout, "M", "right"), 120.0)
+        result = calibrate_hand(markers[:half], nominal_fit(layout, "M", "right"), 120.0)
         off = [1e3 * PoseSolver(hand).solve(seen).rms for hand in (result.start, result.hand)]
         print(f"{name}: {len(seen)} held-out frames, 3D RMS median {np.median(off[0]):.2f} mm before, "
               f"{np.median(off[1]):.2f} mm after (p95 {np.percentile(off[1], 95):.2f}); "

@@ -1,6 +1,6 @@
 """Speed of rendering, accuracy of depth, and memory.
 
-    MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
+    MUJOCO_GL=egl python -m benchmarks.rendering [speed accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
     colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
@@ -27,9 +27,9 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
-from machine import describe
 
-from handsim.app.workers import in_processes
+from benchmarks.record import describe
+from handsim.app.workers import run_jobs
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig
 from render.formats.writer import open_writer
@@ -91,7 +91,7 @@ def rate(job: Callable[[], object], count: int) -> float:
 def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> float:
     """Pictures per second while all processes are at work: from the second shard of each on."""
     ends = []
-    for _ in in_processes(job, range(1 + 6 * cores), cores):
+    for _ in run_jobs(job, range(1 + 6 * cores), cores):
         ends.append(time.perf_counter())
     steady = ends[1 + cores : -cores]  # the first is drawn before there are processes
     return (len(steady) - 1) * frames / (steady[-1] - steady[0])

@@ -1,6 +1,6 @@
 """The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
 
-    OMP_NUM_THREADS=1 python benchmarks/tracking.py [calibrated drums starts speed memory]
+    OMP_NUM_THREADS=1 python -m benchmarks.tracking [calibrated drums starts speed memory]
         [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
@@ -23,24 +23,16 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 import time
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-from drum_takes import with_drum
-from machine import describe
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
-from handsim.cli.calibrate import calibrate
-from track.capture_tracking import warm_up
-from track.evaluation.hand_errors import hand_errors
-from track.evaluation.take_evaluation import (
+from benchmarks.drum_takes import with_drum
+from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.paper.take_evaluation import (
     TrackingReport,
     evaluate_tracker,
     measured_users,
@@ -48,9 +40,13 @@ from track.evaluation.take_evaluation import (
     seen_frame,
     true_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times
+from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
+from benchmarks.record import describe
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from track.calibration.capture_calibration import calibrate
+from track.setup import warm_up
 from track.tracker import Tracker
-from track.user import load_user
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
@@ -105,13 +101,7 @@ def calibrated_users(take: Take, seed: int, free: float) -> list[GloveFit]:
     people = tuple(true_users(take))
     rng = np.random.default_rng((seed, 1))
     made = simulate_calibration(people, CalibrationTakeConfig(free=free), rng=rng)
-    with tempfile.TemporaryDirectory() as folder:
-        capture, user = Path(folder) / "calibration.c3d", Path(folder) / "user.json"
-        names = tuple(f"point{number}" for number in range(made.points.shape[1]))
-        write_capture(capture, Capture(names, made.points, made.rate))
-        calibrate(capture, out=user)
-        found = {hand.side: hand for hand in load_user(user)}
-    return [found[hand.side] for hand in take.hands]
+    return list(calibrate(made).of_sides(take.sides))
 
 
 def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> None:

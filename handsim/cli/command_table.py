@@ -18,7 +18,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "List, show, start and check marker layouts; score and improve one before it is worn.",
     ),
     "rig": (
-        "handsim.cli.rig:RIG+handsim.cli.rig_import:RIG+handsim.cli.rig_advice:RIG",
+        "handsim.cli.rig:RIG+handsim.cli.rig_advice:RIG",
         "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
     ),
     "generate": ("handsim.cli.generate:generate", "Make a training set; goes on where it was stopped."),
@@ -39,18 +39,6 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "view": ("handsim.cli.view:view", "Show a file or a live tracker in the browser."),
     "body": ("handsim.cli.body:body", "Write a rigid body's markers as a file, to track it with."),
     "render": ("handsim.cli.render:render", "Draw the hands of a take, with the truth of each picture."),
-    "reproduce": (
-        "handsim.cli.reproduce:REPRODUCE",
-        "Print a table of the paper with our figures beside.",
-    ),
-    "benchmark": (
-        "handsim.cli.benchmark:BENCHMARK_COMMANDS",
-        "Make the public benchmark, run a tracker on it, score anybody's results.",
-    ),
-    "sweep": (
-        "handsim.cli.sweep:sweep",
-        "Train and measure for gloves x rigs x people x seeds, as one job with a table.",
-    ),
     "doctor": ("handsim.cli.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }
 

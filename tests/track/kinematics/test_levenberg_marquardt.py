@@ -1,4 +1,4 @@
-"""The compiled descent against SciPy's, its wrist against MuJoCo's integration, small systems against numpy's."""
+"""The compiled descent against SciPy's, its wrist against MuJoCo's, small systems against numpy's."""
 
 from __future__ import annotations
 
