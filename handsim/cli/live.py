@@ -13,7 +13,7 @@ import numpy as np
 
 from gloves.takes.take import Take
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
+from handsim.app.messages import LiveStatus
 from track.capture_tracking import track_stream
 from track.live_recording import LiveRecorder
 from track.sinks.sink_group import SinkGroup

@@ -12,8 +12,7 @@ import tyro
 from gloves.captures.formats import READABLE, check_suffix, read_capture
 from gloves.takes.take import SUFFIX, load_take
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
-from handsim.app.messages import print_line
+from handsim.app.messages import LiveStatus, print_line
 from handsim.errors import ArgumentError
 from track.streams.natnet import COMMAND_PORT
 from track.streams.natnet_server import LOOPBACK, ReplayServer
