@@ -18,7 +18,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "List, show, start and check marker layouts; score and improve one before it is worn.",
     ),
     "rig": (
-        "handsim.cli.rig:RIG+handsim.cli.rig_import:RIG+handsim.cli.rig_advice:RIG",
+        "handsim.cli.rig:RIG+handsim.cli.rig_advice:RIG",
         "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
     ),
     "generate": ("handsim.cli.generate:generate", "Make a training set; goes on where it was stopped."),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from handsim.cli.command_table import load
-from handsim.cli.presets import PresetCommand
+from handsim.cli.presets import PresetCommand, named_objects
 
 _SCRIPT: Final = """\
 # Completion of handsim in bash; in zsh, after `autoload -U bashcompinit && bashcompinit`.
@@ -48,7 +48,7 @@ def _words(target: str) -> list[str]:
 def _options(function: Any) -> list[str]:
     import tyro
 
-    parser: Any = tyro.extras.get_parser(function)
+    parser: Any = tyro.extras.get_parser(function, registry=named_objects())
     return [
         option
         for action in parser._actions  # argparse has no other way to list them

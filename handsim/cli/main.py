@@ -19,7 +19,7 @@ from handsim._version import __version__
 from handsim.app.interrupts import Stopped, signals_raise
 from handsim.app.messages import told_warnings
 from handsim.cli.command_table import COMMANDS, load
-from handsim.cli.presets import PresetCommand
+from handsim.cli.presets import PresetCommand, named_objects
 from handsim.errors import HandSimError, choices
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
@@ -197,9 +197,11 @@ def _call(target: str, *, prog: str, help_line: str, args: Sequence[str]) -> int
     if isinstance(command, PresetCommand):
         command = command.choose(args, prog)
     if isinstance(command, dict):
-        result = tyro.extras.subcommand_cli_from_dict(command, prog=prog, description=help_line, args=args)
+        result = tyro.extras.subcommand_cli_from_dict(
+            command, prog=prog, description=help_line, args=args, registry=named_objects()
+        )
     else:
-        result = tyro.cli(command, prog=prog, args=args)
+        result = tyro.cli(command, prog=prog, args=args, registry=named_objects())
     return result if isinstance(result, int) else 0
 
 

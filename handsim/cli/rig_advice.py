@@ -18,6 +18,7 @@ from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.json_files import save_json
 from handsim.files.outputs import check_outputs
+from handsim.space.camera import Camera, focal_of_angle, pinhole
 from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, ROOM_CENTER, load_rig, save_rig
 from train.rig_advice.mounts import MOUNTS, Mount
 
@@ -70,8 +71,7 @@ def score_rig_file(
     sides = _checked_sides("--volume", volume)
     check_outputs([rig, take, glove], [page, json])
     from train.rig_advice.rig_page import COLUMNS_TOLD, camera_table, work_table, write_rig_page
-    from train.rig_advice.rig_score import score_rig
-    from train.rig_advice.rig_sentences import sentences
+    from train.rig_advice.rig_score import score_rig, sentences
 
     with Console(stderr=True).status("simulating hands") as status:
         work, middle, told = _work(take, glove, center, sides, frames, seed)
@@ -98,8 +98,8 @@ def plan_rig(
     volume: _Sides = _VOLUME,
     center: _Sides = ROOM_CENTER,
     keep: str | None = None,
+    size: tuple[int, int] = (1280, 1280),
     field_of_view: float = 60.0,
-    resolution: int = 1280,
     glove: str = _GLOVE,
     seed: int = 0,
 ) -> None:
@@ -115,31 +115,27 @@ def plan_rig(
         volume: Sides of the space that hands work in [m].
         center: Its middle [m].
         keep: A rig whose cameras stay where they are, a .toml file or a shipped name; the new ones are like
-            them.
-        field_of_view: Full opening of each camera's round view cone [deg].
-        resolution: Pixels across it.
+            its first.
+        size: Width and height of the new cameras' pictures [px].
+        field_of_view: Full opening across the shorter side of these [deg].
         glove: Marker layout: a shipped name or the path of a .toml file.
         seed: Seed of people and motion.
     """
     if out.suffix.lower() != ".toml":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .toml")
     hung = None if keep is None else load_rig(keep)
-    fewest = FEWEST_CAMERAS if hung is None else len(hung.positions) + 1
+    fewest = FEWEST_CAMERAS if hung is None else len(hung.cameras) + 1
     if not fewest <= cameras <= MAX_CAMERAS:
         raise ArgumentError(f"--cameras is {cameras}, expected {fewest} to {MAX_CAMERAS}")
     sides, middle = _checked_sides("--volume", volume), _checked_center(center)
     check_outputs([keep, glove], [out])
-    from train.rig_advice.plan import LensKind, plan
+    from train.rig_advice.plan import plan
 
-    lens = (
-        LensKind(float(np.deg2rad(field_of_view)), resolution)
-        if hung is None
-        else LensKind(hung.field_of_view, hung.resolution)
-    )
+    camera = _camera(size, field_of_view) if hung is None else hung.cameras[0]
     with Console(stderr=True).status("simulating hands") as status:
         planned = plan(
             cameras, _checked_sides("--room", room), mounts, load_layout(glove), middle, sides,
-            lens, hung, name=out.stem, told=status.update, seed=seed,
+            camera, hung, name=out.stem, told=status.update, seed=seed,
         )  # fmt: skip
     table = Table("camera", box=None, pad_edge=False)
     table.add_column(Text("position [m]"), justify="right")
@@ -154,6 +150,13 @@ def plan_rig(
     print_line(f"after:  {_forecast_line(planned.after)}")
     save_rig(out, planned.rig)
     print_line(f"{out}: run `handsim rig score {out}`")
+
+
+def _camera(size: tuple[int, int], field_of_view: float) -> Camera:
+    """A camera without distortion, at the world's origin."""
+    if not 1.0 <= field_of_view <= 170.0:
+        raise ArgumentError(f"--field-of-view is {field_of_view:g} degrees, expected 1 to 170")
+    return pinhole("camera", size, focal_of_angle(min(size), np.deg2rad(field_of_view)))
 
 
 def _forecast_line(one: Forecast) -> str:
@@ -173,7 +176,7 @@ def _work(
     seed: int,
 ) -> tuple[dict[str, list[SceneMotion]], NDArray[np.float64], str]:
     """Hands at work, the middle of where they are [m], and what they do, in words."""
-    from gloves.takes.motion import load_any_take
+    from gloves.takes.take import load_take
     from train.rig_advice.work import sample_work, work_of_take
 
     middle = _checked_center(ROOM_CENTER if center is None else center)
@@ -182,7 +185,7 @@ def _work(
         rng = np.random.default_rng(seed)
         work = sample_work(layout, middle, sides, frames, _PEOPLE, rng=rng)
         return work, middle, f"simulated people in the glove {layout.name}"
-    work = work_of_take(load_any_take(take), None if glove is None else load_layout(glove), frames)
+    work = work_of_take(load_take(take), None if glove is None else load_layout(glove), frames)
     if center is None:
         wrists = [hand.qpos[:, :3] for scenes in work.values() for one in scenes for hand in one.hands]
         middle = np.concatenate(wrists).mean(axis=0)

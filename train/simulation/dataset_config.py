@@ -10,6 +10,7 @@ from gloves.optics.reconstruction import OpticsConfig
 from handsim._checks import check_number, check_span
 from handsim.errors import DatasetError
 from handsim.hand.shape import Population
+from handsim.space.cameras import CameraRig
 from poses.shapes.samplers import PoseMix
 from train.simulation.frame_scenes import SceneMix
 
@@ -23,8 +24,8 @@ class DatasetConfig:
     num_frames: int = 170_330
     """Frames; the default is the paper's number."""
     seed: int = 0
-    rig: str = "figure5"
-    """Camera rig: a shipped name or the path of a .toml file."""
+    rig: CameraRig | str = "figure5"
+    """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
     min_cameras: int = 2
     """Cameras that must see a marker before it exists."""
     frames_per_hand: int = 128

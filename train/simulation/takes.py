@@ -18,7 +18,7 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.topology import SIDES, Side
-from handsim.space.cameras import ROOM_CENTER, check_outside_volume, load_rig
+from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, rig_setting
 from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
 from train.simulation.motion import RATE, SceneMotion, sample_scene_motion
 from train.simulation.people import sample_adult_hands, wear_gloves
@@ -53,8 +53,8 @@ class TakeConfig:
     calibration touches and 40 s of free motion."""
     glove: str = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
-    rig: str = "figure5"
-    """Camera rig: a shipped name or the path of a .toml file."""
+    rig: CameraRig | str = "figure5"
+    """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
     seed: int = 0
     optics: OpticsOptions = field(default_factory=OpticsOptions)
     """The optical system, where it differs from the one fitted to this kind of capture."""
@@ -104,14 +104,14 @@ def simulate_take(config: TakeConfig) -> Take:
     kind = config.kind
     key = SIMULATED_KINDS.index(kind), TWINS[kind].draw if kind in TWINS else 0
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=key))
-    rig, layout = load_rig(config.rig), load_layout(config.glove)
+    rig, layout = as_rig(config.rig), load_layout(config.glove)
     for side in config.hands:
         layout.check_side(side)
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
     scene = _sample_scene(config, layout, rng)
     optics = config.optics.applied(config.room.optics).worn(layout.radius)
     room = dataclasses.replace(config.room, optics=optics)
-    settings = dataclasses.asdict(config) | {"room": dataclasses.asdict(room)}
+    settings = dataclasses.asdict(config) | {"rig": rig_setting(rig), "room": dataclasses.asdict(room)}
     del settings["optics"]  # the room has all of them
     if set(config.hands) == set(BOTH):
         del settings["hands"]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import uuid
 
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+from upath import UPath
 
-from handsim.files.object_folder import ObjectFolder
-from tests.handsim.app.executors.object_stores.stored_set import CONFIG, ROWS, contents
+from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS, contents
 from train.simulation import generation
 from train.simulation.generation import generate_dataset
 from train.simulation.takes import TakeConfig, simulate_take
@@ -31,9 +32,8 @@ def whole(tmp_path_factory):
 @pytest.fixture
 def memory():
     """A folder of fsspec's store in memory."""
-    fsspec = pytest.importorskip("fsspec", reason="needs `pip install 'handsim[object-stores]'`")
-    yield ObjectFolder(f"memory://bucket-{uuid.uuid4().hex}/set")
-    fsspec.filesystem("memory").store.clear()
+    yield UPath(f"memory://bucket-{uuid.uuid4().hex}/set")
+    MemoryFileSystem.store.clear()
 
 
 @pytest.fixture(scope="session")

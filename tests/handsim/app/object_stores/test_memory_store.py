@@ -12,28 +12,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fsspec.implementations.memory import MemoryFileSystem
+from upath import UPath
 
-from handsim.app.executors.dask_cluster import DaskCluster, _Task
-from handsim.app.executors.executor import Processes, choose_executor
-from handsim.app.executors.output import StoredOutput, open_output
-from handsim.app.executors.worker_check import WorkerCheck
 from handsim.app.interrupts import Stopped
+from handsim.app.output import open_output, place_of
+from handsim.app.workers import run_jobs
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, DatasetError, HandSimError
-from handsim.files.object_folder import ObjectFolder, folder_or_objects
 from render.config import RenderConfig
 from render.session import left_out_frames, render_take
-from tests.handsim.app.executors.object_stores.stored_set import (
+from tests.handsim.app.object_stores.stored_set import (
     CONFIG,
     contents,
     copied,
+    names,
     write_three,
 )
 from train.data.shards import MANIFEST, Dataset, array_bytes, row_dtype, rows_name, save_array
 from train.simulation.generation import generate_dataset
 
 pytestmark = pytest.mark.xdist_group("object stores")  # what they share is made once
-fsspec = pytest.importorskip("fsspec", reason="needs `pip install 'handsim[object-stores]'`")
 
 
 def test_a_training_set_in_a_store_has_the_bytes_of_a_folder(memory, whole, tmp_path):
@@ -53,9 +52,8 @@ def test_a_stopped_one_goes_on_after_what_is_there(memory, whole, tmp_path):
     with pytest.raises(Stopped) as caught:
         generate_dataset(CONFIG, memory, workers=1, progress=stop)
     assert caught.value.kept == f"200 of 370 frames are in {memory}, and the same command goes on after them"
-    assert MANIFEST not in memory.sizes()
-    (tmp_path / rows_name(0)).write_bytes(b"half")  # what a store would hold that is none
-    memory.put(tmp_path, [rows_name(0)])
+    assert MANIFEST not in names(memory)
+    (memory / rows_name(0)).write_bytes(b"half")  # what a store would hold that is none
     told = []
     generate_dataset(CONFIG, memory, workers=1, progress=lambda *counts: told.append(counts))
     assert told == [(200, 370), (300, 370), (370, 370)], "shards 0, 2 and 3"
@@ -64,11 +62,11 @@ def test_a_stopped_one_goes_on_after_what_is_there(memory, whole, tmp_path):
 
 def test_a_set_grows_and_has_no_manifest_until_it_is_complete(memory, whole, tmp_path):
     generate_dataset(dataclasses.replace(CONFIG, num_frames=150), memory, workers=1)
-    assert MANIFEST in memory.sizes()
+    assert MANIFEST in names(memory)
     with_manifest, told = [], []
 
     def note(done, _):
-        with_manifest.append(MANIFEST in memory.sizes())
+        with_manifest.append(MANIFEST in names(memory))
         told.append(done)
 
     generate_dataset(CONFIG, memory, workers=1, progress=note)
@@ -80,62 +78,38 @@ def test_a_set_grows_and_has_no_manifest_until_it_is_complete(memory, whole, tmp
 
 
 def test_a_store_that_holds_something_else_is_refused(memory, tmp_path):
-    (tmp_path / "mine.txt").write_text("mine")
-    memory.put(tmp_path, ["mine.txt"])
+    (memory / "mine.txt").write_text("mine")
     with pytest.raises(DatasetError, match=f"{memory} is not empty and holds no training set; name another"):
         generate_dataset(CONFIG, memory, workers=1)
-    assert set(memory.sizes()) == {"mine.txt"}
+    assert names(memory) == {"mine.txt"}
 
 
-def test_the_receipt_comes_last_and_tells_whether_all_is_there(memory, monkeypatch):
+def test_what_says_that_a_job_is_finished_comes_last(memory, monkeypatch):
     puts = []
-    put = ObjectFolder.put
-    monkeypatch.setattr(ObjectFolder, "put", lambda *given: (puts.append(list(given[2])), put(*given)))
+    put = MemoryFileSystem.put
+    monkeypatch.setattr(
+        MemoryFileSystem,
+        "put",
+        lambda store, here, there: (
+            puts.append([Path(name).name for name in there]),
+            put(store, here, there),
+        ),
+    )
     with open_output(memory) as output:
         output.claim("config.json", {"x": 1}, noun="thing", error=HandSimError)
-        assert list(Processes(1).run(output.job(write_three), [3, 4])) == [3, 4]
-        output.collect("b-*")
-        assert [path.name for path in sorted(output.folder.rglob("b-*"))] == ["b-3", "b-4"]
+        assert list(run_jobs(output.job(write_three, last=["a-*"]), [3, 4], 1)) == [3, 4]
+        output.fetch("b-*", names_of=["c-*"])
+        brought = sorted(path for path in output.folder.rglob("*-*"))
+        assert [path.name for path in brought] == ["b-3", "b-4", "c-3", "c-4"]
+        assert [path.stat().st_size for path in brought] == [18, 24, 0, 0]
         here = output.folder.parent
         assert {path.name for path in here.iterdir()} == {"output"}, "jobs remove their folders"
+        (output.folder / "made").write_text("of all")
+        output.publish("made")
     assert not here.exists()
-    assert puts[1:] == [
-        ["a-3", "part/b-3", "part/c-3"],
-        ["finished/00003.json"],
-        ["a-4", "part/b-4", "part/c-4"],
-        ["finished/00004.json"],
-    ]
-    memory.remove("part/b-3")
-    with open_output(memory) as output:
-        output.claim("config.json", {"x": 1}, noun="thing", error=HandSimError)
-        assert set(output.receipts) == {4}
-        with pytest.raises(HandSimError, match=f"{memory}: a-3 is gone; run the same command again"):
-            output.checksums(["a-4", "a-3"])
-
-
-@pytest.mark.parametrize(
-    "receipt",
-    [
-        b"{",
-        b"[]",
-        b'{"files": 3}',
-        b'{"files": {"../../x": {"bytes": 1, "sha256": "0"}}}',
-        b'{"files": {"/x": {"bytes": 1, "sha256": "0"}}}',
-        b'{"files": {"x": {"bytes": "1", "sha256": "0"}}}',
-        b'{"files": {"x": 5}}',
-    ],
-)
-def test_a_damaged_receipt_is_none(receipt, memory, tmp_path):
-    with open_output(memory) as output:
-        output.claim("config.json", {}, noun="thing", error=HandSimError)
-    (tmp_path / "finished").mkdir()
-    (tmp_path / "finished/00001.json").write_bytes(receipt)
-    memory.put(tmp_path, ["finished/00001.json"])
-    with open_output(memory) as output:
-        output.claim("config.json", {}, noun="thing", error=HandSimError)
-        assert isinstance(output, StoredOutput) and output.receipts == {}
-        output.collect("*")
-        assert sorted(path.name for path in output.folder.iterdir()) == ["config.json", "finished"]
+    assert puts == [["config.json"], ["b-3", "c-3"], ["a-3"], ["b-4", "c-4"], ["a-4"], ["made"]]
+    with open_output(memory) as output, pytest.raises(HandSimError, match="reading a-5 failed: "):
+        output.checksum("a-5")
 
 
 def test_what_a_killed_run_left_here_is_removed(memory, tmp_path, monkeypatch):
@@ -162,42 +136,38 @@ def test_the_length_of_a_file_of_records(tmp_path):
         ("s3://", "one like s3://bucket/prefix"),
         ("S3://bucket/a", "one like s3://bucket/prefix"),
         ("a b://c", "one like s3://bucket/prefix"),
-        ("file:///tmp/x", "the folder's path alone"),
-        ("simplecache::s3://bucket/x", "one like s3://bucket/prefix"),
+        ("nothing://b/x", "one like s3://bucket/prefix: Unsupported"),
+        ("simplecache::s3://bucket/x", "one without :: and .."),
         ("s3://bucket/../x", "one without :: and .."),
     ],
 )
 def test_an_address_that_is_none(address, expected, capsys):
     with pytest.raises(ArgumentError, match=f"the address is '{address}', expected {expected}"):
-        folder_or_objects(address)
+        place_of(address)
     assert main(["generate", "--num-frames", "10", "--out", address]) == 1
     assert capsys.readouterr().err.startswith(f"handsim generate: the address is '{address}'")
 
 
+def test_a_folder_may_be_an_address(tmp_path, memory):
+    for name in (tmp_path, str(tmp_path), tmp_path.as_uri(), UPath(tmp_path)):
+        assert place_of(name) == tmp_path and isinstance(place_of(name), Path)
+    assert place_of(memory) == memory and place_of(str(memory)) == memory
+    with pytest.raises(ArgumentError, match="the address is '3', expected a folder, or one like s3://"):
+        place_of(3)
+
+
 def test_an_address_with_a_password_is_not_repeated():
     with pytest.raises(ArgumentError, match="the ftp:// address holds a password; credentials") as told:
-        ObjectFolder("ftp://me:geheim@host/sets")
+        place_of("ftp://me:geheim@host/sets")
     assert "geheim" not in str(told.value)
-    assert str(ObjectFolder("abfs://sets@account.host/a")) == "abfs://sets@account.host/a"
+    assert str(place_of("s3://sets@account.host/a/")) == "s3://sets@account.host/a"
 
 
 def test_without_the_packages_a_sentence_says_how_to_get_them(monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "fsspec.core", None)
-        with pytest.raises(ArgumentError, match=r"s3://b/x needs the package fsspec.*'handsim\[object-st"):
-            generate_dataset(CONFIG, ObjectFolder("s3://b/x"))
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
     with pytest.raises(ArgumentError, match=r"s3://b/x needs a package .* run `pip install 'handsim\[obj"):
-        generate_dataset(CONFIG, ObjectFolder("s3://b/x"))
-    with pytest.raises(HandSimError, match=r"^nothing://b/x: opening failed: Protocol not known: nothing;"):
-        generate_dataset(CONFIG, ObjectFolder("nothing://b/x"))
-
-
-def test_options_choose_workers_that_share_no_folder(memory, tmp_path):
-    shared, apart = (choose_executor("tcp://a:1", None, out, print) for out in (tmp_path, memory))
-    assert isinstance(shared, DaskCluster) and shared.folder == tmp_path
-    assert isinstance(apart, DaskCluster) and apart.folder is None
+        generate_dataset(CONFIG, "s3://b/x")
 
 
 def test_what_renames_its_files_or_merges_goes_to_a_folder(memory, tmp_path, capsys):
@@ -222,16 +192,3 @@ def test_pictures_in_a_store_have_the_bytes_of_a_folder(memory, take, tmp_path):
     assert (done, told) == (4, [(4, 4)]), "one shard was there"
     assert copied(memory, tmp_path / "there") == contents(tmp_path / "here")
     assert left_out_frames(memory) == []
-
-
-def lack_a_file(folder: Path, number: int) -> int:
-    raise FileNotFoundError(f"take-{number}.npz is not there")
-
-
-def test_a_worker_that_lacks_a_file_is_named(memory, tmp_path):
-    job, nowhere = StoredOutput(tmp_path / "output", memory).job(lack_a_file), tmp_path / "nowhere"
-    task = _Task(job, WorkerCheck((), nowhere, None, ""))
-    with pytest.raises(HandSimError, match=r"^on .*, which shares no folder: take-3\.npz is not there$"):
-        task._alone(3)
-    assert memory.sizes() == {}
-    WorkerCheck((), nowhere, None, "").check_folders("tcp://one:1")

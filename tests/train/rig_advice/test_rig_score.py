@@ -10,8 +10,7 @@ import pytest
 from handsim.space.cameras import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import CameraLoss
 from train.rig_advice.rig_page import camera_table, work_table, write_rig_page
-from train.rig_advice.rig_score import score_rig
-from train.rig_advice.rig_sentences import sentences
+from train.rig_advice.rig_score import score_rig, sentences
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from upath import UPath
+
 from handsim.files.inputs import checksum
-from handsim.files.object_folder import ObjectFolder
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
 
@@ -15,14 +16,21 @@ CONFIG = DatasetConfig(num_frames=4 * ROWS - 30, seed=5, frames_per_hand=50, sce
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Checksums of all files but receipts, hidden ones too."""
+    """Checksums of all files, hidden ones too."""
     files = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
-    return {name: checksum(path) for name, path in files.items() if not name.startswith("finished/")}
+    return {name: checksum(path) for name, path in files.items()}
 
 
-def copied(store: ObjectFolder, folder: Path) -> dict[str, str]:
-    """The same of what a store holds, copied into a folder."""
-    store.get(list(store.sizes()), folder)
+def names(store: UPath) -> set[str]:
+    """Names of all that a store's folder holds."""
+    return {path.path.removeprefix(store.path + "/") for path in store.rglob("*") if path.is_file()}
+
+
+def copied(store: UPath, folder: Path) -> dict[str, str]:
+    """The same as `contents` of what a store holds, copied into a folder."""
+    for name in names(store):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes((store / name).read_bytes())
     return contents(folder)
 
 
