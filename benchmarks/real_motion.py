@@ -34,9 +34,9 @@ from gloves.layout import load_layout
 from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
+from train.glove_labeler import load_labeler
 from train.hands.frame_hands import HandFinder
 from train.hands.labeling import label_hands
-from train.labelers.storage import load_labeler
 
 SIDES = ("right", "left")
 

@@ -51,11 +51,11 @@ from track.evaluation.take_evaluation import (
 from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times
 from track.tracker import Tracker
 from track.user import load_user
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 from train.simulation.room_settings import KINDS, SIMULATED_KINDS, SimulatedKind
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
@@ -70,7 +70,7 @@ HANDS = {
 
 @cache
 def twin(kind: SimulatedKind, frames: int | None, seed: int) -> Take:
-    return simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)).without_body()
+    return simulate_take(kind=kind, num_frames=frames, seed=seed).without_body()
 
 
 @cache

@@ -15,8 +15,6 @@ import numpy as np
 
 from train import (
     Corruption,
-    Dataset,
-    DatasetConfig,
     Labeler,
     corrupt,
     evaluate_labeler,
@@ -28,8 +26,8 @@ from train import (
 def main() -> None:
     labeler: Labeler = load_labeler("dense19")
     with TemporaryDirectory() as folder:
-        generate_dataset(DatasetConfig(num_frames=1000, seed=42), Path(folder) / "set", workers=1)
-        markers = Dataset(Path(folder) / "set").rows()["markers"].astype(np.float64)  # (1000, 19, 3) [m]
+        dataset = generate_dataset(Path(folder) / "set", num_frames=1000, seed=42, workers=1)
+        markers = dataset.rows()["markers"].astype(np.float64)  # (1000, 19, 3) [m]
     cloud = corrupt(markers[:1], Corruption(), rng=np.random.default_rng(0))  # the first frame
     points = cloud.points[0, cloud.present[0]]  # (N, 3)
     labeling = labeler.label_frames([points])[0]

@@ -13,7 +13,7 @@ import numpy as np
 from gloves import GlovedHand, Take, load_layout, nominal_fit
 from handsim import HandModel
 from track import TrackedTake, Tracker, track_capture
-from train import TakeConfig, load_labeler, simulate_take
+from train import load_labeler, simulate_take
 
 
 def joints(model: HandModel, qpos: np.ndarray) -> np.ndarray:
@@ -32,7 +32,7 @@ def compare(name: str, tracked: TrackedTake, truth: Take) -> None:
 
 
 def main() -> None:
-    truth = simulate_take(TakeConfig(kind="hand-controller", num_frames=240))  # 2 s at 120 Hz
+    truth = simulate_take(kind="hand-controller", num_frames=240)  # 2 s at 120 Hz
     capture = truth.capture()  # no names, many gaps, some ghosts
     labeler = load_labeler("dense19")
     known = [hand.fit for hand in truth.hands]

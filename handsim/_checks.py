@@ -2,10 +2,112 @@
 
 from __future__ import annotations
 
+import dataclasses
+import reprlib
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, choices
+
+Settings = TypeVar("Settings")
+
+
+def check_type(
+    name: str, value: object, kinds: type | tuple[type, ...], expected: str, valid: Iterable[str] = ()
+) -> None:
+    """Refuse an argument of another type; the one check of all public functions.
+
+    Args:
+        name: The argument.
+        value: What was given for it.
+        kinds: The types that it may have; a bool is none of them unless it is named.
+        expected: What is wanted, in words, such as "a MarkerLayout, or the name or path of one".
+        valid: The names that there are.
+
+    Raises:
+        ArgumentError: The value is of another type.
+    """
+    named = kinds if isinstance(kinds, tuple) else (kinds,)
+    if isinstance(value, kinds) and (not isinstance(value, bool) or bool in named):
+        return
+    names = ", ".join(valid)
+    raise ArgumentError(
+        f"{name} is {shown_value(value)}, expected {expected}" + (f"; valid names: {names}" if names else "")
+    )
+
+
+def fill_settings(config: Any) -> None:
+    """Put settings in the place of mappings, in the fields of a frozen dataclass that are groups of settings.
+
+    Args:
+        config: The dataclass; a mapping holds what differs from the field's default.
+
+    Raises:
+        ArgumentError: A setting is unknown, or a field is no such group.
+    """
+    for one in dataclasses.fields(config):
+        if one.default_factory is dataclasses.MISSING:
+            continue
+        value, default = getattr(config, one.name), one.default_factory()
+        if not dataclasses.is_dataclass(default) or type(value) is type(default):
+            continue
+        check_type(one.name, value, Mapping, f"a {type(default).__name__} or a mapping of its settings")
+        made = make_settings(type(default), f"setting of {one.name}", value, default=default)
+        object.__setattr__(config, one.name, made)
+
+
+def make_settings(
+    kind: type[Settings], noun: str, given: Mapping[str, Any], *, default: Any = None
+) -> Settings:
+    """A dataclass of settings, some of which are given by name.
+
+    Args:
+        kind: The dataclass.
+        noun: What one of its fields is called in messages.
+        given: Fields and their values.
+        default: Where the others come from; the dataclass's own defaults when not given.
+
+    Raises:
+        ArgumentError: There is no field of some name.
+    """
+    known = [one.name for one in dataclasses.fields(kind) if one.init]  # type: ignore[arg-type]
+    for name in given:
+        if name not in known:
+            raise ArgumentError(choices(str(name), known, noun=noun))
+    made: Settings = kind(**given) if default is None else dataclasses.replace(default, **given)
+    return made
+
+
+def check_rng(rng: object) -> None:
+    """Refuse anything but a generator of numpy as the source of randomness.
+
+    Raises:
+        ArgumentError: It is something else.
+    """
+    check_type("rng", rng, np.random.Generator, "a numpy.random.Generator, such as default_rng(0)")
+
+
+def check_callable(name: str, value: object, expected: str) -> None:
+    """Refuse what cannot be called.
+
+    Raises:
+        ArgumentError: It cannot.
+    """
+    if not callable(value):
+        raise ArgumentError(f"{name} is {shown_value(value)}, expected {expected}")
+
+
+def shown_value(value: Any) -> str:
+    """A value for a sentence: short ones as Python writes them, arrays and objects by their type."""
+    if isinstance(value, np.ndarray):
+        return f"an array {value.shape}"
+    if value is None or isinstance(value, str | bytes | bool | int | float | list | tuple | dict | set):
+        return reprlib.repr(value)
+    kind = value if isinstance(value, type) else type(value)
+    return f"the class {kind.__name__}" if isinstance(value, type) else f"a {kind.__name__}"
 
 
 def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
@@ -14,7 +116,10 @@ def check_array(name: str, array: ArrayLike, shape: tuple[int | None, ...]) -> N
     Raises:
         ArgumentError: It has another shape, or holds NaN or infinite values.
     """
-    values = np.asarray(array, dtype=np.float64)
+    try:
+        values = np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"{name} is {shown_value(array)}, expected an array of numbers") from error
     tail = values.shape[values.ndim - len(shape) :] if values.ndim >= len(shape) else ()
     if len(tail) != len(shape) or any(
         expected is not None and expected != got for expected, got in zip(shape, tail, strict=True)
@@ -32,6 +137,7 @@ def check_number(name: str, value: float, low: float, high: float = np.inf, *, a
     Raises:
         ArgumentError: It is.
     """
+    check_type(name, value, (int, float, np.integer, np.floating), "a number")
     inside = low <= value <= high and value < np.inf and not (above and value == low)
     if not inside:
         least = f"a number above {low:g}" if above else f"a number of at least {low:g}"
@@ -46,5 +152,6 @@ def check_span(name: str, span: tuple[float, float], low: float = 0.0) -> None:
     Raises:
         ArgumentError: The pair is another.
     """
+    check_type(name, span, (tuple, list), "two numbers")
     if len(span) != 2 or not low <= span[0] <= span[1] < np.inf:
         raise ArgumentError(f"{name} is {span}, expected two numbers from {low:g} upwards, the smaller first")

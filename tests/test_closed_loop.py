@@ -17,7 +17,7 @@ from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0

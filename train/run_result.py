@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any, Final
 
@@ -84,7 +83,7 @@ def _card(
         "handsim": __version__,
         "license": UNKNOWN_LICENSE,
         "dataset": manifest.config,
-        "train": dataclasses.asdict(config),
+        "train": config.record(),
         "held_out_simulated": {
             "clean": clean.figures,
             f"occlude {paper.occlude}, ghosts {paper.ghosts}": report.figures,

@@ -27,7 +27,7 @@ from track.calibration.user_calibration import Calibration, CalibrationError, ca
 from track.capture_tracking import capture_frames, track_capture
 from track.tracker import Tracker
 from track.user import save_user
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 _SHOWN: Final = 0.05  # share of the frames in which a hand must be tracked to be calibrated
@@ -64,7 +64,7 @@ def calibrate(
     check_outputs((capture, glove, labeler), [out])
     tracked = start = users_of(glove, size, None, hands)
     source, words = read_capture(capture), None
-    network = labeler_for_glove(glove, labeler)
+    network = load_labeler(glove, labeler)
     if size == "auto":
         tracked, words = measured_users(glove, hands, sample_frames(list(capture_frames(source))), network)
         start = tuple(attach(hand.layout, hand.model) for hand in tracked)

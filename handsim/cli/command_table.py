@@ -14,7 +14,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "hand": ("handsim.cli.hand:hand", "Write a hand as a MuJoCo model, a URDF or a rigged mesh."),
     "glove": (
-        "handsim.cli.glove:GLOVE+handsim.cli.glove_advice:GLOVE",
+        "handsim.cli.glove:GLOVE",
         "List, show, start and check marker layouts; score and improve one before it is worn.",
     ),
     "rig": (
@@ -53,18 +53,6 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "doctor": ("handsim.cli.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }
-
-# The steps of `handsim demo` in the order in which they run and in which their sections stand on the page.
-DEMO_STEPS: Final = (
-    "handsim.cli.demo_pictures:draw_hands",
-    "handsim.cli.demo_pictures:draw_worn_glove",
-    "handsim.cli.demo_pictures:draw_camera_view",
-    "handsim.cli.demo_figures:generate_and_label",
-    "handsim.cli.demo_pictures:draw_labeled_frame",
-    "handsim.cli.demo_tracking:track_take",
-    "handsim.cli.demo_pictures:draw_tracked_take",
-    "handsim.cli.demo_figures:figures_section",
-)
 
 
 def load(target: str) -> Any:

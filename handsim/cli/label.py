@@ -19,7 +19,7 @@ from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
 from handsim.files.outputs import check_outputs
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.hands.frame_hands import HandFinder
 from train.hands.labeling import FrameLabels, label_hands
 from train.threads import label_on
@@ -48,7 +48,7 @@ def label(
     label_on(threads)
     check_suffix(out, WRITABLE)  # before the work, not after it
     check_outputs((capture, glove, labeler), [out])
-    network = labeler_for_glove(glove, labeler)
+    network = load_labeler(glove, labeler)
     source = read_capture(capture)
     frames = unlabeled_frames(source)
     finder = HandFinder(network, load_layout(glove), rng=np.random.default_rng(0))

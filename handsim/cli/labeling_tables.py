@@ -27,7 +27,7 @@ from train.evaluation.tables import (
     print_tests,
     simulate_takes,
 )
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.storage import shipped_labelers
 from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
@@ -72,7 +72,7 @@ def table2(
             _train_augmentation(dataset, kind, name, run, samples, seed)
         for title, markers in tests.items():
             nets = {
-                name: measure_augmentations(labeler_for_glove(glove, run), markers, seed=seed)
+                name: measure_augmentations(load_labeler(glove, run), markers, seed=seed)
                 for name, run in runs.items()
             }
             Console().print(print_table2(nets, title=f"Table 2, {kind}: {title}, ours (the paper's) [%]"))
@@ -87,8 +87,8 @@ def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samp
     with progress_bar("samples") as (bar, task):
         train_labeler(
             dataset,
-            config,
             run,
+            config,
             progress=lambda done, total, loss: bar.update(
                 task, completed=done, total=total, description=f"{kind} {name}, loss {loss:.3f}"
             ),
@@ -156,8 +156,7 @@ def _print_tests(
     if num_frames < 1:
         raise HandSimError(f"num_frames is {num_frames}, expected at least 1")
     found = {
-        name: labeler_for_glove(glove, name if name in shipped_labelers() else Path(name))
-        for name in labelers
+        name: load_labeler(glove, name if name in shipped_labelers() else Path(name)) for name in labelers
     }
     stills = {"synthetic": held_out_markers(glove, num_frames, seed=seed)}
     takes = _simulate(glove, seed)

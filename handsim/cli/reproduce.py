@@ -13,9 +13,9 @@ from rich.console import Console
 from handsim.app.progress import progress_bar
 from handsim.cli.labeling_tables import LABELING_TABLES
 from handsim.files.json_files import save_json
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.simulation.room_settings import KINDS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import TakeConfig, record_config
 
 if TYPE_CHECKING:
     from gloves.takes.take import Take
@@ -112,12 +112,12 @@ def _measure_on(
     """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
     from track.evaluation.comparison import USERS, compare_trackers, trackers
 
-    network = labeler_for_glove(config.glove, config.labeler)
+    network = load_labeler(config.glove, config.labeler)
     takes: dict[str, Take] = {}
     with progress_bar("captures") as (bar, task):
         bar.update(task, total=len(twins))
         for kind, twin in twins.items():
-            takes[kind] = simulate_take(twin)
+            takes[kind] = record_config(twin)
             bar.advance(task)
     bare = {kind: take.without_body() for kind, take in takes.items()}
     frames = sum(take.num_frames for take in takes.values())
@@ -133,7 +133,7 @@ def _measure_with_body(take: Take, config: TableConfig) -> list[Measurement]:
     """Our tracker on the capture whose object has markers, with the object tracked as well."""
     from track.evaluation.comparison import USERS, measure_with_body
 
-    network = labeler_for_glove(config.glove, config.labeler)
+    network = load_labeler(config.glove, config.labeler)
     with progress_bar("frames") as (bar, task):
         bar.update(task, total=take.num_frames * len(USERS))
         return measure_with_body(_WITH_BODY, take, network, done=lambda: bar.advance(task))

@@ -41,7 +41,7 @@ from track.sinks.sink_group import SinkGroup
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 SHOWN: Final = 0.8
@@ -97,7 +97,7 @@ def track(
     bodies = load_bodies(body)
     source = None if capture is None else read_capture(capture)
     corrections = _corrections_for(out, source, label_names(user, bodies))
-    start = TrackerStart(user, labeler_for_glove(glove, labeler), bodies, glove)
+    start = TrackerStart(user, load_labeler(glove, labeler), bodies, glove)
     start.settings.update(
         capture=live if capture is None else capture.name,
         glove=glove,

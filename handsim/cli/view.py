@@ -27,7 +27,7 @@ from track.viewer.contents import Content, first_look, open_content
 from track.viewer.live_view import LiveView
 from track.viewer.server import LOOPBACK, address_of, opened_server
 from track.viewer.video import write_video
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 
 
 def view(
@@ -76,7 +76,7 @@ def view(
         if out is not None:
             raise ArgumentError(f"--out is {out}, but nothing of a live view is saved; see handsim track")
         start = TrackerStart(
-            users_of(glove, size, shape, hands), labeler_for_glove(glove, labeler), load_bodies(body), glove
+            users_of(glove, size, shape, hands), load_labeler(glove, labeler), load_bodies(body), glove
         )
         _view_live(live, start, host, port, rig, measures=shape is None and size in (None, "auto"))
         return

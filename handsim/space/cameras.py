@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_array
+from handsim._checks import check_array, check_type
 from handsim.errors import ArgumentError, RigError, choices
 from handsim.files.atomic import atomic_write
 from handsim.space.rig_file import read_rig_file, rig_lines
@@ -135,23 +135,29 @@ def rig_description(name: str) -> str:
     return read_rig_file(_SHIPPED / f"{name}.toml").description
 
 
-def load_rig(name_or_path: str | Path) -> CameraRig:
-    """A shipped rig by its name, or your own by the path of its `.toml` file (format: docs/rigs.md).
+def load_rig(rig: CameraRig | str | Path) -> CameraRig:
+    """A shipped rig by its name, or your own by the path of its `.toml` file; a rig as it is.
+
+    The format of the file is in docs/rigs.md.
 
     Args:
-        name_or_path: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, or a path.
+        rig: A rig; `figure5` (sixteen cameras, as in the paper), `eight`, `six`; or a path.
 
     Returns:
         The rig with its camera poses (C, 4, 4) [m], field of view [rad] and resolution [px].
 
     Raises:
+        ArgumentError: It is none of these.
         RigError: No such rig or file, or the file does not describe one; the sentence names the file.
     """
-    if str(name_or_path) in list_rigs():
-        return named_rig(str(name_or_path))
-    path = Path(name_or_path)
+    if isinstance(rig, CameraRig):
+        return rig
+    check_type("rig", rig, (str, Path), "a CameraRig, or the name or path of one", list_rigs())
+    if str(rig) in list_rigs():
+        return named_rig(str(rig))
+    path = Path(rig)
     if path.suffix.lower() != ".toml":
-        unknown = choices(str(name_or_path), list_rigs(), noun="camera rig")
+        unknown = choices(str(rig), list_rigs(), noun="camera rig")
         raise RigError(f"{unknown}, or the path of a .toml file")
     return _read(path)
 

@@ -18,8 +18,8 @@ from track.capture_tracking import track_capture
 from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.data.shards import Dataset
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
 SMALL = [
@@ -94,7 +94,7 @@ def test_empty_frames_are_labeled_as_empty(run):
 
 
 def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
-    truth = simulate_take(TakeConfig(num_frames=240))
+    truth = simulate_take(num_frames=240)
     truth.save(run / "one.truth.npz")
     columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
     capture = Capture(columns, truth.points, truth.rate)
@@ -130,9 +130,9 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        train_labeler(dataset, config, tmp_path / "killed", progress=kill, save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "killed", save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "whole")
+        train_labeler(dataset, tmp_path / "killed", config, progress=kill, save_every=0.0)
+    train_labeler(dataset, tmp_path / "killed", config, save_every=0.0)
+    train_labeler(dataset, tmp_path / "whole", config)
     resumed, whole = (load_file(tmp_path / name / "labeler.safetensors") for name in ("killed", "whole"))
     for name, values in whole.items():
         np.testing.assert_allclose(resumed[name], values, atol=1e-6)

@@ -27,7 +27,7 @@ from track.calibration.hand_size import fit_size, sample_frames
 from track.capture_tracking import capture_frames
 from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]
@@ -69,7 +69,7 @@ def run_baseline(
     """
     about = {"benchmark": BENCHMARK, "size": benchmark.size, "tracker": tracker, "users": users}
     claim(out / ABOUT, about, noun="set of results", error=BenchmarkError)
-    labeler, finished = labeler_for_glove(GLOVE, None), 0
+    labeler, finished = load_labeler(GLOVE, None), 0
     try:
         for one in benchmark.captures:
             path = out / f"{one.name}.npz"

@@ -48,7 +48,8 @@ def fine_tuned_labeler(
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler(layout, seed=seed)
     rows = _simulated_rows(layout, load_rig("figure5") if rig is None else rig, 2 * num_clouds // 3, rng)
-    network, config = copy.deepcopy(labeler.network).train(), TrainConfig(batch=_BATCH)
+    network = copy.deepcopy(labeler.network).train()
+    recipe = TrainConfig(batch=_BATCH).recipe(layout.num_markers)
     optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
     steps = -(-num_clouds // _BATCH)
     with torch_threads(1):
@@ -56,7 +57,7 @@ def fine_tuned_labeler(
             rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
             for group in optimizer.param_groups:
                 group["lr"] = float(_PEAK_RATE * rate)
-            cloud = draw_batch(rows, config, rng=rng).cloud
+            cloud = draw_batch(rows, recipe, rng=rng).cloud
             points, present = (
                 torch.from_numpy(cloud.points.astype(np.float32)),
                 torch.from_numpy(cloud.present),

@@ -18,8 +18,10 @@ import numpy as np
 from jaxtyping import Shaped
 from numpy.typing import NDArray
 
+from gloves.layout import MarkerLayout, stored_layout
 from gloves.optics.ghosts import MAX_GHOSTS
-from handsim.errors import DatasetError, choices
+from handsim._checks import check_type
+from handsim.errors import DatasetError, LayoutError, choices
 from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import checksum
@@ -192,7 +194,7 @@ def checked_manifest(file: Path, content: dict[str, Any]) -> Manifest:
 
 
 class Dataset:
-    """A finished training set, its rows memory-mapped.
+    """A finished training set of `len(dataset)` frames, its rows memory-mapped.
 
     A row is one frame of one hand. Its fields are `qpos` (27,) [m, rad], true `markers` (M, 3) [m], the
     `cameras` that see each marker, positions `observed` (M, 3) [m] and `ghosts` (4, 3) [m].
@@ -204,7 +206,9 @@ class Dataset:
         DatasetError: Not a training set, unfinished, of another schema, or damaged (the file is named).
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Path) -> None:
+        check_type("path", path, (str, Path), "the folder of a training set")
+        path = Path(path)
         self.manifest = load_manifest(path)
         for name, expected in self.manifest.files.items():
             file = path / name
@@ -239,6 +243,21 @@ class Dataset:
         self.path, self.manifest = state["path"], state["manifest"]
         self.shards = self._map_shards()
 
+    def __len__(self) -> int:
+        return self.manifest.num_frames
+
+    @property
+    def layout(self) -> MarkerLayout:
+        """The glove of its hands.
+
+        Raises:
+            DatasetError: The manifest holds none.
+        """
+        try:
+            return stored_layout(self.manifest.config["layout"])
+        except (KeyError, TypeError, LayoutError) as error:
+            raise DatasetError(f"{self.path / MANIFEST} holds no layout: {error}") from error
+
     @property
     def marker_names(self) -> tuple[str, ...]:
         """Markers in label order."""
@@ -255,6 +274,19 @@ class Dataset:
     def hands(self, shard: int) -> list[HandShape]:
         """The hands of a shard; the `hand` of its rows is an index into them."""
         return [unpack_hand(record) for record in _load_records(self.path / hands_name(shard), HAND_DTYPE)]
+
+
+def load_dataset(dataset: Dataset | str | Path) -> Dataset:
+    """A training set as it is, or by its folder.
+
+    Raises:
+        ArgumentError: It is neither.
+        DatasetError: As of `Dataset`.
+    """
+    if isinstance(dataset, Dataset):
+        return dataset
+    check_type("dataset", dataset, (str, Path), "a Dataset or the folder of one")
+    return Dataset(dataset)
 
 
 def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:

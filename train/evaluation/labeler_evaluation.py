@@ -4,23 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from gloves.captures.capture import Capture
+from gloves.captures.collection import find_captures, read_markers
+from gloves.captures.markers import select_hands
+from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
-from gloves.takes.take import Take
-from handsim.errors import CaptureError
-from train.data.augmentation import Cloud, Corruption, corrupt
+from gloves.takes.take import Take, load_take
+from handsim._checks import check_rng, check_type
+from handsim.errors import ArgumentError, CaptureError
+from train.data.augmentation import Cloud, Corruption
 from train.data.batches import paper_corruption
+from train.data.own_corruption import OwnCorruption, draw_cloud
+from train.data.shards import MANIFEST, Dataset, load_dataset
 from train.evaluation.metrics import LabelCounts
 from train.evaluation.reliability import error_without, expected_calibration_error
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 _CHUNK: Final = 4096
+CLEAN: Final = Corruption(occlude=0, ghosts=0)
+"""No corruption but the order of points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,31 +53,109 @@ class Report:
     """Slots, points, occlusions and ghosts counted, see `train.evaluation.metrics.LabelCounts.numbers`."""
 
 
+Truth = Float[np.ndarray, "T M 3"] | Dataset | Take | Capture | str | Path
+"""Markers whose labels are known: [m] in the labeler's order, a training set, a take with its truth, a
+labeled capture, the path of one of the three, or a folder of captures."""
+
+
 def evaluate_labeler(
-    labeler: Labeler,
-    markers: Float[np.ndarray, "T M 3"],
-    corruption: Corruption,
+    labeler: MarkerLayout | Labeler | str | Path,
+    truth: Truth | Sequence[Truth],
+    corruption: Corruption | OwnCorruption | str = CLEAN,
     *,
-    rng: np.random.Generator,
+    every: int = 1,
+    rng: np.random.Generator | None = None,
 ) -> Report:
-    """Corrupt known markers, label them and count errors.
+    """Corrupt known markers, label them and count errors; takes keep the gaps and ghosts that they have.
 
     Args:
-        labeler: The labeler to evaluate.
-        markers: True markers (T, M, 3) [m] in the labeler's order, NaN where missing.
-        corruption: Occlusion, ghosts and jitter to draw.
-        rng: Source of all randomness.
+        labeler: The labeler to evaluate, its name or path, or a glove whose labeler it is.
+        truth: True markers (T, M, 3) [m] in the labeler's order, NaN where missing; a training set, a labeled
+            capture or a take with its truth; the path of one of these or of a folder of captures; or several.
+            Each hand is counted by itself.
+        corruption: Occlusion, ghosts and jitter to draw; none when not given. Or a corruption of your own, as
+            `CloudStream` takes it.
+        every: Take one frame of this many; 1 takes all.
+        rng: Source of all randomness; one of seed 0 when not given.
 
     Returns:
-        Figures as shares in [0, 1], by their names, and the counts that they come from.
+        Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
+        of a take are those within 0.1 [m] of its markers.
 
     Raises:
-        ArgumentError: `markers` are not in meters.
+        ArgumentError: An argument is of another type, or markers are not in meters.
+        CaptureError: A file cannot be read, its glove has other markers than the labeler knows, takes are
+            given with others or to be corrupted, or there is nothing to count.
     """
-    count = _Count(labeler)
-    for first in range(0, len(markers), _CHUNK):
-        count.add_cloud(corrupt(markers[first : first + _CHUNK], corruption, rng=rng))
-    return count.report()
+    network = load_labeler(labeler)
+    check_type("every", every, int, "a whole number")
+    if every < 1:
+        raise ArgumentError(f"every is {every}, expected at least 1")
+    rng = np.random.default_rng(0) if rng is None else rng
+    check_rng(rng)
+    several = isinstance(truth, list | tuple) and not isinstance(truth, Capture | Take)
+    given: list[Any] = list(truth) if several else [truth]  # type: ignore[arg-type]
+    count, takes = _Count(network), [one for one in given if _is_take(one)]
+    if takes and (len(takes) < len(given) or corruption != CLEAN or every > 1):
+        raise CaptureError(
+            "a simulated take is counted whole, with its own gaps and ghosts, expected takes alone and no "
+            "corruption"
+        )
+    for take in takes:
+        _count_take(count, take if isinstance(take, Take) else load_take(take))
+    if not takes:
+        markers = _markers(given, network.marker_names)[::every]
+        for first in range(0, len(markers), _CHUNK):
+            count.add_cloud(draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng))
+    report = count.report()
+    if not report.confusion[:-1].any() and not all(isinstance(one, np.ndarray) for one in given):
+        raise CaptureError(
+            f"nothing to count: no frame holds any of {', '.join(network.marker_names)}, expected labeled "
+            "captures"
+        )
+    return report
+
+
+def _is_take(truth: Any) -> bool:
+    return isinstance(truth, Take) or (isinstance(truth, str | Path) and Path(truth).suffix == ".npz")
+
+
+def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, "T M 3"]:
+    """The markers of all that was given [m], in the labeler's order."""
+    parts = []
+    for one in truth:
+        if isinstance(one, np.ndarray):
+            parts.append(_checked_markers(one, len(names)))
+        elif isinstance(one, Capture):
+            parts += select_hands(one, names)
+        elif isinstance(one, Dataset) or (isinstance(one, str | Path) and (Path(one) / MANIFEST).is_file()):
+            parts.append(_markers_of_set(load_dataset(one), names))
+        else:
+            expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
+            check_type("truth", one, (str, Path), expected)
+            parts.append(read_markers(find_captures([Path(one)]), names))
+    if not parts:
+        raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
+    return np.concatenate(parts)
+
+
+def _checked_markers(markers: NDArray[Any], count: int) -> NDArray[np.float64]:
+    if markers.ndim != 3 or markers.shape[1:] != (count, 3) or markers.dtype.kind not in "fiu":
+        raise ArgumentError(
+            f"markers are {markers.dtype} of shape {markers.shape}, expected (T, {count}, 3) numbers [m]"
+        )
+    return markers.astype(np.float64)
+
+
+def _markers_of_set(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.float64]:
+    if dataset.marker_names != names:
+        raise _other_markers(f"the set {dataset.path}", dataset.marker_names, names)
+    markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
+    return markers
+
+
+def _other_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> CaptureError:
+    return CaptureError(f"{owner} has markers {', '.join(has)}, the labeler knows {', '.join(knows)}")
 
 
 def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> Report:
@@ -88,33 +177,15 @@ def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
     return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
 
 
-def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
-    """Label every hand of every frame of simulated takes, separated by the truth, and count errors.
-
-    Args:
-        labeler: The labeler to evaluate.
-        takes: Takes with truth.
-
-    Returns:
-        Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
-        are those within 0.1 [m] of its markers.
-
-    Raises:
-        CaptureError: A take's glove has other markers than the labeler knows.
-    """
-    count = _Count(labeler)
-    for take in takes:
-        for hand in range(len(take.hands)):
-            names = take.hands[hand].fit.layout.names
-            if names != labeler.marker_names:
-                raise CaptureError(
-                    f"the take's glove has markers {', '.join(names)}, the labeler knows "
-                    f"{', '.join(labeler.marker_names)}"
-                )
-            clouds, truths = hand_clouds(take, hand)
-            for first in range(0, len(clouds), _CHUNK):
-                count.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
-    return count.report()
+def _count_take(count: _Count, take: Take) -> None:
+    """Label every hand of every frame of a take, separated by the truth."""
+    for hand in range(len(take.hands)):
+        names = take.hands[hand].fit.layout.names
+        if names != count.labeler.marker_names:
+            raise _other_markers("the take's glove", names, count.labeler.marker_names)
+        clouds, truths = hand_clouds(take, hand)
+        for first in range(0, len(clouds), _CHUNK):
+            count.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
 
 
 def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:

@@ -11,11 +11,11 @@ from rich.table import Table
 
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler, evaluate_takes
+from train.evaluation.labeler_evaluation import Report, evaluate_labeler
 from train.evaluation.paper import AUGMENTATIONS, TABLE2, TEST_SETS
 from train.labelers.protocol import Labeler
 from train.simulation.room_settings import KINDS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 if TYPE_CHECKING:
     from gloves.takes.take import Take
@@ -57,7 +57,7 @@ def simulate_takes(glove: str, seed: int, done: Callable[[], None]) -> dict[str,
     """The twins of the paper's four captures."""
     takes: dict[str, Take] = {}
     for kind in KINDS:
-        takes[kind] = simulate_take(TakeConfig(kind=kind, glove=glove, seed=seed))
+        takes[kind] = simulate_take(kind=kind, glove=glove, seed=seed)
         done()
     return takes
 
@@ -82,7 +82,7 @@ def measure_tests(
         name: evaluate_labeler(labeler, markers, recipe, rng=np.random.default_rng(seed))
         for name, markers in stills.items()
     }
-    return reports | {name: evaluate_takes(labeler, [take]) for name, take in takes.items()}
+    return reports | {name: evaluate_labeler(labeler, [take]) for name, take in takes.items()}
 
 
 def print_table2(nets: Mapping[str, Mapping[str, Report]], *, title: str) -> Table:

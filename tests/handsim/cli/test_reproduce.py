@@ -24,9 +24,9 @@ from track.evaluation.comparison import (
 from track.evaluation.paper import CAMERAS, FRAMES, HAN, TABLE5, TABLE7
 from track.evaluation.tables import print_errors, print_trials
 from track.evaluation.trials import FEWEST_FRAMES
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 from train.simulation.room_settings import KINDS, TWINS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what they share is made once
 METHODS = (OURS, PAPERS_LOOP, *NEED_FIRST_LABELS)
@@ -115,7 +115,7 @@ def test_few_cameras(tmp_path, capsys):
     assert main(["reproduce", "cameras", "--num-frames", "8", "--json", str(file)]) == 0
     said = capsys.readouterr().out
     saved = json.loads(file.read_text())
-    take = simulate_take(TakeConfig(kind="single-hand", num_frames=8, rig="six"))
+    take = simulate_take(kind="single-hand", num_frames=8, rig="six")
     assert saved["missing"] == pytest.approx(1.0 - take.markers_present().mean())
     assert f"{100 * saved['missing']:.2f} % of the markers missing" in said
     tables = rows(said)
@@ -133,7 +133,7 @@ def test_the_paper_has_no_figures_of_other_gloves(capsys):
 
 def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     monkeypatch.setattr(comparison, "USERS", {"calibrated": USERS["calibrated"]})
-    take = simulate_take(TakeConfig(kind="single-hand", num_frames=FEWEST_FRAMES)).without_body()
+    take = simulate_take(kind="single-hand", num_frames=FEWEST_FRAMES).without_body()
     measured = compare_trackers({"single-hand": take}, load_labeler("dense19"), seed=0, trials=1)
     by_name = {one.method: one for one in measured}
     assert by_name[OURS].initialization[0] <= 3 and by_name[OURS].recovery[0] <= 3
@@ -156,7 +156,7 @@ def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
 
 def test_a_body_that_is_followed_must_have_its_labels():
     labeler = load_labeler("dense19")
-    take = simulate_take(TakeConfig(kind="hand-controller", num_frames=20))
+    take = simulate_take(kind="hand-controller", num_frames=20)
     first, second, *_ = measure_with_body("controller", take, labeler)
     assert (first.users, second.users) == tuple(USERS) and first.report.right.all()
     labels = take.labels.copy()

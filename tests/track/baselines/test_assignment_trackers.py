@@ -14,14 +14,14 @@ from track.baselines.assignment_trackers import GATE, NEAR, HungarianTracker, Ne
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
 from track.evaluation.trials import cut_take, hide_points
 from track.tracked_frame import Status
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker])
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="single-hand", num_frames=300)).without_body()
+    return simulate_take(kind="single-hand", num_frames=300).without_body()
 
 
 @pytest.fixture(scope="module")

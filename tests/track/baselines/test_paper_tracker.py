@@ -15,9 +15,9 @@ from track.baselines.paper_tracker import GATE, PaperTracker
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
 from track.evaluation.trials import cut_take, hide_points
 from track.tracked_frame import Status, TrackedFrame
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeling
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 class Asked:
@@ -39,7 +39,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240)).without_body()
+    return simulate_take(kind="hand-controller", num_frames=240).without_body()
 
 
 @pytest.fixture(scope="module")

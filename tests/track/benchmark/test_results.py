@@ -18,7 +18,7 @@ from track.benchmark.manifest import label_names
 from track.benchmark.results import find_results, read_result
 from track.capture_tracking import track_capture
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 
 NAME = "hand-controller-hard-1"
 LABELS = label_names()

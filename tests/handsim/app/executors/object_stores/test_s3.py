@@ -36,7 +36,7 @@ from tests.handsim.app.executors.object_stores.stored_set import (
 )
 from train.data.shards import MANIFEST
 from train.simulation import generation
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 
 pytestmark = pytest.mark.xdist_group("object stores")  # what they share is made once
 fsspec = pytest.importorskip("fsspec", reason="needs `pip install 'handsim[object-stores]'`")
@@ -50,7 +50,7 @@ from train.simulation.frame_scenes import SceneMix
 
 generation.ROWS_PER_SHARD = {ROWS}
 config = DatasetConfig(num_frames={CONFIG.num_frames}, seed=5, frames_per_hand=50, scenes={ALONE})
-generation.generate_dataset(config, ObjectFolder(sys.argv[1]), workers=1)
+generation.make_dataset(config, ObjectFolder(sys.argv[1]), workers=1)
 """
 
 
@@ -188,7 +188,7 @@ def test_workers_of_a_cluster_share_no_folder(s3, whole, tmp_path, monkeypatch):
         # As on another machine: workers do not see the folder that the command runs in.
         monkeypatch.setattr("handsim.app.executors.dask_cluster.Path.cwd", lambda: tmp_path / "nowhere")
         executor = DaskCluster(cluster.scheduler_address, None)
-        generate_dataset(CONFIG, ObjectFolder("s3://bucket/cluster"), workers=executor)
+        make_dataset(CONFIG, ObjectFolder("s3://bucket/cluster"), workers=executor)
     assert contents(s3.folder / "bucket/cluster") == whole
     assert list(here.iterdir()) == []
 
@@ -205,7 +205,7 @@ def test_a_run_that_is_killed_while_it_sends_leaves_whole_objects(s3, whole):
             assert all(name in there for name in json.loads(receipt.read_text())["files"])
         finished.append(len(list(out.glob("finished/*"))))
     assert finished[0] < finished[1] < 4, "it went on after what was there"
-    generate_dataset(CONFIG, ObjectFolder("s3://bucket/killed"), workers=1)
+    make_dataset(CONFIG, ObjectFolder("s3://bucket/killed"), workers=1)
     assert contents(out) == whole
 
 
