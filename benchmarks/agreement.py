@@ -1,6 +1,6 @@
 """How exactly the fast paths agree with MuJoCo, and how valid sampled poses are.
 
-    python benchmarks/agreement.py [--hands 50 --poses 2000]
+    python -m benchmarks.agreement [--hands 50 --poses 2000]
 
 Random people of both sides and all ages: kinematics against mj_kinematics, sight against mj_multiRay, ranges,
 and the deepest self-penetration of any sampled pose.
@@ -12,8 +12,8 @@ import argparse
 
 import mujoco
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays

@@ -1,6 +1,6 @@
 """How near a calibration comes to the truth, on simulated users.
 
-    python benchmarks/calibration.py [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
+    python -m benchmarks.calibration [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
         [--picture FILE.png] [--captures FOLDER]
 
 Each user is one hand, right and left in turn: a size's mean hand made 8 % larger or smaller, with the
@@ -28,9 +28,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from machine import describe
-from people import right_hands
 
+from benchmarks.machine import describe
+from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.people import right_hands
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, load_layout
@@ -44,7 +45,6 @@ from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import SkinPatch, displace_markers
 from track.calibration.user_calibration import calibrate
-from track.evaluation.hand_errors import hand_errors
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 

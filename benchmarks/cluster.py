@@ -1,6 +1,6 @@
 """A Dask scheduler and its workers against this machine's worker processes: bytes, deaths, and overhead.
 
-python benchmarks/cluster.py [--frames 400000] [--pictures 5000] [--workers 4] [--rounds 2] [--shards 10000]
+python -m benchmarks.cluster [--frames 400000] [--pictures 5000] [--workers 4] [--rounds 2] [--shards 10000]
 
 Training sets and pictures are made by worker processes and by as many `dask worker` processes of one thread,
 in turns, and compared byte by byte. Then each is made once more while two of the workers are killed (SIGKILL)
@@ -26,8 +26,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
 from handsim.app.executors.dask_cluster import DaskCluster
 from handsim.app.executors.executor import Executor, Processes
 from render.config import RenderConfig

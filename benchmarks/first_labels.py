@@ -2,7 +2,7 @@
 
 The clock runs while frames are generated and while the network learns, and stands while it is measured.
 
-python benchmarks/first_labels.py [--captures DATA] [--labeler cnn] [--frames 100000] [--samples 400000]
+python -m benchmarks.first_labels [--captures DATA] [--labeler cnn] [--frames 100000] [--samples 400000]
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import time
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
+from benchmarks.paper.labeling_tables import measure_augmentations
+from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
 from gloves.captures.collection import find_captures, read_markers
 from gloves.layout import load_layout
 from train.config import KINDS, TrainConfig, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
-from train.evaluation.paper import AUGMENTATIONS, TABLE2
-from train.evaluation.tables import measure_augmentations
 from train.labelers.kinds import labeler_of
 from train.loop import start_fabric
 from train.simulation.dataset_config import DatasetConfig

@@ -1,6 +1,6 @@
 """How fast training sets are made, every ray from every marker to every camera cast.
 
-    python benchmarks/generation.py [--frames 170330]
+    python -m benchmarks.generation [--frames 170330]
 
 The floor of a frame is what cannot be left out: its rays, 19 markers x 16 cameras, each against 21 capsules,
 and its row on the disk. Then come the stages of `train.simulation.generation` for a hand alone, a new
@@ -19,8 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
 from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.ghosts import sample_ghosts

@@ -1,6 +1,6 @@
 """Fit of the hand model to real people: one shape and one marker placement per person, one pose per frame.
 
-    python benchmarks/hand_fit.py CAPTURES [--frames 400 --held-out 400 --seed 0]
+    python -m benchmarks.hand_fit CAPTURES [--frames 400 --held-out 400 --seed 0]
 
 CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (right hands, *_right.trc). Shape
 (bone lengths, knuckles, directions of digits) and marker places are fitted together with the poses of some
@@ -16,9 +16,9 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from machine import describe
-from people import right_hands
 
+from benchmarks.machine import describe
+from benchmarks.people import right_hands
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim.hand.jacobian import skinned_jacobian

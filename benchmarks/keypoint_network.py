@@ -1,6 +1,6 @@
 """What drawn pictures teach: a keypoint network that has seen only them, tried on photographs.
 
-    python benchmarks/keypoint_network.py OUT --photos FOLDER --reference FILE [--variants ours plain ...]
+    python -m benchmarks.keypoint_network OUT --photos FOLDER --reference FILE [--variants ours plain ...]
         [--pictures 12000 --samples 240000 --seed 0]
 
 Trains the network of examples/14_train_a_keypoint_network.py once for each variant of the pictures, from
@@ -37,8 +37,8 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from machine import describe
 
+from benchmarks.machine import describe
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES

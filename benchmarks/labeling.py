@@ -1,6 +1,6 @@
 """How long labelers take for one hand on one core, matching included, whatever runs them.
 
-python benchmarks/labeling.py [--frames 2000] [--cnn RUN]
+python -m benchmarks.labeling [--frames 2000] [--cnn RUN]
 
 RUN is a folder that handsim train --labeler cnn wrote; without it the paper's network is timed untrained, so
 that it tries every view.
@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import torch
-from machine import describe
 
+from benchmarks.machine import describe
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
 from train.glove_labeler import load_labeler

@@ -4,7 +4,7 @@ A simulated capture of two hands is replayed at 120 Hz by a process of its own, 
 clients, which are processes of their own. In the middle the server is restarted, with another data port.
 The latency that is added to the tracker's own time is from the server's `sendto` to the client's `recv`.
 
-python benchmarks/live_output.py [--seconds 600]
+python -m benchmarks.live_output [--seconds 600]
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from multiprocessing.sharedctypes import Synchronized
 from typing import Any
 
 import numpy as np
-from machine import describe
 from pythonosc.osc_bundle import OscBundle
 from websockets.sync.client import connect
 
+from benchmarks.machine import describe
+from benchmarks.paper.take_evaluation import true_users
 from gloves.takes.take import Take
 from track.capture_tracking import track_stream, warm_up
-from track.evaluation.take_evaluation import true_users
 from track.sinks.addresses import open_sinks
 from track.streams import natnet
 from track.streams.addresses import open_source

@@ -5,7 +5,7 @@ the tracker reads. On the way 5 % of the packets are dropped, as many doubled, o
 corrupted; others bring junk, wild times and frames of another sender. The server restarts now and then, on
 its port; another one on another port is not heard. Then the command itself is killed.
 
-python benchmarks/live_stream.py [--seconds 3600] [--no-hands]
+python -m benchmarks.live_stream [--seconds 3600] [--no-hands]
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
+from benchmarks.paper.take_evaluation import true_users
 from gloves.takes.growing import GrownArchive
 from gloves.takes.take import Take
 from gloves.takes.tracked_take import load_tracked_take
 from track.capture_tracking import track_stream
-from track.evaluation.take_evaluation import true_users
 from track.live_recording import LiveRecorder
 from track.streams import natnet
 from track.streams.natnet import Kind, MarkerFrame, ServerInfo

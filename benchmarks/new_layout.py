@@ -1,6 +1,6 @@
 """From a glove of ten markers, nothing but a TOML file, to a labeler: three commands, timed and measured.
 
-python benchmarks/new_layout.py [--frames 170330] [--samples 800000]
+python -m benchmarks.new_layout [--frames 170330] [--samples 800000]
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from machine import describe
-
+from benchmarks.machine import describe
 from handsim.cli.main import main as handsim
 
 GLOVE = Path(__file__).parents[1] / "examples" / "ten_markers.toml"

@@ -1,6 +1,6 @@
 """How well sampled poses cover those of real people: the distance to the nearest one.
 
-    python benchmarks/pose_coverage.py CAPTURES [--poses 100000 --frames 2000 --seed 0]
+    python -m benchmarks.pose_coverage CAPTURES [--poses 100000 --frames 2000 --seed 0]
 
 CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (such as the public
 Mocap_SIG18_Data); only right hands, named *_right.trc, are used. Sampled poses of the mean hand are scaled to
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe
-from people import right_hands
 
+from benchmarks.machine import describe
+from benchmarks.people import right_hands
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos

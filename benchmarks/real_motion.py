@@ -1,6 +1,6 @@
 """The tracker on real hands in motion: published poses, two hands, made into captures without names.
 
-python benchmarks/real_motion.py DATA [--conditions clean gaps close new-ids exchanged-ids]
+python -m benchmarks.real_motion DATA [--conditions clean gaps close new-ids exchanged-ids]
     [--frames 0] [--label]
 
 DATA is a folder of Mocap_SIG18_Data (Han et al. 2018), with User1/capture1 and so on in it. The left and the
@@ -27,9 +27,9 @@ from time import perf_counter
 
 import numpy as np
 import torch
-from machine import describe
-from real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 
+from benchmarks.machine import describe
+from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 from gloves.layout import load_layout
 from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame

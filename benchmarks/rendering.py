@@ -1,6 +1,6 @@
 """Speed of rendering, accuracy of depth, and memory.
 
-    MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
+    MUJOCO_GL=egl python -m benchmarks.rendering [speed accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
     colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
@@ -27,8 +27,8 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
-from machine import describe
 
+from benchmarks.machine import describe
 from handsim.app.workers import in_processes
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig

@@ -1,6 +1,6 @@
 """How fast the capture room is: people, gloves and motions, then every line of sight, then the optics.
 
-    python benchmarks/room.py [--frames 2048 --repeats 5]
+    python -m benchmarks.room [--frames 2048 --repeats 5]
 
 Two hands and an object (hand-pen, hand-controller), two hands (hand-hand), all past triangle meshes, and one
 hand alone past capsules as in training sets; whole captures on one core and in two processes side by side,
@@ -19,8 +19,8 @@ from typing import Any
 
 import numba
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
 from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_mesh

@@ -1,6 +1,6 @@
 """What a million and a billion cost: processor time and bytes of each item, and how far a scheduler reaches.
 
-python benchmarks/scale.py [--core-hour 0.045] [--gigabyte-month 0.023] [--workers 4 16]
+python -m benchmarks.scale [--core-hour 0.045] [--gigabyte-month 0.023] [--workers 4 16]
 
 Items are made in this process by one thread, and processor time counts, so that other work on the machine
 matters little. Prices are dollars per core-hour and per gigabyte and month. For the scheduler's part a Dask
@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
 from handsim.app.executors.dask_cluster import DaskCluster
 from render.config import RenderConfig
 from render.session import render_take

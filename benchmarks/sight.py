@@ -1,6 +1,6 @@
 """How right and how fast lines of sight past the skin are, what capsules miss, and what each rig sees.
 
-    python benchmarks/sight.py [--poses 500 --seed 0]
+    python -m benchmarks.sight [--poses 500 --seed 0]
 
 One hand with the dense19 glove, random valid poses, turns and places, hands of random people. The reference
 for every line is embree (through trimesh, package embreex) on the same meshes. Speeds are processor time of
@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from machine import describe
 
+from benchmarks.machine import describe
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh

@@ -1,6 +1,6 @@
 """The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
 
-    OMP_NUM_THREADS=1 python benchmarks/tracking.py [calibrated drums starts speed memory]
+    OMP_NUM_THREADS=1 python -m benchmarks.tracking [calibrated drums starts speed memory]
         [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
@@ -30,17 +30,11 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from drum_takes import with_drum
-from machine import describe
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
-from handsim.cli.calibrate import calibrate
-from track.capture_tracking import warm_up
-from track.evaluation.hand_errors import hand_errors
-from track.evaluation.take_evaluation import (
+from benchmarks.drum_takes import with_drum
+from benchmarks.machine import describe
+from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.paper.take_evaluation import (
     TrackingReport,
     evaluate_tracker,
     measured_users,
@@ -48,7 +42,13 @@ from track.evaluation.take_evaluation import (
     seen_frame,
     true_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times
+from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
+from gloves.captures.capture import Capture
+from gloves.captures.formats import write_capture
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from handsim.cli.calibrate import calibrate
+from track.capture_tracking import warm_up
 from track.tracker import Tracker
 from track.user import load_user
 from train.glove_labeler import load_labeler

@@ -1,6 +1,6 @@
 """How valid motions are, frame by frame: the deepest overlaps, the angles out of range, the fastest wrists.
 
-    python benchmarks/validity.py [--frames N --seeds 3 --people 5]
+    python -m benchmarks.validity [--frames N --seeds 3 --people 5]
 
 All twins of the paper's captures at full length (or N frames), and every script by people drawn at random for
 ten seconds each. Overlaps are of the capsules that stand for flesh, and of an object's parts, as MuJoCo
@@ -13,8 +13,8 @@ import argparse
 import itertools
 
 import numpy as np
-from machine import describe
 
+from benchmarks.machine import describe
 from gloves.takes.take import Take
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
 from gloves.takes.tracked_take import load_tracked_take
@@ -15,7 +16,6 @@ from render.cameras.viewpoints import ViewConfig
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
-from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.simulation.takes import TakeConfig

@@ -32,7 +32,7 @@ def run_command(
     *,
     prog: str,
     help_line: str = "",
-    args: Sequence[str],
+    args: Sequence[str] | None = None,
     is_silent: bool = False,
 ) -> Any:
     """Parse arguments for a function, or for one of several by its name, and call it.

@@ -35,10 +35,10 @@ from track.bodies.rigid_body import RigidTemplate
 from track.calibration.hand_size import sample_frames
 from track.capture_tracking import capture_frames, track_capture, warm_up
 from track.corrected_take import correct_take
-from track.evaluation.take_summary import summarize, suspicions
 from track.sinks.addresses import open_sinks
 from track.sinks.sink_group import SinkGroup
 from track.streams.frame_source import StreamedFrame
+from track.take_summary import summarize, suspicions
 from track.tracked_frame import TrackedFrame
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler

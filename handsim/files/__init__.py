@@ -8,5 +8,4 @@
 - object_folder: a folder of an object store, as fsspec reaches it
 - outputs: a check that no output is written over an input
 - toml_values: type checks and formatting of TOML values
-- toml_settings: settings dataclasses from tables of TOML files
 """

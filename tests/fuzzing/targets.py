@@ -30,11 +30,7 @@ from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive
-from track.benchmark.manifest import label_names, load_benchmark
-from track.benchmark.results import read_result
 from track.bodies.body_file import load_body
-from track.evaluation.sweep.cells import cells_of
-from track.evaluation.sweep.sweep_file import load_sweep
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
 
@@ -113,14 +109,6 @@ def _read_calibration(path: Path) -> None:
         rig_of_cameras(path, marker_cameras(path, load_lab_cameras(path)))
 
 
-def _read_sweep(path: Path) -> None:
-    cells_of(load_sweep(path))
-
-
-def _read_result(path: Path) -> None:
-    read_result(path, seeds.benchmark_capture(), label_names())
-
-
 _ALL: Final = (
     Target("c3d", seeds.c3d, read_capture),
     Target("trc", seeds.trc, read_capture),
@@ -128,7 +116,6 @@ _ALL: Final = (
     Target("tsv", seeds.tsv, read_capture),
     Target("layout", seeds.layout, load_layout),
     Target("rig", seeds.rig, load_rig),
-    Target("sweep", seeds.sweep, _read_sweep),
     Target("cameras", seeds.camera_files, load_cameras),
     Target("calibrations", seeds.calibrations, _read_calibration),
     Target("poses", seeds.own_poses, lambda path: load_poses(PoseFile(path)), mutate_archive),
@@ -138,10 +125,6 @@ _ALL: Final = (
     Target("tracked", seeds.tracked, load_tracked_take, mutate_archive),
     Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
-    Target("benchmark", seeds.benchmark, lambda path: load_benchmark(path.parent)),
-    Target("result_table", seeds.result_table, _read_result),
-    Target("result_arrays", seeds.result_arrays, _read_result, mutate_archive),
-    Target("result_points", seeds.result_points, _read_result),
     Target("weights", seeds.weights, _read_weights),
     Target("onnx", seeds.onnx, _read_onnx),
     Target("dataset", seeds.dataset, _read_dataset),

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from handsim.cli.main import main
@@ -15,7 +16,6 @@ from render.cameras.viewpoints import ViewConfig
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
-from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.data.shards import Dataset
 from train.glove_labeler import load_labeler

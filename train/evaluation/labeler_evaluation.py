@@ -24,8 +24,7 @@ from train.data.augmentation import Cloud, Corruption
 from train.data.batches import paper_corruption
 from train.data.own_corruption import OwnCorruption, draw_cloud
 from train.data.shards import MANIFEST, Dataset, load_dataset
-from train.evaluation.metrics import LabelCounts
-from train.evaluation.reliability import error_without, expected_calibration_error
+from train.evaluation.metrics import LabelCounts, error_without, expected_calibration_error
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
@@ -39,7 +38,7 @@ class Report:
     """The result of an evaluation."""
 
     figures: dict[str, float]
-    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.reliability` the expected
+    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.metrics` the expected
     calibration error and the share of points labeled wrongly without the 2 % of least confidence."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int

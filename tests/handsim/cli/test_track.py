@@ -17,6 +17,7 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.paper.hand_errors import hand_errors
 from gloves.attachment import wear
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
@@ -32,7 +33,6 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
 from track.bodies.body_file import load_body
-from track.evaluation.hand_errors import hand_errors
 from track.streams.addresses import open_source
 from track.streams.natnet_server import ReplayServer
 from track.user import load_user

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.paper.hand_errors import hand_errors
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
@@ -20,7 +21,6 @@ from poses.motion.wrist_paths import WristConfig, wrist_path
 from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import displace_markers
 from track.calibration.user_calibration import Calibration, CalibrationError, calibrate, calibrate_hands
-from track.evaluation.hand_errors import hand_errors
 from track.user import load_user, save_user
 from train.simulation.calibration_take import CalibrationTakeConfig, calibration_angles
 
