@@ -127,7 +127,7 @@ def attach(layout: MarkerLayout | str | Path, model: HandModel | HandShape | str
     return GloveFit(worn_by, attach_markers(load_layout(layout), worn_by))
 
 
-def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
+def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> GloveFit:
     """A hand of one of the five sizes, with its glove put on as designed.
 
     Args:
@@ -139,8 +139,9 @@ def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
         ArgumentError: There is no such size or side.
         LayoutError: A marker meets no skin, and the message names it; or the glove is for the other hand.
     """
-    layout.check_side(side)
-    return attach(layout, HandModel.named(size, side=side))
+    worn, model = load_layout(layout), HandModel.named(size, side=side)
+    worn.check_side(side)
+    return attach(worn, model)
 
 
 def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:

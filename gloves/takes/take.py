@@ -22,6 +22,7 @@ from gloves.takes.archives import (
     settings_of,
     write_archive,
 )
+from handsim._checks import check_type
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
@@ -156,6 +157,7 @@ def load_take(path: str | Path) -> Take:
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
     """
+    check_type("path", path, (str, Path), "the path of a take")
     return read_archive(path, KIND, (SCHEMA,), _unpack)
 
 
