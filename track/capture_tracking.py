@@ -23,6 +23,7 @@ from gloves.optics.identities import number_runs
 from gloves.takes.tracked_take import STATUSES, TrackedTake, usual_rate
 from handsim.errors import CaptureError
 from handsim.hand.topology import NUM_QPOS
+from track.intake import FARTHEST
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
@@ -60,7 +61,7 @@ def track_capture(
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
-    check_place(capture, tracker.config.intake.farthest)
+    check_place(capture, FARTHEST)
     recorder = TakeRecorder(tracker)
     for frame, tracked in track_stream(frames, tracker):
         if taken is not None:

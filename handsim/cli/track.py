@@ -184,7 +184,12 @@ class TimedTracker(Tracker):
         super().__init__(hands, labeler, bodies)
         self._seconds = seconds
 
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
+    def step(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        ids: Int[np.ndarray, "N"] | None = None,
+        time: float | None = None,
+    ) -> TrackedFrame:
         """Track the next frame, see `Tracker.step`."""
         start = perf_counter()
         frame = super().step(points, ids, time)
