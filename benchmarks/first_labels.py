@@ -20,7 +20,7 @@ from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
 from gloves.captures.collection import find_captures, read_markers
 from gloves.layout import load_layout
-from train.config import KINDS, TrainConfig, default_config
+from train.config import KINDS, TrainConfig, batch_recipe, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.labelers.kinds import labeler_of
@@ -67,7 +67,7 @@ def race(
     make_dataset(DatasetConfig(glove=GLOVE, num_frames=frames), folder / "set")
     dataset = Dataset(folder / "set")
     rows, names = dataset.rows(), dataset.marker_names
-    recipe = config.recipe(len(names))
+    recipe = batch_recipe(config, len(names))
     print(f"{(time.perf_counter() - start) / 60:5.1f} min: {frames} frames generated")
     state = TrainingState(config, start_fabric(config, folder), rows)
     beaten: dict[str, dict[str, float]] = {name: {} for name in tests}

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from benchmarks.machine import describe
-from train.config import default_config
+from train.config import batch_recipe, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric
@@ -53,7 +53,7 @@ def main() -> None:
         rows = Dataset(Path(folder) / "set").rows()
         state = TrainingState(config, start_fabric(config, Path(folder)), rows)
         rng = np.random.default_rng(0)
-        recipe = config.recipe(rows["markers"].shape[1])
+        recipe = batch_recipe(config, rows["markers"].shape[1])
         batch = draw_batch(rows, recipe, rng=rng)
         points, present = batch.cloud.points, batch.cloud.present
         hand = state.network.mean_hand.get()

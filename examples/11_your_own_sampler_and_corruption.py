@@ -15,7 +15,7 @@ from own_ideas import Pointing, hide_a_side
 from torch.utils.data import DataLoader
 
 from handsim import HandSimError
-from train import CloudStream, TrainConfig, evaluate_labeler, generate_dataset, train_labeler
+from train import CloudStream, OwnCorruption, TrainConfig, evaluate_labeler, generate_dataset, train_labeler
 
 
 def main() -> None:
@@ -34,7 +34,8 @@ def main() -> None:
         markers = dataset.rows()["markers"][-200:]  # (200, 19, 3) [m]
         figures = evaluate_labeler(folder / "run", markers).figures
         print(f"{100 * figures['slot_accuracy']:.1f} % of slots right after {config.samples} clouds")
-        loader = DataLoader(CloudStream(dataset, hide_a_side, batch=64), batch_size=None)
+        corruption: OwnCorruption = hide_a_side
+        loader = DataLoader(CloudStream(dataset, corruption, batch=64), batch_size=None)
         points, present, labels = next(iter(loader))  # (64, N, 3) [m], (64, N) bool, (64, N) marker or -1
         print(f"a batch: {tuple(points.shape)}, {int((present & (labels < 0)).sum())} ghosts")
 

@@ -12,12 +12,13 @@ from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from train.config import TrainConfig
-    from train.data.augmentation import Corruption, corrupt
+    from train.data.augmentation import Cloud, Corruption, corrupt
     from train.data.cloud_stream import CloudStream
+    from train.data.own_corruption import OwnCorruption
     from train.data.shards import Dataset
-    from train.evaluation.labeler_evaluation import evaluate_labeler
+    from train.evaluation.labeler_evaluation import Report, evaluate_labeler
     from train.glove_labeler import load_labeler
-    from train.labelers.protocol import Labeler
+    from train.labelers.protocol import Labeler, Labeling
     from train.loop import train_labeler
     from train.simulation.generation import generate_dataset
     from train.simulation.takes import simulate_take
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "Cloud": "train.data.augmentation",
+        "OwnCorruption": "train.data.own_corruption",
+        "Report": "train.evaluation.labeler_evaluation",
+        "Labeling": "train.labelers.protocol",
         "CloudStream": "train.data.cloud_stream",
         "Corruption": "train.data.augmentation",
         "Dataset": "train.data.shards",
@@ -40,10 +45,14 @@ __getattr__, __dir__ = lazy_exports(
 )
 
 __all__ = [
+    "Cloud",
     "CloudStream",
     "Corruption",
     "Dataset",
     "Labeler",
+    "Labeling",
+    "OwnCorruption",
+    "Report",
     "TrainConfig",
     "__version__",
     "corrupt",

@@ -146,18 +146,6 @@ class TrainConfig:
         """The settings of the network of this kind."""
         return self.cnn if self.labeler == "cnn" else self.network
 
-    def recipe(self, num_markers: int) -> BatchRecipe:
-        """How batches are drawn for a layout of this many markers."""
-        usual = paper_corruption(num_markers).occlude
-        occlude = usual if self.occlude is None else self.occlude
-        return BatchRecipe(
-            self.batch,
-            Corruption(occlude, self.ghosts) if self.corruption is None else self.corruption,
-            self.jitter,
-            self.rig_share,
-            self.anisotropy,
-        )
-
     def record(self) -> dict[str, Any]:
         """The settings as JSON; a corruption by its name."""
         name = None if self.corruption is None else plugin_name(self.corruption)
@@ -191,6 +179,19 @@ class TrainConfig:
         check_number("rig_share", self.rig_share, 0.0, 1.0)
         check_number("anisotropy", self.anisotropy, 0.0, 1.0)
         check_number("knee", self.knee, 0.0, above=True)
+
+
+def batch_recipe(config: TrainConfig, num_markers: int) -> BatchRecipe:
+    """How a labeler's batches are drawn for a layout of this many markers."""
+    usual = paper_corruption(num_markers).occlude
+    occlude = usual if config.occlude is None else config.occlude
+    return BatchRecipe(
+        config.batch,
+        Corruption(occlude, config.ghosts) if config.corruption is None else config.corruption,
+        config.jitter,
+        config.rig_share,
+        config.anisotropy,
+    )
 
 
 Preset = Literal["han2018"]

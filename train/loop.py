@@ -19,7 +19,7 @@ from handsim._checks import check_type, make_settings
 from handsim.app.interrupts import Stopped, interrupt_flag
 from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
-from train.config import KINDS, Kind, TrainConfig, default_config
+from train.config import KINDS, Kind, TrainConfig, batch_recipe, default_config
 from train.data.batches import Batch, draw_batch
 from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import check_corruption
@@ -263,7 +263,7 @@ class _Run:
         """The batch of the next step, and the generator that the step goes on with."""
         # One generator per step, so that a resumed run makes the same draws; the same one on each device.
         rng = np.random.default_rng((self.state.config.seed, self.state.done, 0))
-        recipe = self.state.config.recipe(len(self.dataset.marker_names))
+        recipe = batch_recipe(self.state.config, len(self.dataset.marker_names))
         return draw_batch(self.rows, recipe, rng=rng), rng
 
     @contextmanager

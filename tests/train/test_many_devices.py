@@ -19,7 +19,7 @@ import torch
 from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
-from train.config import SetLabelerConfig, TrainConfig, default_config
+from train.config import SetLabelerConfig, TrainConfig, batch_recipe, default_config
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric
@@ -216,7 +216,7 @@ def test_parts_of_a_batch_give_the_papers_network_the_loss_of_the_whole(dataset,
 
     def loss(part):
         rng = np.random.default_rng(3)
-        recipe = config.recipe(len(dataset.marker_names))
+        recipe = batch_recipe(config, len(dataset.marker_names))
         batch = draw_batch(dataset.mapped_rows(), recipe, rng=rng)
         with torch.no_grad():
             return float(batch_loss(config, network, batch, fabric.device, rng=rng, part=part))

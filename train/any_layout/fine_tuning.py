@@ -16,7 +16,7 @@ from gloves.layout import MarkerLayout
 from handsim.space.cameras import CameraRig, load_rig
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.any_layout.layout_network import layout_loss
-from train.config import TrainConfig
+from train.config import TrainConfig, batch_recipe
 from train.data.batches import draw_batch
 from train.data.shards import row_dtype
 from train.simulation.dataset_config import DatasetConfig
@@ -49,7 +49,7 @@ def fine_tuned_labeler(
     labeler = LayoutLabeler(layout, seed=seed)
     rows = _simulated_rows(layout, load_rig("figure5") if rig is None else rig, 2 * num_clouds // 3, rng)
     network = copy.deepcopy(labeler.network).train()
-    recipe = TrainConfig(batch=_BATCH).recipe(layout.num_markers)
+    recipe = batch_recipe(TrainConfig(batch=_BATCH), layout.num_markers)
     optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
     steps = -(-num_clouds // _BATCH)
     with torch_threads(1):

@@ -33,7 +33,7 @@ class Labeling:
     labels: Int[np.ndarray, "N"]
     """Index of each point's marker in the layout, -1 for a ghost; no marker twice."""
     confidence: Float[np.ndarray, "N"]
-    """Confidence of each label, 0 to 1."""
+    """Confidence of each label, a probability from 0 to 1."""
 
 
 class Labeler(Protocol):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train.config import TrainConfig
+from train.config import TrainConfig, batch_recipe
 from train.data.batches import Part, draw_batch
 from train.data.mapped_rows import MappedRows
 from train.data.shards import Dataset, row_dtype
@@ -63,7 +63,7 @@ def test_a_set_that_is_handed_on_is_its_files(dataset):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_parts_are_the_batch_of_one_device_shared_out(dataset, share, count):
-    recipe = TrainConfig(batch=32, rig_share=share).recipe(19)
+    recipe = batch_recipe(TrainConfig(batch=32, rig_share=share), 19)
     whole, again = (
         draw_batch(rows, recipe, rng=np.random.default_rng(5))
         for rows in (dataset.rows(), dataset.mapped_rows())
