@@ -50,6 +50,9 @@ tables: $(DEVELOPER)  ## print the paper's tables beside ours, half an hour; ONL
 	for table in $(or $(ONLY),table3 table4 table5 table6 table7 cameras); do \
 	  OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.paper $$table || exit 1; done
 
+results: $(DEVELOPER)  ## write docs/results.md from the figures in benchmarks/figures
+	$(BIN)/python -m benchmarks.results
+
 chaos: $(DEVELOPER)  ## kill every long command at random moments and run it again; KILLS=20
 	$(BIN)/python -m benchmarks.chaos --kills $(or $(KILLS),20)
 

@@ -13,7 +13,7 @@ import argparse
 import mujoco
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.captures.collection import read_markers
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from train.any_layout.fine_tuning import fine_tuned_labeler

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
+from benchmarks.record import describe
 from gloves.captures.collection import find_captures, read_markers
 from gloves.layout import load_layout
 from train.config import KINDS, TrainConfig, batch_recipe, default_config

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.ghosts import sample_ghosts

@@ -27,7 +27,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from benchmarks.rendering import COLORS, draw, rate, rate_in_processes
 from benchmarks.training_scaling import train
 from render.painting.hardware import _renderer_name, opengl_has_hardware

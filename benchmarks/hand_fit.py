@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.machine import describe
 from benchmarks.people import right_hands
+from benchmarks.record import describe
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim.hand.jacobian import skinned_jacobian

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.attachment import Attachment, attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout

@@ -38,7 +38,7 @@ import numpy as np
 import torch
 import trimesh
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES

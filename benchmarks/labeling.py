@@ -18,7 +18,7 @@ import numpy as np
 import onnxruntime
 import torch
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
 from train.glove_labeler import load_labeler

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.any_layout import random_layout
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.layout import MarkerLayout, list_layouts, load_layout, save_layout
 from handsim.cli.main import main as handsim
 from handsim.space.cameras import load_rig

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.layout_forecast import measure, stored
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout, save_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of

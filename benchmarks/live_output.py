@@ -23,8 +23,8 @@ import numpy as np
 from pythonosc.osc_bundle import OscBundle
 from websockets.sync.client import connect
 
-from benchmarks.machine import describe
 from benchmarks.paper.take_evaluation import true_users
+from benchmarks.record import describe
 from gloves.takes.take import Take
 from track.capture_tracking import track_stream, warm_up
 from track.sinks.addresses import open_sinks

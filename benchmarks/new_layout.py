@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from handsim.cli.main import main as handsim
 
 GLOVE = Path(__file__).parents[1] / "examples" / "ten_markers.toml"

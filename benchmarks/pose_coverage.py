@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.machine import describe
 from benchmarks.people import right_hands
+from benchmarks.record import describe
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos

@@ -28,8 +28,8 @@ from time import perf_counter
 import numpy as np
 import torch
 
-from benchmarks.machine import describe
 from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
+from benchmarks.record import describe
 from gloves.layout import load_layout
 from track.calibration.hand_size import fit_size, sample_frames
 from track.streams.frame_source import StreamedFrame

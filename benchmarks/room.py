@@ -20,7 +20,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_mesh

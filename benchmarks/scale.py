@@ -20,8 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.machine import describe
-from handsim.app.executors.dask_cluster import DaskCluster
+from benchmarks.record import describe
+from handsim.app.cluster import chosen_workers
+from handsim.app.workers import run_jobs
 from render.config import RenderConfig
 from render.session import render_take
 from train.data.augmentation import Corruption, corrupt
@@ -64,7 +65,7 @@ def main() -> None:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         print(f"largest memory so far: {peak / 1e6:.2g} GB")
         for count in options.workers:
-            share = efficiency(count, folder)
+            share = efficiency(count)
             print(f"{count} workers: {100 * share:.0f} % of their time in shards of a second", flush=True)
 
 
@@ -125,16 +126,16 @@ def rest(number: int) -> int:
     return number
 
 
-def efficiency(count: int, folder: Path) -> float:
+def efficiency(count: int) -> float:
     """Share of the workers' time that is spent in shards."""
     from distributed import LocalCluster
 
     options = {"n_workers": count, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
     with LocalCluster(**options, protocol="tcp://", host="127.0.0.1", silence_logs="CRITICAL") as cluster:
-        executor = DaskCluster(cluster.scheduler_address, folder, tell=lambda line: None)
-        start = time.perf_counter()
-        done = sum(1 for _ in executor.run(rest, range(EACH * count)))
-        return done * SHARD / count / (time.perf_counter() - start)
+        with chosen_workers(cluster.scheduler_address, None, lambda line: None) as executor:
+            start = time.perf_counter()
+            done = sum(1 for _ in run_jobs(rest, range(EACH * count), executor))
+            return done * SHARD / count / (time.perf_counter() - start)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from handsim.space.camera import Camera, pinhole
 from handsim.space.lens import Lens
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh

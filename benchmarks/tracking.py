@@ -32,7 +32,6 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.drum_takes import with_drum
-from benchmarks.machine import describe
 from benchmarks.paper.hand_errors import hand_errors
 from benchmarks.paper.take_evaluation import (
     TrackingReport,
@@ -43,6 +42,7 @@ from benchmarks.paper.take_evaluation import (
     true_users,
 )
 from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
+from benchmarks.record import describe
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from train.config import batch_recipe, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.machine import describe
+from benchmarks.record import describe
 from train.loop import CHECKPOINT
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset

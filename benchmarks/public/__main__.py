@@ -15,7 +15,6 @@ import tyro
 from rich.console import Console
 
 from benchmarks.command_line import run as run_commands
-from benchmarks.machine import describe
 from benchmarks.public.baselines import TRACKERS, TrackerName, Users, run_baseline
 from benchmarks.public.card import describe_captures
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, SIZES
@@ -23,6 +22,7 @@ from benchmarks.public.making import make_benchmark
 from benchmarks.public.manifest import PUBLISHED, differing_files, load_benchmark
 from benchmarks.public.score_tables import figure_text, score_record, score_tables
 from benchmarks.public.scoring import score_results
+from benchmarks.record import describe
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning

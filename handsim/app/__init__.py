@@ -10,8 +10,9 @@
 - progress: the progress bar of all commands, and lines in its place in a log
 - live_status: one line of status, renewed in place
 - interrupts: signals to end, as a flag that a loop reads or as an exception
-- workers: numbered jobs in worker processes, which end with their parent
-- executors: who does numbered jobs, those processes or a cluster
+- workers: numbered jobs in processes of this machine, or on another executor
+- cluster: the workers of a Dask scheduler as an executor
+- output: where jobs leave their files: a folder, or an object store
 - system_packages: names of system packages that pip cannot install
 - page: one HTML page of pictures and figures
 """

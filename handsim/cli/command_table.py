@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final
 
-# "module:function", or "module:TABLE" for a dict of functions: sub-commands; tables of several modules are
-# joined by "+". Strings, so that nothing heavy loads for --help and no package names one above in an import.
+# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy loads
+# for --help and no package names one above in an import.
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "demo": (
         "handsim.cli.demo:demo",
@@ -18,7 +18,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "List, show, start and check marker layouts; score and improve one before it is worn.",
     ),
     "rig": (
-        "handsim.cli.rig:RIG+handsim.cli.rig_import:RIG+handsim.cli.rig_advice:RIG",
+        "handsim.cli.rig:RIG",
         "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
     ),
     "generate": ("handsim.cli.generate:generate", "Make a training set; goes on where it was stopped."),
@@ -44,9 +44,6 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
 
 
 def load(target: str) -> Any:
-    """What "module:name" stands for, imported now and not before; tables joined by "+" are one."""
-    found = []
-    for part in target.split("+"):
-        module, _, attribute = part.partition(":")
-        found.append(getattr(importlib.import_module(module), attribute))
-    return found[0] if len(found) == 1 else {name: one for table in found for name, one in table.items()}
+    """What "module:name" stands for, imported now and not before."""
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)

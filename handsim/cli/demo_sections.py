@@ -244,11 +244,11 @@ def _draw_labeled_frame(out: Path, frame: LabeledFrame) -> Section:
 def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
     """Track a simulated capture of two hands, say how far its joints are off, and draw it."""
     take = simulate_take("hand-hand", num_frames=_TRACKED, seed=seed)
-    tracked = track_capture(take.capture(), Tracker([hand.fit for hand in take.hands], labeler))
+    tracked = track_capture(take.capture(), Tracker(take.hands, labeler))
     errors = []
-    for hand in take.hands:
-        model, found = hand.fit.model, tracked.motion(hand.side).qpos
-        joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, hand.qpos)]
+    for number, hand in enumerate(take.hands):
+        model, found = hand.model, tracked.motion(hand.side).qpos
+        joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, take.qpos[:, number])]
         errors.append(1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
     frames = np.linspace(0, tracked.num_frames - 1, _PICTURES).astype(int).tolist()
     drawn = draw_frames(tracked, RenderConfig(seed=seed, vary="frame"), frames)

@@ -219,7 +219,7 @@ def _hands(
     motion: str, layout: MarkerLayout, rig: CameraRig, frames: int, seed: int, rng: np.random.Generator
 ) -> tuple[list[ObservedHand], str]:
     """Hands in the motion that was asked for, and its name."""
-    from gloves.takes.motion import load_any_take
+    from gloves.takes.take import load_take
     from track.glove_advice.observed_hands import observe_motion, observe_poses
     from train.simulation.takes import simulate_take
 
@@ -234,7 +234,7 @@ def _hands(
     if not motion.endswith(".npz"):
         raise ArgumentError(f"--motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
     return observe_motion(
-        load_any_take(Path(motion)), layout, rig, frames, rng=rng
+        load_take(Path(motion)), layout, rig, frames, rng=rng
     ), f"the take {Path(motion).name}"
 
 

@@ -5,7 +5,6 @@
 - arrays: `.npz` archives with their sizes checked first
 - inputs: what others wrote, read only from regular files of a bounded size
 - json_files: JSON objects, and folders claimed by a settings file
-- object_folder: a folder of an object store, as fsspec reaches it
 - outputs: a check that no output is written over an input
 - toml_values: type checks and formatting of TOML values
 """

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
 from handsim.errors import ArgumentError, choices
-from handsim.space.camera import Camera, preset
-from handsim.space.cameras import load_rig, look_at
+from handsim.space.camera import Camera, look_at, preset
+from handsim.space.cameras import load_rig
 from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
 from render.shown_take import ShownTake

@@ -13,11 +13,10 @@ import trimesh
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
-from gloves.fit import GlovedHand, GloveFit, attach
+from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout, save_layout, starter_layout
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import STATUSES, MarkedBody, TrackedTake
+from gloves.takes.take import STATUSES, RigidBody, Take
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
@@ -167,16 +166,12 @@ def hands() -> tuple[GloveFit, ...]:
 
 
 def truth(folder: Path) -> list[Path]:
-    qpos = np.zeros((FRAMES, 27))
-    qpos[:, 3] = 1.0
-    take = Take(
-        rate=120.0,
-        points=_rng().uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3)),
-        ids=np.tile(np.arange(COLUMNS), (FRAMES, 1)),
-        labels=np.tile(np.arange(COLUMNS), (FRAMES, 1)),
-        hands=tuple(GlovedHand(hand, qpos) for hand in hands()),
-        body=None,
-        settings={"kind": "single-hand"},
+    qpos = np.zeros((FRAMES, 2, 27))
+    qpos[..., 3] = 1.0
+    columns = np.tile(np.arange(COLUMNS), (FRAMES, 1))
+    points = _rng().uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3))
+    take = Take.of_truth(
+        hands(), qpos, points, columns, columns, rate=120.0, settings={"kind": "single-hand"}
     )
     take.save(folder / "take.truth.npz")
     return [folder / "take.truth.npz"]
@@ -186,20 +181,18 @@ def tracked(folder: Path) -> list[Path]:
     rng, worn = _rng(), hands()
     qpos = np.zeros((FRAMES, 2, 27))
     qpos[..., 3] = 1.0
-    take = TrackedTake(
+    take = Take(
         rate=120.0,
         times=np.arange(FRAMES) / 120.0,
         hands=worn,
         qpos=qpos,
         status=np.full((FRAMES, 2), STATUSES.index("tracked"), dtype=np.int8),
         rms=np.full((FRAMES, 2), 1e-3),
-        markers=rng.uniform(0.0, 0.2, size=(FRAMES, 2, worn[0].layout.num_markers, 3)),
-        filled=np.zeros((FRAMES, 2, worn[0].layout.num_markers), dtype=bool),
         points=rng.uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3)),
         ids=np.tile(np.arange(COLUMNS, dtype=np.int32), (FRAMES, 1)),
         labels=np.tile(np.arange(COLUMNS, dtype=np.int16), (FRAMES, 1)),
         confidence=np.ones((FRAMES, COLUMNS)),
-        bodies=(MarkedBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3)),),
+        bodies=(RigidBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3)),),
         body_poses=np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (FRAMES, 1, 1)),
         body_status=np.full((FRAMES, 1), STATUSES.index("tracked"), dtype=np.int8),
         body_rms=np.full((FRAMES, 1), 1e-3),
@@ -217,12 +210,6 @@ def user(folder: Path) -> list[Path]:
 def settings(folder: Path) -> list[Path]:
     (folder / "config.json").write_text(json.dumps(SETTINGS))
     return [folder / "config.json"]
-
-
-def receipt(folder: Path) -> list[Path]:
-    files = {f"rows-{number:05d}.npy": {"bytes": 5 * number, "sha256": "ab" * 32} for number in range(3)}
-    (folder / "00000.json").write_text(json.dumps({"files": files}))
-    return [folder / "00000.json"]
 
 
 def packets(folder: Path) -> list[Path]:

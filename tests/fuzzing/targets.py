@@ -17,14 +17,11 @@ from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
 from gloves.takes.corrections import load_corrections
 from gloves.takes.take import load_take
-from gloves.takes.tracked_take import load_tracked_take
-from handsim.app.executors.output import load_receipt
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
-from handsim.space.rig_formats.any_file import load_cameras, load_lab_cameras
-from handsim.space.rig_formats.rig_of_cameras import marker_cameras, rig_of_cameras
+from handsim.space.rig_formats.any_file import import_cameras, load_cameras
 from render.own_poses import PoseFile, load_poses
 from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
@@ -106,7 +103,7 @@ def _read_checkpoint(path: Path) -> None:
 def _read_calibration(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
-        rig_of_cameras(path, marker_cameras(path, load_lab_cameras(path)))
+        CameraRig("lab", import_cameras(path))
 
 
 _ALL: Final = (
@@ -122,7 +119,7 @@ _ALL: Final = (
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
     Target("truth", seeds.truth, load_take, mutate_archive),
-    Target("tracked", seeds.tracked, load_tracked_take, mutate_archive),
+    Target("tracked", seeds.tracked, load_take, mutate_archive),
     Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
     Target("weights", seeds.weights, _read_weights),
@@ -130,7 +127,6 @@ _ALL: Final = (
     Target("dataset", seeds.dataset, _read_dataset),
     Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_archive),
     Target("settings", seeds.settings, _read_settings),
-    Target("receipt", seeds.receipt, load_receipt),
     Target("packet", seeds.packets, _read_packet, refusals=(DamagedPacket,)),
     Target("photo", seeds.photos, _read_photo),
 )

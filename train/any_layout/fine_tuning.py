@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gloves.layout import MarkerLayout
-from handsim.space.cameras import CameraRig, load_rig
+from handsim.space.cameras import CameraRig, as_rig
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.any_layout.layout_network import layout_loss
 from train.config import TrainConfig, batch_recipe
@@ -32,13 +32,17 @@ _MOST_GRADIENT: Final = 1.0
 
 
 def fine_tuned_labeler(
-    layout: MarkerLayout, rig: CameraRig | None = None, *, num_clouds: int = NUM_CLOUDS, seed: int = 0
+    layout: MarkerLayout,
+    rig: CameraRig | str = "figure5",
+    *,
+    num_clouds: int = NUM_CLOUDS,
+    seed: int = 0,
 ) -> LayoutLabeler:
     """A labeler for any layout that has learned more of this one.
 
     Args:
         layout: The glove.
-        rig: Cameras that see the frames; the paper's when not given.
+        rig: Cameras that see the frames: a rig, its name or its file; the paper's when not given.
         num_clouds: Clouds to learn from, of two thirds as many frames.
         seed: Of all randomness.
 
@@ -47,7 +51,7 @@ def fine_tuned_labeler(
     """
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler(layout, seed=seed)
-    rows = _simulated_rows(layout, load_rig("figure5") if rig is None else rig, 2 * num_clouds // 3, rng)
+    rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
     network = copy.deepcopy(labeler.network).train()
     recipe = batch_recipe(TrainConfig(batch=_BATCH), layout.num_markers)
     optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)

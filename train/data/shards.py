@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,10 +18,12 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Shaped
 from numpy.typing import NDArray
+from upath import UPath
 
 from gloves.layout import MarkerLayout, stored_layout
 from gloves.optics.ghosts import MAX_GHOSTS
 from handsim._checks import check_type
+from handsim.app.output import Place, place_of
 from handsim.errors import DatasetError, LayoutError, choices
 from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write
@@ -200,15 +203,17 @@ class Dataset:
     `cameras` that see each marker, positions `observed` (M, 3) [m] and `ghosts` (4, 3) [m].
 
     Args:
-        path: The folder that `handsim generate` wrote: `.npy` shards and a `manifest.json`.
+        path: The folder that `handsim generate` wrote: `.npy` shards and a `manifest.json`. A folder of an
+            object store, as s3://bucket/prefix, is copied for as long as the set is open.
 
     Raises:
         DatasetError: Not a training set, unfinished, of another schema, or damaged (the file is named).
     """
 
-    def __init__(self, path: str | Path) -> None:
-        check_type("path", path, (str, Path), "the folder of a training set")
-        path = Path(path)
+    def __init__(self, path: str | Place) -> None:
+        check_type("path", path, (str, Path, UPath), "the folder of a training set")
+        place = place_of(path)
+        path = place if isinstance(place, Path) else self._copied(place)
         self.manifest = load_manifest(path)
         for name, expected in self.manifest.files.items():
             file = path / name
@@ -229,6 +234,17 @@ class Dataset:
                 f"{path / MANIFEST} says {self.manifest.num_frames} frames, but the shards hold {found}; "
                 "delete it and run handsim generate again"
             )
+
+    def _copied(self, place: UPath) -> Path:
+        """A copy of the files of an object store, removed with the set."""
+        self._copy = tempfile.TemporaryDirectory(prefix="handsim-set-")
+        folder = Path(self._copy.name)
+        for name in (MANIFEST, CONFIG):
+            if (place / name).exists():
+                (folder / name).write_bytes((place / name).read_bytes())
+        for name in load_manifest(folder).files:
+            (folder / name).write_bytes((place / name).read_bytes())
+        return folder
 
     def _map_shards(self) -> list[NDArray[np.void]]:
         names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
@@ -276,7 +292,7 @@ class Dataset:
         return [unpack_hand(record) for record in _load_records(self.path / hands_name(shard), HAND_DTYPE)]
 
 
-def load_dataset(dataset: Dataset | str | Path) -> Dataset:
+def load_dataset(dataset: Dataset | str | Place) -> Dataset:
     """A training set as it is, or by its folder.
 
     Raises:
@@ -285,7 +301,7 @@ def load_dataset(dataset: Dataset | str | Path) -> Dataset:
     """
     if isinstance(dataset, Dataset):
         return dataset
-    check_type("dataset", dataset, (str, Path), "a Dataset or the folder of one")
+    check_type("dataset", dataset, (str, Path, UPath), "a Dataset or the folder of one")
     return Dataset(dataset)
 
 

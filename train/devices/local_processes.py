@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -15,7 +17,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol, cast
 
 from handsim.app.interrupts import InterruptFlag, Stopped, interrupt_flag, signals_raise
-from handsim.app.workers import end_processes, portable, spawn
+from handsim.app.workers import portable, without_signals
 from handsim.errors import HandSimError
 from train.devices.agreement import PeerError
 from train.devices.world import RENDEZVOUS, World
@@ -24,6 +26,39 @@ Progress = Callable[[int, int, float], None]
 """Called with samples done, samples expected, and the loss."""
 _LOOK: Final = 0.2  # [s] between two looks for a signal
 _PATIENCE: Final = 5.0  # [s] that the other processes have when one has failed
+
+
+def spawn(live: Callable[..., None], *args: object) -> tuple[Connection, SpawnProcess]:
+    """A process that calls `live(*args, channel)`, and this end of its pipe."""
+    context = multiprocessing.get_context("spawn")
+    channel, theirs = context.Pipe()
+    process = context.Process(target=_bound, args=(live, *args, theirs), daemon=True)
+    with without_signals():
+        process.start()
+    theirs.close()
+    return channel, process
+
+
+def _bound(live: Callable[..., None], *args: object) -> None:
+    def watch() -> None:
+        process = multiprocessing.parent_process()
+        if process is not None:
+            process.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+    live(*args)
+
+
+def end_processes(pool: dict[Connection, SpawnProcess]) -> None:
+    """End processes, whatever they do, and wait until they are gone."""
+    for channel, process in pool.items():
+        channel.close()
+        process.terminate()
+    for process in pool.values():
+        process.join(1.0)
+        process.kill()
+        process.join()
 
 
 class Job(Protocol):

@@ -179,7 +179,7 @@ def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
 def _count_take(count: _Count, take: Take) -> None:
     """Label every hand of every frame of a take, separated by the truth."""
     for hand in range(len(take.hands)):
-        names = take.hands[hand].fit.layout.names
+        names = take.hands[hand].layout.names
         if names != count.labeler.marker_names:
             raise _other_markers("the take's glove", names, count.labeler.marker_names)
         clouds, truths = hand_clouds(take, hand)

@@ -20,7 +20,7 @@ from gloves.takes.take import Take
 from handsim._checks import check_type, fill_settings
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.topology import SIDES, Side
-from handsim.space.cameras import ROOM_CENTER, CameraRig, check_outside_volume, list_rigs, load_rig
+from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
 from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
 from train.simulation.motion import RATE, SceneMotion, sample_scene_motion
 from train.simulation.people import sample_adult_hands, wear_gloves
@@ -154,7 +154,7 @@ def record_config(config: TakeConfig) -> Take:
     kind = config.kind
     key = SIMULATED_KINDS.index(kind), TWINS[kind].draw if kind in TWINS else 0
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=key))
-    rig, layout = load_rig(config.rig), load_layout(config.glove)
+    rig, layout = as_rig(config.rig), load_layout(config.glove)
     for side in config.hands:
         layout.check_side(side)
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
@@ -164,9 +164,9 @@ def record_config(config: TakeConfig) -> Take:
     named = dataclasses.replace(
         config,
         glove=layout.name if isinstance(config.glove, MarkerLayout) else str(config.glove),
-        rig=rig.name if isinstance(config.rig, CameraRig) else str(config.rig),
+        rig=rig.name,
     )
-    settings = dataclasses.asdict(named) | {"room": dataclasses.asdict(room)}
+    settings = dataclasses.asdict(named) | {"rig": rig_setting(rig), "room": dataclasses.asdict(room)}
     del settings["optics"]  # the room has all of them
     if set(config.hands) == set(BOTH):
         del settings["hands"]

@@ -61,7 +61,7 @@ def test_a_planned_rig_is_written_and_told(tmp_path, capsys):
         (["--cameras", "6", "--room", "4", "0", "3"], "--room is 4 0 3, expected three lengths"),
         (
             ["--cameras", "6", "--room", "4", "4", "3", "--field-of-view", "180"],
-            "field_of_view is 180 degrees, expected 1 to 170",
+            "--field-of-view is 180 degrees, expected 1 to 170",
         ),
         (
             ["--cameras", "6", "--room", "0.8", "0.8", "1.5", "--mounts", "walls", "--volume", "2", "2", "3"],

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimWarning, RigError
-from handsim.space.camera import pinhole
-from handsim.space.cameras import look_at
+from handsim.space.camera import look_at, pinhole
 from render.cameras.own_cameras import check_hands_in_view
 from render.own_poses import PoseFile, load_poses
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import look_at
+from handsim.space.camera import look_at
 from render.illustrations.scene import PosedHand, View, view_along
 
 SIZE = (320, 240)

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.space.camera import Camera, preset
-from handsim.space.cameras import look_at, named_rig
+from handsim.space.camera import Camera, look_at, preset
+from handsim.space.cameras import named_rig
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
 from render.frames.frame import Pictures, RenderedFrame

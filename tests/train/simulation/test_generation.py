@@ -21,8 +21,12 @@ from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
+from handsim.space.cameras import as_rig, save_rig
 from poses.shapes.couplings import HIGH, LOW
+from tests.rigs import mixed_rig
+from track.viewer.recordings.datasets import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
+from train.reports.dataset_page import write_report
 from train.simulation import frame_scenes, generation, people
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import NO_GRASP, NO_TOUCH, SceneMix
@@ -228,6 +232,21 @@ def test_bad_settings_leave_nothing_behind(tmp_path, change, error, sentence):
     with pytest.raises(error, match=sentence):
         make_dataset(DatasetConfig(num_frames=10, **change), out)
     assert not out.exists()
+
+
+def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
+    rig = mixed_rig()
+    config = DatasetConfig(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
+    make_dataset(config, tmp_path / "set", workers=1)
+    dataset = Dataset(tmp_path / "set")
+    assert as_rig(dataset.manifest.config["rig"]) == rig
+    assert DatasetRecording(dataset).rig == rig
+    write_report(dataset)
+    save_rig(tmp_path / "mixed.toml", rig)  # the same cameras, whatever names them
+    same = dataclasses.replace(config, rig=str(tmp_path / "mixed.toml"))
+    make_dataset(same, tmp_path / "set", workers=1)
+    with pytest.raises(DatasetError, match=r"begun with other settings \(rig"):
+        make_dataset(dataclasses.replace(config, rig="six"), tmp_path / "set", workers=1)
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):

@@ -6,8 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from handsim.space.camera import Camera, camera_from_record
-from handsim.space.cameras import look_at
+from handsim.space.camera import Camera, camera_from_record, look_at
 from handsim.space.lens import Lens
 from handsim.space.transforms import quaternion_matrix
 from render.formats.annotations.common import to_json
