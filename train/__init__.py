@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from train.data.cloud_stream import CloudStream
     from train.data.own_corruption import OwnCorruption
     from train.data.shards import Dataset
-    from train.evaluation.labeler_evaluation import Report, evaluate_labeler
+    from train.evaluate import evaluate_labeler
+    from train.evaluation.labeler_evaluation import Report
     from train.glove_labeler import load_labeler
     from train.labelers.protocol import Labeler, Labeling
     from train.loop import train_labeler
@@ -36,7 +37,7 @@ __getattr__, __dir__ = lazy_exports(
         "Labeler": "train.labelers.protocol",
         "TrainConfig": "train.config",
         "corrupt": "train.data.augmentation",
-        "evaluate_labeler": "train.evaluation.labeler_evaluation",
+        "evaluate_labeler": "train.evaluate",
         "generate_dataset": "train.simulation.generation",
         "load_labeler": "train.glove_labeler",
         "simulate_take": "train.simulation.takes",

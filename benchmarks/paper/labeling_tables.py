@@ -23,7 +23,8 @@ from train.config import Kind, default_config
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler
+from train.evaluate import evaluate_labeler
+from train.evaluation.labeler_evaluation import Report
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.storage import shipped_labelers

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final
 
-# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy loads
-# for --help and no package names one above in an import.
+# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy
+# loads for --help and no package names one above in an import.
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "demo": (
         "handsim.cli.demo:demo",

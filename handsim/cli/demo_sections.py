@@ -31,7 +31,7 @@ from track.capture_tracking import track_capture
 from track.tracker import Tracker
 from train.data.augmentation import Corruption, corrupt
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import CLEAN, evaluate_labeler
+from train.evaluate import CLEAN, evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 from train.simulation.generation import generate_dataset

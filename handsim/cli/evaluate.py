@@ -47,7 +47,7 @@ def evaluate(
     from handsim.files.json_files import save_json
     from handsim.files.outputs import check_outputs
     from train.data.augmentation import Corruption
-    from train.evaluation.labeler_evaluation import evaluate_labeler
+    from train.evaluate import evaluate_labeler
     from train.glove_labeler import load_labeler
     from train.reports.figures_table import print_figures
     from train.threads import label_on

@@ -12,7 +12,7 @@ import torch
 from train.config import CNNConfig, default_config
 from train.data.augmentation import Corruption
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.loop import train_labeler

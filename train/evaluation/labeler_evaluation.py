@@ -4,33 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gloves.captures.capture import Capture
-from gloves.captures.collection import find_captures, read_markers
-from gloves.captures.markers import select_hands
-from gloves.layout import MarkerLayout
 from gloves.optics.ghosts import GHOST_REACH
-from gloves.takes.take import Take, load_take
-from handsim._checks import check_rng, check_type
-from handsim.errors import ArgumentError, CaptureError
+from gloves.takes.take import Take
 from train.data.augmentation import Cloud, Corruption
 from train.data.batches import paper_corruption
 from train.data.own_corruption import OwnCorruption, draw_cloud
-from train.data.shards import MANIFEST, Dataset, load_dataset
 from train.evaluation.metrics import LabelCounts, error_without, expected_calibration_error
-from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 _CHUNK: Final = 4096
-CLEAN: Final = Corruption(occlude=0, ghosts=0)
-"""No corruption but the order of points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,109 +41,17 @@ class Report:
     """Slots, points, occlusions and ghosts counted, see `train.evaluation.metrics.LabelCounts.numbers`."""
 
 
-Truth = Float[np.ndarray, "T M 3"] | Dataset | Take | Capture | str | Path
-"""Markers whose labels are known: [m] in the labeler's order, a training set, a take with its truth, a
-labeled capture, the path of one of the three, or a folder of captures."""
-
-
-def evaluate_labeler(
-    labeler: MarkerLayout | Labeler | str | Path,
-    truth: Truth | Sequence[Truth],
-    corruption: Corruption | OwnCorruption | str = CLEAN,
+def evaluate_markers(
+    labeler: Labeler,
+    markers: Float[np.ndarray, "T M 3"],
+    corruption: Corruption | OwnCorruption | str,
     *,
-    every: int = 1,
-    rng: np.random.Generator | None = None,
+    rng: np.random.Generator,
 ) -> Report:
-    """Corrupt known markers, label them and count errors; takes keep the gaps and ghosts that they have.
-
-    Args:
-        labeler: The labeler to evaluate, its name or path, or a glove whose labeler it is.
-        truth: True markers (T, M, 3) [m] in the labeler's order, NaN where missing; a training set, a labeled
-            capture or a take with its truth; the path of one of these or of a folder of captures; or several.
-            Each hand is counted by itself.
-        corruption: Occlusion, ghosts and jitter to draw; none when not given. Or a corruption of your own, as
-            `CloudStream` takes it.
-        every: Take one frame of this many; 1 takes all.
-        rng: Source of all randomness; one of seed 0 when not given.
-
-    Returns:
-        Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
-        of a take are those within 0.1 [m] of its markers.
-
-    Raises:
-        ArgumentError: An argument is of another type, or markers are not in meters.
-        CaptureError: A file cannot be read, its glove has other markers than the labeler knows, takes are
-            given with others or to be corrupted, or there is nothing to count.
-    """
-    network = load_labeler(labeler)
-    check_type("every", every, int, "a whole number")
-    if every < 1:
-        raise ArgumentError(f"every is {every}, expected at least 1")
-    rng = np.random.default_rng(0) if rng is None else rng
-    check_rng(rng)
-    several = isinstance(truth, list | tuple) and not isinstance(truth, Capture | Take)
-    given: list[Any] = list(truth) if several else [truth]  # type: ignore[arg-type]
-    count, takes = _Count(network), [one for one in given if _is_take(one)]
-    if takes and (len(takes) < len(given) or corruption != CLEAN or every > 1):
-        raise CaptureError(
-            "a simulated take is counted whole, with its own gaps and ghosts, expected takes alone and no "
-            "corruption"
-        )
-    for take in takes:
-        _count_take(count, take if isinstance(take, Take) else load_take(take))
-    if not takes:
-        markers = _markers(given, network.marker_names)[::every]
-        for first in range(0, len(markers), _CHUNK):
-            count.add_cloud(draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng))
-    report = count.report()
-    if not report.confusion[:-1].any() and not all(isinstance(one, np.ndarray) for one in given):
-        raise CaptureError(
-            f"nothing to count: no frame holds any of {', '.join(network.marker_names)}, expected labeled "
-            "captures"
-        )
-    return report
-
-
-def _is_take(truth: Any) -> bool:
-    return isinstance(truth, Take) or (isinstance(truth, str | Path) and Path(truth).suffix == ".npz")
-
-
-def _markers(truth: Sequence[Any], names: tuple[str, ...]) -> Float[np.ndarray, "T M 3"]:
-    """The markers of all that was given [m], in the labeler's order."""
-    parts = []
-    for one in truth:
-        if isinstance(one, np.ndarray):
-            parts.append(_checked_markers(one, len(names)))
-        elif isinstance(one, Capture):
-            parts += select_hands(one, names)
-        elif isinstance(one, Dataset) or (isinstance(one, str | Path) and (Path(one) / MANIFEST).is_file()):
-            parts.append(_markers_of_set(load_dataset(one), names))
-        else:
-            expected = "markers (T, M, 3) [m], a Dataset, Capture or Take, or the path of one"
-            check_type("truth", one, (str, Path), expected)
-            parts.append(read_markers(find_captures([Path(one)]), names))
-    if not parts:
-        raise CaptureError("no capture was given, expected labeled captures, folders, training sets or takes")
-    return np.concatenate(parts)
-
-
-def _checked_markers(markers: NDArray[Any], count: int) -> NDArray[np.float64]:
-    if markers.ndim != 3 or markers.shape[1:] != (count, 3) or markers.dtype.kind not in "fiu":
-        raise ArgumentError(
-            f"markers are {markers.dtype} of shape {markers.shape}, expected (T, {count}, 3) numbers [m]"
-        )
-    return markers.astype(np.float64)
-
-
-def _markers_of_set(dataset: Dataset, names: tuple[str, ...]) -> NDArray[np.float64]:
-    if dataset.marker_names != names:
-        raise _other_markers(f"the set {dataset.path}", dataset.marker_names, names)
-    markers: NDArray[np.float64] = dataset.rows()["markers"].astype(np.float64)
-    return markers
-
-
-def _other_markers(owner: str, has: Sequence[str], knows: Sequence[str]) -> CaptureError:
-    return CaptureError(f"{owner} has markers {', '.join(has)}, the labeler knows {', '.join(knows)}")
+    """Corrupt known markers [m], NaN where missing, label them and count errors."""
+    count = LabelingCount(labeler)
+    count.add_markers(markers, corruption, rng=rng)
+    return count.report()
 
 
 def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> Report:
@@ -164,7 +61,7 @@ def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> Report:
         labeler: The labeler to evaluate.
         cloud: Clouds of hands [m].
     """
-    count = _Count(labeler)
+    count = LabelingCount(labeler)
     count.add_cloud(cloud)
     return count.report()
 
@@ -173,18 +70,7 @@ def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
     """Evaluation of a labeler on these rows with the paper's corruption, the same each time."""
     markers = rows["markers"].astype(np.float64)
     corruption = paper_corruption(markers.shape[1])
-    return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
-
-
-def _count_take(count: _Count, take: Take) -> None:
-    """Label every hand of every frame of a take, separated by the truth."""
-    for hand in range(len(take.hands)):
-        names = take.hands[hand].layout.names
-        if names != count.labeler.marker_names:
-            raise _other_markers("the take's glove", names, count.labeler.marker_names)
-        clouds, truths = hand_clouds(take, hand)
-        for first in range(0, len(clouds), _CHUNK):
-            count.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
+    return evaluate_markers(labeler, markers, corruption, rng=np.random.default_rng(0))
 
 
 def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:
@@ -215,7 +101,7 @@ def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "T N"]:
     return distance
 
 
-class _Count:
+class LabelingCount:
     """Labels clouds and counts errors."""
 
     def __init__(self, labeler: Labeler) -> None:
@@ -228,18 +114,39 @@ class _Count:
         self.right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
 
     def add_cloud(self, cloud: Cloud) -> None:
+        """Label clouds [m] and count."""
         self.add(
             [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
             [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
         )
 
+    def add_markers(
+        self,
+        markers: Float[np.ndarray, "T M 3"],
+        corruption: Corruption | OwnCorruption | str,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        """Corrupt markers [m], label the clouds and count."""
+        for first in range(0, len(markers), _CHUNK):
+            self.add_cloud(draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng))
+
+    def add_take(self, take: Take) -> None:
+        """Label every hand of every frame of a take, separated by the truth."""
+        for hand in range(len(take.hands)):
+            clouds, truths = hand_clouds(take, hand)
+            for first in range(0, len(clouds), _CHUNK):
+                self.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
+
     def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
+        """Label points [m] and count; a truth is the marker of each, -1 for a ghost."""
         for labeling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):
             self.right_by_marker += self.counts.add(labeling.labels, truth, self.num_labels)
             self.confidences.append(labeling.confidence)
             self.right.append(labeling.labels == truth)
 
     def report(self) -> Report:
+        """Figures of all that was counted."""
         frames = self.counts.frames
         confidences, right = np.concatenate(self.confidences), np.concatenate(self.right)
         figures = {

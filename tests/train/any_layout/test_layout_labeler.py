@@ -14,7 +14,7 @@ from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler, save_layout_network, shipped_network
 from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
-from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.labelers.storage import shipped_labelers
 

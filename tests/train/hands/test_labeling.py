@@ -8,7 +8,7 @@ import torch
 
 from gloves.captures.markers import unlabeled_frames
 from gloves.layout import load_layout
-from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
 from train.hands.frame_hands import HandFinder
 from train.hands.labeling import label_hands
