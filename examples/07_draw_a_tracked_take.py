@@ -17,7 +17,7 @@ import numpy as np
 from handsim import Camera
 from render import RenderConfig, RenderedFrame, SkinLook, ViewConfig, draw_frames, render_take
 from track import track_capture
-from train import TakeConfig, simulate_take
+from train import simulate_take
 
 
 def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
@@ -32,7 +32,7 @@ def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
 
 
 def main() -> None:
-    truth = simulate_take(TakeConfig(kind="hand-hand", num_frames=120))  # 1 s at 120 Hz
+    truth = simulate_take(kind="hand-hand", num_frames=120)  # 1 s at 120 Hz
     tracked = track_capture(truth.capture(), glove="dense19")  # nobody was calibrated
     tone = SkinLook(lightness=45.0).typology_angle  # [deg]; people with skin about as dark as this
     config = RenderConfig(

@@ -9,7 +9,7 @@ from gloves.captures.formats import read_capture
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim.errors import WeightsError
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 AnyCapture = Capture | Take | str | Path
@@ -57,7 +57,7 @@ def labeler_of(glove: MarkerLayout, labeler: AnyLabeler) -> Labeler:
         WeightsError: The labeler is unknown, damaged, or knows other markers.
     """
     if labeler is None or isinstance(labeler, str | Path):
-        return labeler_for_glove(glove, labeler)
+        return load_labeler(glove, labeler)
     if labeler.marker_names != glove.names:
         raise WeightsError(
             f"the labeler knows markers {', '.join(labeler.marker_names)}, but glove '{glove.name}' has "

@@ -33,8 +33,8 @@ from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 
 _EVIDENCE_PER_FRAME: Final = (
     2.0  # of a label (log-odds), less half the squared Mahalanobis distance of its point

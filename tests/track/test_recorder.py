@@ -21,8 +21,8 @@ from track.bodies.rigid_body import RigidTemplate
 from track.recorder import Recorder, TakeRecorder
 from track.streams.frame_source import capture_frames
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 FRAMES = 24
 COUNTS = {"missing_frames": 2}
@@ -31,7 +31,7 @@ COUNTS = {"missing_frames": 2}
 @functools.cache
 def tracked():
     """A tracker and the frames that it made of a capture."""
-    take = simulate_take(TakeConfig(kind="hand-controller", num_frames=FRAMES))
+    take = simulate_take(kind="hand-controller", num_frames=FRAMES)
     hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
     tracker = Tracker(hands, load_labeler("dense19"), (RigidTemplate.of(named_object("controller")),))
     return tracker, [

@@ -17,7 +17,7 @@ from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
 from train.data.shards import Dataset
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
 SMALL = [
@@ -92,7 +92,7 @@ def test_empty_frames_are_labeled_as_empty(run):
 
 
 def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
-    truth = simulate_take(TakeConfig(num_frames=240))
+    truth = simulate_take(num_frames=240)
     truth.save(run / "one.truth.npz")
     track_capture(truth, hands=true_users(truth), labeler=run / "run").save(run / "tracked.npz")
     shown, true = load_shown_take(run / "tracked.npz"), load_shown_take(run / "one.truth.npz").hands[0]
@@ -125,9 +125,9 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        train_labeler(dataset, config, tmp_path / "killed", progress=kill, save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "killed", save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "whole")
+        train_labeler(dataset, tmp_path / "killed", config, progress=kill, save_every=0.0)
+    train_labeler(dataset, tmp_path / "killed", config, save_every=0.0)
+    train_labeler(dataset, tmp_path / "whole", config)
     resumed, whole = (load_file(tmp_path / name / "labeler.safetensors") for name in ("killed", "whole"))
     for name, values in whole.items():
         np.testing.assert_allclose(resumed[name], values, atol=1e-6)
