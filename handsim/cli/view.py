@@ -10,8 +10,7 @@ import tyro
 from rich.console import Console
 
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
-from handsim.app.messages import print_line
+from handsim.app.messages import LiveStatus, print_line
 from handsim.app.progress import progress_bar
 from handsim.cli.options import chosen_hands
 from handsim.errors import ArgumentError
