@@ -1,6 +1,6 @@
 """What a graphics card is worth here: labels, training and pictures, on the CPU and on it.
 
-    python benchmarks/gpu.py [--sections labels training pictures]
+    python -m benchmarks.gpu [--sections labels training pictures]
                              [--clouds 20000] [--samples 100000] [--frames 200]
 
 labels: clouds a second in batches, the default labeler and the paper's network.
@@ -26,10 +26,10 @@ from typing import Final
 
 import numpy as np
 import torch
-from machine import describe
-from rendering import COLORS, draw, rate, rate_in_processes
-from training_scaling import train
 
+from benchmarks.record import describe
+from benchmarks.rendering import COLORS, draw, rate, rate_in_processes
+from benchmarks.training_scaling import train
 from render.painting.hardware import _renderer_name, opengl_has_hardware
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt

@@ -4,7 +4,7 @@ Twelve layouts of 6 to 30 markers: the shipped ones, even and crowded random one
 palm, whose fingers look alike. Each gets a training set and a labeler of its own; forecast and measurement
 use other people, poses and losses. Layouts that are finished stay in the folder; run again to continue.
 
-python benchmarks/layout_forecast.py FOLDER [--frames 60000] [--samples 300000]
+python -m benchmarks.layout_forecast FOLDER [--frames 60000] [--samples 300000]
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from any_layout import random_layout
-from machine import describe
 from scipy.stats import spearmanr
 
+from benchmarks.any_layout import random_layout
+from benchmarks.record import describe
 from gloves.layout import MarkerLayout, list_layouts, load_layout, save_layout
 from handsim.cli.main import main as handsim
 from handsim.space.cameras import load_rig

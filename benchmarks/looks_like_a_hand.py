@@ -1,6 +1,6 @@
 """Whether a hand tracker that was trained on photographs takes the renders for hands.
 
-    python benchmarks/looks_like_a_hand.py OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
+    python -m benchmarks.looks_like_a_hand OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
         [--takes TRACKED.npz ...]
 
 Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:
@@ -29,7 +29,7 @@ import numpy as np
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
-from gloves.takes.tracked_take import load_tracked_take
+from gloves.takes.take import load_take
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
@@ -114,7 +114,7 @@ def load_tracked(paths: list[Path]) -> Tracked:
     """The hands of tracked takes and their poses (T, 27) where they were tracked, the wrists in one place."""
     found: Tracked = {side: [] for side in SIDES} if paths else {}
     for path in paths:
-        take = load_tracked_take(path)
+        take = load_take(path)
         for number, hand in enumerate(take.hands):
             rows = take.qpos[np.isfinite(take.qpos[:, number, 0]), number, 7:]
             found[hand.model.shape.side].append((hand.model, join_qpos(rows)))

@@ -3,9 +3,9 @@
 Eight rigs, shipped, planned and bad ones, of 3 to 16 cameras. The captures have other people and motions than
 the forecast, with the forecast's well-kept optical system and with the losses fitted to each kind of capture.
 
-python benchmarks/rig_forecast.py [--frames 1500] [--folder RIGS]
+python -m benchmarks.rig_forecast [--frames 1500] [--folder RIGS]
 
-The rigs are written into the folder, for `handsim reproduce cameras --rig FILE`.
+The rigs are written into the folder, for `python -m benchmarks.paper cameras --rig FILE`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 from scipy.stats import spearmanr
 
+from benchmarks.record import describe
 from gloves.captures.gaps import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at

@@ -1,6 +1,6 @@
 """How many images a second the paper's network learns from, against the floor of its multiplications.
 
-python benchmarks/training.py [--steps 6] [--threads 2]
+python -m benchmarks.training [--steps 6] [--threads 2]
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe
 
+from benchmarks.record import describe
 from train.config import default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset

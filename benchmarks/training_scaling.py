@@ -1,6 +1,6 @@
 """Training in one process and in several: samples a second, loss and accuracy after equal samples, memory.
 
-python benchmarks/training_scaling.py [--samples 100000] [--seeds 3] [--devices 1 2] [--frames 40000]
+python -m benchmarks.training_scaling [--samples 100000] [--seeds 3] [--devices 1 2] [--frames 40000]
                                       [--set DIR] [-- OPTIONS OF handsim train]
 
 Each process has one thread. The memory is that of the training's processes at its largest; PSS counts a page
@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe
 
+from benchmarks.record import describe
 from train.loop import CHECKPOINT
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import generate_dataset

@@ -2,7 +2,7 @@
 
 The page here is a plain client of the socket, which takes what comes as fast as it can and draws nothing.
 
-python benchmarks/viewer.py TAKE [--seconds 10]
+python -m benchmarks.viewer TAKE [--seconds 10]
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import time
 
 import numpy as np
 import viser
-from machine import describe
 from websockets.sync.client import ClientConnection, connect
 
-from gloves.takes.tracked_take import load_tracked_take
-from track.viewer.recordings.takes import TrackedRecording
+from benchmarks.record import describe
+from gloves.takes.take import load_take
+from track.viewer.recordings.takes import TakeRecording
 from track.viewer.scene.frame_view import FrameView
 from track.viewer.server import LOOPBACK, opened_server
 from track.viewer.timeline import Timeline
@@ -51,7 +51,7 @@ def main() -> None:
     options = parser.parse_args()
     print(describe("viser"))
     start = time.perf_counter()
-    recording = TrackedRecording(load_tracked_take(options.take))
+    recording = TakeRecording(load_take(options.take))
     print(f"{recording.num_frames} frames read in {time.perf_counter() - start:.2f} s")
     with opened_server(LOOPBACK, 0, "benchmark") as server:
         start = time.perf_counter()

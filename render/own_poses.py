@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
-from gloves.takes.tracked_take import label_names
+from gloves.takes.take import label_names
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular

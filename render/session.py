@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,20 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
-from handsim.app.executors.executor import Executor, executor_of
-from handsim.app.executors.output import FolderOutput, Make, Output, open_output
 from handsim.app.interrupts import Stopped
+from handsim.app.output import Make, Output, Place, open_output, place_of
+from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning, choices
-from handsim.files.atomic import remove_leftovers
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
-from handsim.files.object_folder import ObjectFolder
 from render.cameras.own_cameras import check_hands_in_view
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.formats.annotations.common import without_colors
+from render.formats.clip_writer import TAR
 from render.formats.merging import CONFIG
 from render.formats.shards import INDEX
 from render.formats.writer import FORMATS, NEED_COLORS, open_writer
@@ -60,7 +59,7 @@ _MOST_STUDIOS: Final = 32  # of people with painted skins that are kept, some 5 
 
 def render_take(
     path: Path | PoseFile,
-    out: Path | ObjectFolder,
+    out: str | Place,
     formats: Sequence[str],
     config: RenderConfig,
     *,
@@ -71,10 +70,12 @@ def render_take(
 
     Args:
         path: A tracked take (`.npz`), the truth of a simulated one (`.truth.npz`), or poses of your own.
-        out: Folder, or a folder of an object store; each of several formats has a folder of its own in it.
+        out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
+            formats has a folder of its own in it.
         formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
-        workers: Processes, all cores when not given; or who else draws the shards.
+        workers: Number of processes, all cores when not given; or an executor, as Dask's
+            `Client.get_executor()`.
         progress: Called after every shard.
 
     Returns:
@@ -86,12 +87,12 @@ def render_take(
             shards are kept.
     """
     _check_formats(formats, config)
-    if isinstance(out, ObjectFolder) and _RENAMES in formats:
+    place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
+    if not isinstance(place, Path) and _RENAMES in formats:
         raise HandSimError(
             f"{out}: {_RENAMES} renames its pictures at the end, which no object store can; render into a "
             "folder and copy it"
         )
-    executor = executor_of(workers)
     config = config.settled()
     take = _load(path, config)
     if config.background.photo > 0.0:
@@ -103,10 +104,10 @@ def render_take(
         check_hands_in_view(config.view.cameras, viewpoints.cameras(0), take)
     settings = _settings(path, take, viewpoints, config) | {"formats": list(formats)}
     make = functools.partial(_render_shard, path, tuple(formats), config)
-    with open_output(out) as output:
+    with open_output(place) as output:
         output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
-        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], executor, progress)
-        output.collect(INDEX, _LEFT_OUT.format("*"))
+        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], workers, progress)
+        output.fetch(INDEX, _LEFT_OUT.format("*"))
         for name in formats:
             open_writer(name, _folder(output.folder, formats, name)).finish()
         lost = frozenset(left_out_frames(output.folder))
@@ -126,22 +127,23 @@ def _draw_shards(
     formats: Sequence[str],
     make: Make,
     counts: Sequence[int],
-    executor: Executor,
+    workers: int | Executor,
     progress: Progress | None,
 ) -> None:
     """Have the shards drawn that are not there; each has a count of pictures."""
-    done, total = _finished(output, formats), sum(counts)
+    output.fetch(INDEX, names_of=[f"*{TAR}"])
+    done, total = _finished(output.folder, formats), sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
     try:
-        for drawn, number in enumerate(executor.run(output.job(make), todo)):
+        job = output.job(make, last=[INDEX, f"*{TAR}"])
+        for drawn, number in enumerate(run_jobs(job, todo, workers)):
             count += counts[number]
             if progress is not None:
                 progress(count, total)
-            if drawn == 0 and isinstance(output, FolderOutput):
+            if drawn == 0 and output.is_here:
                 _check_space(output.folder, len(done) + 1, len(todo) - 1)
     except KeyboardInterrupt as stop:
-        remove_leftovers(output.folder)  # of workers that had no time to
         drawn_so_far = f"{count} of {total} images are in {output}, and the same command goes on after them"
         raise Stopped.again(stop, drawn_so_far) from stop
 
@@ -176,10 +178,10 @@ def _settings(
     return settings
 
 
-def left_out_frames(out: Path | ObjectFolder) -> list[int]:
+def left_out_frames(out: str | Place) -> list[int]:
     """Numbers of the frames that a rendering left out: a camera would be inside a hand or an object."""
     with open_output(out) as output:
-        output.collect(_LEFT_OUT.format("*"))
+        output.fetch(_LEFT_OUT.format("*"))
         files = sorted(output.folder.glob(_LEFT_OUT.format("*")))
         return sorted(frame for file in files for frame in load_json(file)["frames"])
 
@@ -204,10 +206,8 @@ def _folder(out: Path, formats: Sequence[str], name: str) -> Path:
     return out if len(formats) == 1 else out / name
 
 
-def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
-    if not isinstance(output, FolderOutput):
-        return frozenset(output.receipts)
-    done = [open_writer(name, _folder(output.folder, formats, name)).done() for name in formats]
+def _finished(folder: Path, formats: Sequence[str]) -> frozenset[int]:
+    done = [open_writer(name, _folder(folder, formats, name)).done() for name in formats]
     return frozenset.intersection(*done)
 
 
@@ -254,7 +254,7 @@ def _render_shard(
 
 
 def draw_frames(
-    take: Take | TrackedTake | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
+    take: Take | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
 ) -> Iterator[RenderedFrame]:
     """Some frames of a take, seen by all its cameras.
 

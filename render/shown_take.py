@@ -9,16 +9,13 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GlovedHand, attach
-from gloves.takes.motion import load_any_take
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import LOST, TrackedTake
+from gloves.takes.take import Take, load_take
 from handsim.errors import CaptureError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape, sample_shape
-from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.objects import RigidObject
 from handsim.space.transforms import pose_matrices
 
 
@@ -109,51 +106,23 @@ class ShownTake:
 
 
 def load_shown_take(path: Path) -> ShownTake:
-    """Read a tracked take, or the truth of a simulated one.
+    """Read a take.
 
     Raises:
         CaptureError: The file is missing, of another kind or schema, damaged, or without any pose.
     """
-    shown = show_take(load_any_take(path))
+    shown = show_take(load_take(path))
     if not np.isfinite(shown.wrists()[..., 0]).any():
         raise CaptureError(f"{path}: there is no hand in any frame, expected one to draw")
     return shown
 
 
-def show_take(take: Take | TrackedTake) -> ShownTake:
-    """The truth of a simulated take, or the motion of a tracked one."""
-    return _show_simulated(take) if isinstance(take, Take) else _show_tracked(take)
-
-
-def _show_simulated(take: Take) -> ShownTake:
-    """The truth of a simulated take."""
-    names = [f"{hand.side}:{name}" for hand in take.hands for name in hand.fit.layout.names]
-    bodies: tuple[ShownBody, ...] = ()
-    if take.body is not None:
-        names += [f"{take.body.name}:{name}" for name in take.body.marker_names]
-        bodies = (_body(take.body.name, np.empty((0, 3)), take.body.T_world_body),)
-    times = np.arange(take.num_frames) / take.rate
+def show_take(take: Take) -> ShownTake:
+    """What pictures need of a take."""
+    bodies = []
+    for number, body in enumerate(take.bodies):
+        obj, poses = body.shape, pose_matrices(take.body_poses[:, number])
+        bodies.append(ShownBody(body.name, obj, body.positions if obj is None else obj.markers, poses))
     labels = take.labels.astype(np.int64)
-    return ShownTake(take.rate, times, take.hands, bodies, take.points, labels, tuple(names))
-
-
-def _show_tracked(take: TrackedTake) -> ShownTake:
-    """The result of a tracker."""
-    hands = tuple(
-        GlovedHand(
-            hand,
-            np.where(take.status[:, index, None] == LOST, np.nan, take.qpos[:, index]),
-        )
-        for index, hand in enumerate(take.hands)
-    )
-    bodies = tuple(
-        _body(body.name, body.positions, pose_matrices(take.body_poses[:, index]))
-        for index, body in enumerate(take.bodies)
-    )
-    labels = take.labels.astype(np.int64)
-    return ShownTake(take.rate, take.times, hands, bodies, take.points, labels, take.label_names)
-
-
-def _body(name: str, markers: NDArray[np.float64], poses: NDArray[np.float64]) -> ShownBody:
-    obj = named_object(name) if name in object_names() else None
-    return ShownBody(name, obj, markers if obj is None else obj.markers, poses)
+    hands, names = take.moving_hands(), take.label_names
+    return ShownTake(take.rate, take.times, hands, tuple(bodies), take.points, labels, names)

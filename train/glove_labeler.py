@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 from typing import Final
 
-from gloves.layout import load_layout
+from gloves.layout import MarkerLayout, load_layout
 from handsim.errors import HandSimWarning, WeightsError
 from train.labelers.protocol import Labeler
 from train.labelers.storage import load_labeler, shipped_labelers
@@ -15,11 +15,11 @@ ANY_LAYOUT: Final = "any-layout"
 """Name of the labeler that needs no training."""
 
 
-def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
+def labeler_for_glove(glove: MarkerLayout | str, labeler: str | Path | None) -> Labeler:
     """The given labeler, or the glove's shipped one; checked against the glove's markers.
 
     Args:
-        glove: Marker layout: a shipped name or the path of a .toml file.
+        glove: Marker layout, or its shipped name or the path of its .toml file.
         labeler: Anything that `load_labeler` reads, or `any-layout`. When None the shipped one of the glove
             or, where none was trained on it, the one for any layout, with a warning.
 
@@ -27,11 +27,13 @@ def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
         LayoutError: The glove is unknown.
         WeightsError: The labeler is unknown, damaged, or knows other markers.
     """
-    layout = load_layout(glove)
-    if labeler is None and glove not in shipped_labelers():
+    layout = glove if isinstance(glove, MarkerLayout) else load_layout(glove)
+    name = layout.name if isinstance(glove, MarkerLayout) else glove
+    shipped = name in shipped_labelers() and load_layout(name) == layout
+    if labeler is None and not shipped:
         warnings.warn(
-            f"no labeler was trained on glove '{glove}', so that the one for any layout learns it within a "
-            f"minute; a better one takes handsim generate --glove {glove} --out SET && handsim train SET "
+            f"no labeler was trained on glove '{name}', so that the one for any layout learns it within a "
+            f"minute; a better one takes handsim generate --glove {name} --out SET && handsim train SET "
             "--out RUN, and --labeler RUN",
             HandSimWarning,
             stacklevel=2,
@@ -41,10 +43,10 @@ def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
         from train.any_layout.fine_tuning import fine_tuned_labeler  # torch
 
         return fine_tuned_labeler(layout)
-    found = load_labeler(glove if labeler is None else labeler)
+    found = load_labeler(name if labeler is None else labeler)
     if found.marker_names != layout.names:
         raise WeightsError(
-            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{glove}' has "
+            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{name}' has "
             f"{', '.join(layout.names)}"
         )
     return found

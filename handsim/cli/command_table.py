@@ -39,18 +39,6 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "view": ("handsim.cli.view:view", "Show a file or a live tracker in the browser."),
     "body": ("handsim.cli.body:body", "Write a rigid body's markers as a file, to track it with."),
     "render": ("handsim.cli.render:render", "Draw the hands of a take, with the truth of each picture."),
-    "reproduce": (
-        "handsim.cli.reproduce:REPRODUCE",
-        "Print a table of the paper with our figures beside.",
-    ),
-    "benchmark": (
-        "handsim.cli.benchmark:BENCHMARK_COMMANDS",
-        "Make the public benchmark, run a tracker on it, score anybody's results.",
-    ),
-    "sweep": (
-        "handsim.cli.sweep:sweep",
-        "Train and measure for gloves x rigs x people x seeds, as one job with a table.",
-    ),
     "doctor": ("handsim.cli.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }
 

@@ -8,10 +8,10 @@ from typing import Annotated, Final
 import tyro
 from rich.console import Console
 
-from handsim.app.executors.executor import choose_executor
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
+from handsim.app.output import place_of
 from handsim.app.progress import print_above, progress_bar
-from handsim.files.object_folder import folder_or_objects
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
@@ -37,12 +37,15 @@ def generate(
         cluster: Where else to make shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
     """
-    place = folder_or_objects(out)
-    with progress_bar("frames") as (bar, task):
+    place = place_of(out)
+    with (
+        progress_bar("frames") as (bar, task),
+        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+    ):
         manifest = generate_dataset(
             config,
             place,
-            workers=choose_executor(cluster, workers, place, print_above(bar)),
+            workers=chosen,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     print_line(f"{manifest.num_frames} frames of {config.glove} in {place}")

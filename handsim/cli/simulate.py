@@ -14,12 +14,12 @@ from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX, Take, load_take
-from handsim.app.executors.executor import choose_executor
-from handsim.app.memory import check_memory
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
+from handsim.app.workers import run_jobs
 from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free, check_memory
 from handsim.files.outputs import check_outputs
 from train.simulation.takes import TakeConfig, simulate_take
 
@@ -46,8 +46,8 @@ def simulate(
     if cluster is None:
         take = _simulate_into(out, config)
     else:
-        executor = choose_executor(cluster, None, out.parent, print_line)
-        list(executor.run(functools.partial(_capture_of_seed, out, config), [config.seed]))
+        with chosen_workers(cluster, None, print_line) as workers:
+            list(run_jobs(functools.partial(_capture_of_seed, out, config), [config.seed], workers))
         take = load_take(truth)
     counts = count_gaps(take.markers_present())
     print_line(f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}")

@@ -17,8 +17,6 @@ from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
 from gloves.takes.corrections import load_corrections
 from gloves.takes.take import load_take
-from gloves.takes.tracked_take import load_tracked_take
-from handsim.app.executors.output import load_receipt
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
 from handsim.space.cameras import CameraRig, load_rig
@@ -29,11 +27,7 @@ from render.scenery.photographs import draw_photo, photo_files
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive
-from track.benchmark.manifest import label_names, load_benchmark
-from track.benchmark.results import read_result
 from track.bodies.body_file import load_body
-from track.evaluation.sweep.cells import cells_of
-from track.evaluation.sweep.sweep_file import load_sweep
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
 
@@ -112,14 +106,6 @@ def _read_calibration(path: Path) -> None:
         CameraRig("lab", import_cameras(path))
 
 
-def _read_sweep(path: Path) -> None:
-    cells_of(load_sweep(path))
-
-
-def _read_result(path: Path) -> None:
-    read_result(path, seeds.benchmark_capture(), label_names())
-
-
 _ALL: Final = (
     Target("c3d", seeds.c3d, read_capture),
     Target("trc", seeds.trc, read_capture),
@@ -127,26 +113,20 @@ _ALL: Final = (
     Target("tsv", seeds.tsv, read_capture),
     Target("layout", seeds.layout, load_layout),
     Target("rig", seeds.rig, load_rig),
-    Target("sweep", seeds.sweep, _read_sweep),
     Target("cameras", seeds.camera_files, load_cameras),
     Target("calibrations", seeds.calibrations, _read_calibration),
     Target("poses", seeds.own_poses, lambda path: load_poses(PoseFile(path)), mutate_archive),
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
     Target("truth", seeds.truth, load_take, mutate_archive),
-    Target("tracked", seeds.tracked, load_tracked_take, mutate_archive),
+    Target("tracked", seeds.tracked, load_take, mutate_archive),
     Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
-    Target("benchmark", seeds.benchmark, lambda path: load_benchmark(path.parent)),
-    Target("result_table", seeds.result_table, _read_result),
-    Target("result_arrays", seeds.result_arrays, _read_result, mutate_archive),
-    Target("result_points", seeds.result_points, _read_result),
     Target("weights", seeds.weights, _read_weights),
     Target("onnx", seeds.onnx, _read_onnx),
     Target("dataset", seeds.dataset, _read_dataset),
     Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_archive),
     Target("settings", seeds.settings, _read_settings),
-    Target("receipt", seeds.receipt, load_receipt),
     Target("packet", seeds.packets, _read_packet, refusals=(DamagedPacket,)),
     Target("photo", seeds.photos, _read_photo),
 )

@@ -108,9 +108,9 @@ def test_the_default_sensor_measures_hands_from_the_users_eyes(path):
 def reaching_the_eyes(path, folder, config):
     """A copy of the take whose left hand is at the camera in frames 24 and 25."""
     take = load_take(path)
-    middle = take.hands[1].fit.model.skin(take.hands[1].qpos[24:25])[0].mean(axis=0)
+    middle = take.hands[1].model.skin(take.qpos[24:25, 1])[0].mean(axis=0)
     eye = Viewpoints(config.view, show_take(take), rng=_path_rng(config)).cameras(24)[0].T_world_camera[:3, 3]
-    take.hands[1].qpos[24:26, :3] += eye - middle
+    take.qpos[24:26, 1, :3] += eye - middle
     take.save(folder / "reaching.truth.npz")
     return folder / "reaching.truth.npz"
 
@@ -143,7 +143,7 @@ def test_frames_with_a_camera_in_a_hand_are_left_out_and_told(path, tmp_path, ca
 def test_a_rendering_without_any_frame_is_told(path, tmp_path):
     config = dataclasses.replace(PLAIN, view=ViewConfig("head"), every=1)
     take = load_take(reaching_the_eyes(path, tmp_path, config))
-    hands = tuple(dataclasses.replace(hand, qpos=hand.qpos.copy()) for hand in take.hands)
+    hands = tuple(dataclasses.replace(hand, qpos=hand.qpos.copy()) for hand in take.moving_hands())
     for hand in hands:
         hand.qpos[[*range(24), *range(26, 48)]] = np.nan
     shown = dataclasses.replace(show_take(take), hands=hands)

@@ -11,7 +11,7 @@ import pytest
 
 from gloves.captures.formats import read_capture
 from handsim._plugins import load_plugin
-from handsim.app.workers import in_processes
+from handsim.app.workers import run_jobs
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError
 from poses.shapes.sampling import load_sampler
@@ -122,7 +122,7 @@ def test_a_training_set_has_the_samplers_poses(dataset, folder, capsys):
 def test_worker_processes_import_it_too(folder):
     load_sampler("own_ideas:Curled")  # as the command does before the work
     job = functools.partial(sys.modules["own_ideas"].job, "own_ideas:Curled")
-    assert sorted(in_processes(job, [0, 1, 2], 2)) == [0, 1, 2]
+    assert sorted(run_jobs(job, [0, 1, 2], 2)) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(

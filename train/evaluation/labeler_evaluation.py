@@ -16,8 +16,7 @@ from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.batches import paper_corruption
-from train.evaluation.metrics import LabelCounts
-from train.evaluation.reliability import error_without, expected_calibration_error
+from train.evaluation.metrics import LabelCounts, error_without, expected_calibration_error
 from train.labelers.protocol import Labeler
 
 _CHUNK: Final = 4096
@@ -28,7 +27,7 @@ class Report:
     """The result of an evaluation."""
 
     figures: dict[str, float]
-    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.reliability` the expected
+    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.metrics` the expected
     calibration error and the share of points labeled wrongly without the 2 % of least confidence."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int
@@ -105,7 +104,7 @@ def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
     count = _Count(labeler)
     for take in takes:
         for hand in range(len(take.hands)):
-            names = take.hands[hand].fit.layout.names
+            names = take.hands[hand].layout.names
             if names != labeler.marker_names:
                 raise CaptureError(
                     f"the take's glove has markers {', '.join(names)}, the labeler knows "

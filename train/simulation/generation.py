@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,14 +14,12 @@ import numpy as np
 
 from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout, load_layout
-from handsim.app.executors.executor import Executor, executor_of
-from handsim.app.executors.output import FolderOutput, Output, open_output
 from handsim.app.interrupts import Stopped
+from handsim.app.output import Output, Place, open_output, place_of
+from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import DatasetError
-from handsim.files.atomic import remove_leftovers
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
-from handsim.files.object_folder import ObjectFolder
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES
@@ -51,7 +50,7 @@ Progress = Callable[[int, int], None]
 
 def generate_dataset(
     config: DatasetConfig,
-    out: Path | ObjectFolder,
+    out: str | Place,
     *,
     workers: int | Executor | None = None,
     progress: Progress | None = None,
@@ -60,9 +59,10 @@ def generate_dataset(
 
     Args:
         config: What to make.
-        out: Folder to make it in, or a folder of an object store. A set there may have fewer frames and must
-            have the same settings else.
-        workers: Processes, all cores when not given; or who else makes the shards.
+        out: Folder to make it in; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. A set
+            there may have fewer frames and must have the same settings else.
+        workers: Number of processes, all cores when not given; or an executor, as Dask's
+            `Client.get_executor()`.
         progress: Called after every shard.
 
     Returns:
@@ -75,7 +75,7 @@ def generate_dataset(
         LayoutError: The glove is unknown or does not fit.
         ArgumentError: The rig is unknown or stands in the hands' way, or no hand of the population can rest.
     """
-    executor = executor_of(workers)
+    place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
     layout, rig = load_layout(config.glove), as_rig(config.rig)
     check_outside_volume(rig, np.array(ROOM_CENTER), config.volume)
     if config.min_cameras > len(rig.positions):
@@ -85,9 +85,9 @@ def generate_dataset(
     attach_markers(layout, HandModel.named("M"))  # raises before anything is written
     if config.sampler is not None:
         load_sampler(config.sampler)
-    if isinstance(out, Path):
-        _check_space(config, out, layout.num_markers)
-    with open_output(out) as output:
+    if isinstance(place, Path):
+        _check_space(config, place, layout.num_markers)
+    with open_output(place) as output:
         output.claim(
             CONFIG,
             _settings(config, layout, rig),
@@ -96,7 +96,7 @@ def generate_dataset(
             grows="num_frames",
             result=MANIFEST,
         )
-        _make_shards(config, output, layout.num_markers, executor, progress)
+        _make_shards(config, output, layout.num_markers, workers, progress)
         return _complete(config, output, layout)
 
 
@@ -114,42 +114,43 @@ def _settings(config: DatasetConfig, layout: MarkerLayout, rig: CameraRig) -> di
 
 
 def _make_shards(
-    config: DatasetConfig, output: Output, num_markers: int, executor: Executor, progress: Progress | None
+    config: DatasetConfig,
+    output: Output,
+    num_markers: int,
+    workers: int | Executor,
+    progress: Progress | None,
 ) -> None:
     """Have the shards made that are not there."""
-    todo = [shard for shard in _shards(config) if not _finished(config, output, shard, num_markers)]
+    there = output.sizes()
+    todo = [shard for shard in _shards(config) if not _finished(config, there, shard, num_markers)]
     done = config.num_frames - sum(_shard_size(config, shard) for shard in todo)
     try:
-        for shard in executor.run(output.job(functools.partial(make_shard, config)), todo):
+        job = output.job(functools.partial(make_shard, config), last=["rows-*"])
+        for shard in run_jobs(job, todo, workers):
             done += _shard_size(config, shard)
             if progress is not None:
                 progress(done, config.num_frames)
     except KeyboardInterrupt as stop:
-        raise _stopped(stop, output, done, config.num_frames) from stop
+        kept = f"{done} of {config.num_frames} frames are in {output}"
+        raise Stopped.again(stop, f"{kept}, and the same command goes on after them") from stop
 
 
 def _complete(config: DatasetConfig, output: Output, layout: MarkerLayout) -> Manifest:
     """Write the manifest."""
     shards = _shards(config)
-    output.collect("redrawn-*.json")
+    output.fetch("redrawn-*.json")
+    names = sorted(name(shard) for shard in shards for name in (rows_name, hands_name))
     manifest = Manifest(
         config=load_json(output.folder / CONFIG),
         marker_names=layout.names,
         num_frames=config.num_frames,
         min_cameras=config.min_cameras,
-        files=output.checksums(sorted(name(shard) for shard in shards for name in (rows_name, hands_name))),
+        files={name: output.checksum(name) for name in names},
         redrawn=load_redrawn(output.folder, len(shards)),
     )
     save_manifest(output.folder, manifest)
     output.publish(MANIFEST)
     return manifest
-
-
-def _stopped(stop: KeyboardInterrupt, out: Output, done: int, expected: int) -> Stopped:
-    """The same signal, with what is kept."""
-    remove_leftovers(out.folder)  # of workers that had no time to
-    kept = f"{done} of {expected} frames are in {out}, and the same command goes on after them"
-    return Stopped.again(stop, kept)
 
 
 def _check_space(config: DatasetConfig, out: Path, num_markers: int) -> None:
@@ -166,19 +167,10 @@ def _shards(config: DatasetConfig) -> range:
     return range(-(-config.num_frames // ROWS_PER_SHARD))
 
 
-def _finished(config: DatasetConfig, output: Output, shard: int, num_markers: int) -> bool:
+def _finished(config: DatasetConfig, there: dict[str, int], shard: int, num_markers: int) -> bool:
     """Whether a shard is there with all its rows; the last one of a set that grows is made again."""
-    if not isinstance(output, FolderOutput):
-        expected = array_bytes(row_dtype(num_markers), _shard_size(config, shard))
-        return output.size(shard, rows_name(shard)) == expected
-    out = output.folder
-    if not (out / hands_name(shard)).is_file():
-        return False
-    try:
-        rows = np.load(out / rows_name(shard), mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):  # not there, or damaged
-        return False
-    return len(rows) == _shard_size(config, shard)
+    expected = array_bytes(row_dtype(num_markers), _shard_size(config, shard))
+    return hands_name(shard) in there and there.get(rows_name(shard)) == expected
 
 
 def _shard_size(config: DatasetConfig, shard: int) -> int:

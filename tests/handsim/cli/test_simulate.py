@@ -1,4 +1,4 @@
-"""`handsim simulate`, `handsim reproduce` and `handsim evaluate` of a take, through the command line."""
+"""`handsim simulate` and `handsim evaluate` of a take, through the command line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gloves.layout import load_layout
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from train.simulation.held_out import held_out_markers
-from train.simulation.room_settings import KINDS, TWINS
+from train.simulation.room_settings import KINDS
 
 FRAMES = 60
 
@@ -166,28 +166,6 @@ def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
     assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "the labeler knows" in said
-
-
-def test_table_3_has_a_row_a_capture_with_the_papers_figures(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "120")
-    assert main(["reproduce", "table3"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    for kind in KINDS:
-        row, by_marker = (line for line in lines if line.split("│")[1:2] and kind in line.split("│")[1])
-        paper, ghosts = TWINS[kind].paper, TWINS[kind].ghost_ratio
-        frames, gaps, length, missing, share = (cell.strip() for cell in row.split("│")[2:7])
-        assert frames == f"{paper.frames} ({paper.frames})"
-        for cell, wanted in (
-            (gaps, paper.gaps),
-            (length, paper.average_length),
-            (missing, paper.average_missing),
-        ):
-            ours, theirs = cell.rstrip(")").split(" (")
-            assert float(theirs) == pytest.approx(wanted)
-            assert float(ours) == pytest.approx(wanted, rel=0.4), f"{kind}: {cell}"
-        assert share.endswith(f"({100 * ghosts:.2f} %)")
-        assert by_marker.count("%") == 3
-    assert any("real finger markers" in line for line in lines)
 
 
 def test_a_capture_that_no_memory_holds_is_refused_at_once(tmp_path, capsys):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.paper.take_evaluation import true_users
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
-from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
 from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig, simulate_take

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from benchmarks.paper.take_evaluation import seen_frame
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel
-from track.evaluation.take_evaluation import seen_frame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 
@@ -83,7 +83,7 @@ def joint_errors(
 ) -> np.ndarray:
     """Mean distance (T, H) of a hand's joints from the truth [m] where the tracker is sure, NaN elsewhere."""
     off = np.full((len(tracked), 2), np.nan)
-    for number, hand in enumerate(take.hands):
+    for number, hand in enumerate(take.moving_hands()):
         model = HandModel(hand.shape)
         sure = [n for n, one in enumerate(tracked) if one.hands[number].status in SURE]
         if not sure:

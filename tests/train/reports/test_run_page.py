@@ -17,8 +17,7 @@ from handsim.hand.topology import BONES
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import Report
-from train.evaluation.metrics import macro_f1, percent
-from train.evaluation.reliability import error_without, expected_calibration_error
+from train.evaluation.metrics import error_without, expected_calibration_error, macro_f1, percent
 from train.history import History
 from train.labelers.storage import load_labeler
 from train.loop import CHECKPOINT, train_labeler

@@ -1,0 +1,41 @@
+"""A table of functions as one command line, for the folders of benchmarks."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import tyro
+
+from handsim.app.messages import told_warnings
+from handsim.errors import HandSimError
+
+
+def run(
+    module: str,
+    description: str | None,
+    commands: Mapping[str, Callable[..., Any]],
+    args: Sequence[str] | None = None,
+) -> int:
+    """Run one function of a table and return the exit code: 1, and one sentence, for a user's mistake.
+
+    Args:
+        module: What the table is started as, `python -m MODULE`.
+        description: What its help begins with.
+        commands: Functions by name.
+        args: Words of the command line; those of the process when not given.
+
+    Raises:
+        SystemExit: After the help (code 0) or a mistake in options (code 2).
+    """
+    program = f"python -m {module}"
+    try:
+        with told_warnings(program):
+            tyro.extras.subcommand_cli_from_dict(
+                dict(commands), prog=program, description=description, args=args
+            )
+    except HandSimError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 1
+    return 0
