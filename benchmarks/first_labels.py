@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
-from benchmarks.record import describe
+from benchmarks.record import add_save, describe, save_figures
 from gloves.captures.collection import find_captures, read_markers
 from gloves.layout import load_layout
 from train.config import KINDS, TrainConfig, batch_recipe, default_config
@@ -42,6 +42,7 @@ def main() -> None:
     parser.add_argument("--labeler", choices=KINDS, default="set")
     parser.add_argument("--frames", type=int, default=100_000)
     parser.add_argument("--samples", type=int, default=400_000)
+    add_save(parser)
     options = parser.parse_args()
     print(describe("torch", "mujoco"))
     tested = FRAMES[options.labeler]
@@ -57,6 +58,11 @@ def main() -> None:
     last = max((time for times in beaten.values() for time in times.values()), default=np.inf)
     complete = all(len(times) == len(AUGMENTATIONS) for times in beaten.values())
     print(f"all beaten within {LIMIT:.0f} minutes: {'yes' if complete and last <= LIMIT else 'no'}")
+    every = sorted(time for times in beaten.values() for time in times.values())
+    if complete:
+        what = "minutes until the last of the paper's four best figures was beaten, generation included"
+        three = "minutes until the other three were beaten"
+        save_figures(options.save, {"all": (what, last), "three": (three, every[-1 - len(beaten)])})
 
 
 def race(

@@ -28,7 +28,6 @@ from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, d
 from render.illustrations.scene import PosedHand
 from render.session import draw_frames
 from track.capture_tracking import track_capture
-from track.tracker import Tracker
 from train.data.augmentation import Corruption, corrupt
 from train.data.shards import Dataset
 from train.evaluate import CLEAN, evaluate_labeler
@@ -244,7 +243,7 @@ def _draw_labeled_frame(out: Path, frame: LabeledFrame) -> Section:
 def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
     """Track a simulated capture of two hands, say how far its joints are off, and draw it."""
     take = simulate_take("hand-hand", num_frames=_TRACKED, seed=seed)
-    tracked = track_capture(take.capture(), Tracker(take.hands, labeler))
+    tracked = track_capture(take, hands=take.hands, labeler=labeler)
     errors = []
     for number, hand in enumerate(take.hands):
         model, found = hand.model, tracked.motion(hand.side).qpos

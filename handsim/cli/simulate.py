@@ -15,12 +15,11 @@ from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX, Take, load_take
 from handsim.app.cluster import chosen_workers
-from handsim.app.memory import check_memory
 from handsim.app.messages import print_line
 from handsim.app.workers import run_jobs
 from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free, check_memory
 from handsim.files.outputs import check_outputs
 from train.simulation.takes import TakeConfig, record_config
 

@@ -13,8 +13,6 @@ from gloves.takes.take import LOST, Take
 from handsim.cli.main import main
 from track.capture_tracking import track_capture
 from track.take_summary import suspicions
-from track.tracker import Tracker
-from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take
 
 FRAMES = 40
@@ -27,8 +25,7 @@ def truth() -> Take:
 
 @pytest.fixture(scope="module")
 def tracked(truth) -> Take:
-    tracker = Tracker(list(truth.hands), load_labeler("dense19"))
-    return track_capture(truth.capture(), tracker)
+    return track_capture(truth, hands=truth.hands, labeler="dense19")
 
 
 def test_a_good_take_tells_nothing(tracked):

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
 from handsim.hand.topology import Side
-from train.hands.links import clusters
-from train.hands.measures import HandMeasures
+from track.finder.links import clusters
+from track.finder.measures import HandMeasures
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
 from train.matching.pose_prior import PosePrior

@@ -1,12 +1,13 @@
-"""Space on the disk, asked for before the work."""
+"""Space on the disk and memory of the machine, asked for before the work."""
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Final
 
-from handsim.errors import HandSimError
+from handsim.errors import ArgumentError, HandSimError
 
 _UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
 
@@ -30,6 +31,36 @@ def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type
             f"{what} need {shown_bytes(needed)}, but the disk of {folder} has {shown_bytes(free)} free; "
             f"{remedy} or name a folder on another disk"
         )
+
+
+def check_memory(needed: int, what: str, remedy: str) -> None:
+    """Refuse work that the machine has no memory for.
+
+    Args:
+        needed: Bytes that will be held at a time.
+        what: What needs them, for the message, in the plural.
+        remedy: What to do, as in `ask for fewer frames`.
+
+    Raises:
+        ArgumentError: The machine has less than that free.
+    """
+    free = available_bytes()
+    if needed > free:
+        raise ArgumentError(
+            f"{what} need {shown_bytes(needed)} of memory, but {shown_bytes(free)} are free; {remedy}"
+        )
+
+
+def available_bytes() -> int:
+    """Memory to be had without swapping [bytes]; all that is built in where the system tells no more."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def shown_bytes(count: float) -> str:

@@ -1,8 +1,8 @@
 """The hands of a capture with their labels: how many each frame holds, and which is left and right.
 
-Frames in which the hands stand apart are decided on their own (`train.hands.frame_hands`), all of them vote
-for left and right (`train.hands.sides`), and the other frames follow from these (`train.hands.following`).
-At the end all labels of a point's path vote for its label in each frame (`train.hands.voting`).
+Frames in which the hands stand apart are decided on their own (`track.finder.frame_hands`), all of them vote
+for left and right (`track.finder.sides`), and the other frames follow from these (`track.finder.following`).
+At the end all labels of a point's path vote for its label in each frame (`track.finder.voting`).
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from train.hands.following import Follower
-from train.hands.frame_hands import FoundHand, HandFinder
-from train.hands.links import previous_points
-from train.hands.sides import sides_of
-from train.hands.voting import vote
+from track.finder.following import Follower
+from track.finder.frame_hands import FoundHand, HandFinder
+from track.finder.links import previous_points
+from track.finder.sides import sides_of
+from track.finder.voting import vote
 from train.labelers.protocol import check_clouds
 
 Frames = Sequence[NDArray[np.float64]]

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
 
-from train.hands.frame_hands import FoundHand
+from track.finder.frame_hands import FoundHand
 
 _FOLLOWED: Final = 0.5  # share of a hand's points that were another's in the frames before, if it is the same
 
@@ -26,7 +26,7 @@ def sides_of(
     Args:
         frames: At most two hands in each frame.
         starts: Where each frame starts among all points.
-        previous: Which point of the frame before each point was, see `train.hands.links.previous_points`.
+        previous: Which point of the frame before each point was, see `track.finder.links.previous_points`.
     """
     tracks, votes = _tracks(frames, starts, previous)
     together = Counter(tuple(sorted(pair)) for pair in tracks if len(pair) == 2 and pair[0] != pair[1])

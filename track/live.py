@@ -1,26 +1,25 @@
-"""The live part of `handsim track`: a stream is tracked and recorded until it ends."""
+"""Live streams: hands are measured in the first frames, then tracked, sent on and recorded until the end."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from gloves.takes.take import Take
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
-from track.capture_tracking import track_stream
-from track.live_recording import LiveRecorder
-from track.sinks.sink_group import SinkGroup
-from track.streams.addresses import LiveStream, open_source
-from track.streams.frame_source import StreamedFrame
+from handsim.app.messages import LiveStatus
+from track.capture_tracking import OnFrame
+from track.recorder import Recorder
+from track.setup import TrackerSetup
+from track.sinks.addresses import SinkGroup
+from track.streams.addresses import open_source
+from track.streams.frame_source import LiveStream, StreamedFrame
 from track.tracked_frame import TrackedFrame
-from track.tracker import Tracker
 
 _MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for them
@@ -34,82 +33,100 @@ _LEFT_OUT: Final = {
 """Counts of what does not go on, in words."""
 
 
-class TrackedSource(NamedTuple):
-    """What was made of a capture or a stream, and written."""
+class LiveTake(NamedTuple):
+    """What was recorded of a stream."""
 
     take: Take
     """The take; of a long stream, parts of it."""
     num_frames: int
     """Number of all frames."""
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...]
     """What is to be told, one line each."""
 
     @property
-    def whole(self) -> bool:
+    def is_whole(self) -> bool:
         """Whether `take` is all of it."""
         return self.take.num_frames == self.num_frames
 
 
-class Start(Protocol):
-    """Makes a tracker."""
+def measured_setup(
+    stream: LiveStream, setup: TrackerSetup, status: LiveStatus, *, seconds: float | None = None
+) -> tuple[TrackerSetup, Iterator[StreamedFrame]]:
+    """The setup with the hands as measured in the first frames of a stream, and all its frames.
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """What makes the take, as JSON; complete once the tracker is made."""
-        ...
-
-    def __call__(self, frames: Sequence[StreamedFrame]) -> Tracker:
-        """The tracker; its hands are measured in some frames, if there are any."""
-        ...
+    Args:
+        stream: The stream.
+        setup: What the tracker is made of; a stream is not waited for if its hands are known.
+        status: Says what is waited for.
+        seconds: How long to wait [s], ten seconds at most.
+    """
+    if not setup.is_measured:
+        return setup, stream
+    first = _first_frames(stream, setup.fewest_points, seconds, status)
+    setup = setup.measured([frame for frame in first if len(frame.points) >= setup.fewest_points])
+    status.say(f"size of the hands: {setup.user}")
+    return setup, chain(first, stream)
 
 
 def track_live(
-    url: str,
-    seconds: float | None,
-    start: Start,
+    address: str,
     out: Path,
+    setup: TrackerSetup,
     *,
-    fewest_points: float | None,
+    seconds: float | None = None,
     sinks: SinkGroup,
-) -> TrackedSource:
-    """Track and record a stream until time is up or a signal ends it.
+    on_frame: OnFrame,
+) -> LiveTake:
+    """Track and record a stream until time is up, the stream ends, or a signal ends it.
 
     Args:
-        url: The address of the stream, see `open_source`.
-        seconds: How long to record [s]; None for as long as it comes.
-        start: Makes the tracker, from the first frames if there is something to be measured in them.
+        address: The stream, see `open_source`.
         out: The take's file; until its end the recording is beside it.
-        fewest_points: Points of a frame in which something can be measured; None where nothing is.
+        setup: What the tracker is made of; its hands may be measured in the first second.
+        seconds: How long to record [s]; None for as long as it comes.
         sinks: Take every frame before it is recorded.
+        on_frame: Called with each frame, its time in [s], and what the tracker made of it.
 
     Raises:
         CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
     """
     with (
         interrupt_flag() as interrupted,  # the frames so far are kept
-        closing(open_source(url, ended=interrupted)) as stream,
+        open_source(address, ended=interrupted) as stream,
         LiveStatus() as status,
-        ExitStack() as stack,
     ):
-        first = [] if fewest_points is None else first_frames(stream, fewest_points, seconds, status)
-        tracker = start([frame for frame in first if len(frame.points) >= (fewest_points or 0)])
+        setup, frames = measured_setup(stream, setup, status, seconds=seconds)
+        tracker = setup.tracker()
         sinks.start(tracker.hands, tracker.bodies)
-        recorder = stack.enter_context(LiveRecorder(tracker, out, start.settings))
-        status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
-        try:
-            _record(track_stream(chain(first, stream), tracker), seconds, recorder, sinks, stream, status)
-            status.show(f"writing {out}", now=True)
-            take, step = recorder.finish(
-                stream.counts,
-                told=lambda: status.show(f"writing {out}; {recorder.part} is kept until then"),
-            )
-        except KeyboardInterrupt:
-            status.say(f"the recording is kept in {recorder.part}")
-            raise
-        return TrackedSource(take, recorder.num_frames, (*_notes(stream.counts, step), *sinks.notes()))
+        with Recorder(out, tracker, {"capture": address, **setup.settings}) as recorder:
+            status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
+            status.show("waiting for the first frame")
+            try:
+                start = perf_counter()
+                for frame in frames:
+                    tracked = tracker.step(frame.points, frame.ids, frame.time)
+                    sinks.send(frame, tracked)
+                    recorder.add(frame, tracked)
+                    on_frame(frame, tracked)
+                    elapsed = perf_counter() - start if frame.silent else recorder.duration
+                    if seconds is not None and elapsed >= seconds:
+                        break
+                    if frame.silent or status.due:
+                        line = _status_line(frame, tracked, stream.counts, sinks.counts)
+                        status.show(line, now=frame.silent)
+                status.show(f"writing {out}", now=True)
+                take, step = recorder.finish(
+                    stream.counts,
+                    told=lambda: status.show(f"writing {out}; {recorder.part} is kept until then"),
+                )
+            except KeyboardInterrupt:
+                status.say(f"the recording is kept in {recorder.part}")
+                recorder.close()
+                raise
+        return LiveTake(take, recorder.num_frames, (*_notes(stream.counts, step), *sinks.notes()))
 
 
-def first_frames(
+def _first_frames(
     stream: LiveStream, fewest_points: float, seconds: float | None, status: LiveStatus
 ) -> list[StreamedFrame]:
     """The first frames of a stream, until there were enough points for a second, or ten seconds are over."""
@@ -128,27 +145,6 @@ def first_frames(
         if now >= min(began + min(_LONGEST_WAIT, seconds or np.inf), shown + _MEASURED):
             break
     return frames
-
-
-def _record(
-    frames: Iterator[tuple[StreamedFrame, TrackedFrame]],
-    seconds: float | None,
-    recorder: LiveRecorder,
-    sinks: SinkGroup,
-    stream: LiveStream,
-    status: LiveStatus,
-) -> None:
-    """Send and record frames until the stream ends or time is up."""
-    status.show("waiting for the first frame")
-    start = perf_counter()
-    for frame, tracked in frames:
-        sinks.send(frame, tracked)
-        recorder.add(frame, tracked)
-        elapsed = perf_counter() - start if frame.silent else recorder.duration
-        if seconds is not None and elapsed >= seconds:
-            break
-        if frame.silent or status.due:
-            status.show(_status_line(frame, tracked, stream.counts, sinks.counts), now=frame.silent)
 
 
 def _notes(counts: dict[str, int], step: int) -> tuple[str, ...]:

@@ -42,7 +42,7 @@ def vote(
         confidence: Of each label.
         asked: Whether its frame was labeled; where not, no label says nothing.
         starts: Where each frame starts among the points, and where the last one ends.
-        previous: Which point of the frame before each point was, see `train.hands.links.previous_points`.
+        previous: Which point of the frame before each point was, see `track.finder.links.previous_points`.
         num_markers: Markers of a hand.
         rate: Frames per second [Hz].
     """

@@ -12,8 +12,8 @@ import termios
 
 import pytest
 
-from handsim.app import live_status
-from handsim.app.live_status import LiveStatus
+from handsim.app import messages
+from handsim.app.messages import LiveStatus
 
 LINE = "frame 1234: right tracked, left tracked, controller tracked, 12 missing; Ctrl-C ends it"
 
@@ -38,7 +38,7 @@ def test_a_terminal_shows_what_fits_into_its_line(columns, monkeypatch):
 
 def test_a_log_gets_a_line_every_ten_seconds(monkeypatch, capsys):
     now = [50.0]
-    monkeypatch.setattr(live_status.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(messages.time, "monotonic", lambda: now[0])
     with LiveStatus() as status:
         for _ in range(200):
             status.show(f"{now[0]:.1f}")

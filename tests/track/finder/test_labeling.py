@@ -8,10 +8,10 @@ import torch
 
 from gloves.captures.markers import unlabeled_frames
 from gloves.layout import load_layout
+from track.finder.frame_hands import HandFinder
+from track.finder.labeling import label_hands
 from train.evaluate import evaluate_labeler
 from train.glove_labeler import load_labeler
-from train.hands.frame_hands import HandFinder
-from train.hands.labeling import label_hands
 from train.labelers.protocol import Labeling
 from train.simulation.takes import simulate_take
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from train.hands.voting import vote
+from track.finder.voting import vote
 
 FRAMES, MARKERS = 40, 5
 STARTS = np.arange(FRAMES + 1) * MARKERS

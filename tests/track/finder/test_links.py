@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from train.hands.links import previous_points
+from track.finder.links import previous_points
 
 FRAMES, MARKERS = 20, 6
 STARTS = np.arange(FRAMES + 1) * MARKERS

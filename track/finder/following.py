@@ -3,8 +3,8 @@
 From both ends of such a stretch, frame by frame: a point that was a hand's a moment ago is that hand's. Each
 hand is labeled among its own points and those of which nothing is known; where both claim one, the more
 confident hand has it. A new point is a hand's own after some frames, and one that a hand does not want is
-free again. Some frames are passed over: the votes of the others decide there (`train.hands.voting`). Where
-nothing is known of merged hands, they are cut (`train.hands.frame_hands`).
+free again. Some frames are passed over: the votes of the others decide there (`track.finder.voting`). Where
+nothing is known of merged hands, they are cut (`track.finder.frame_hands`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from train.hands.frame_hands import Criteria, FoundHand, HandFinder
-from train.hands.links import following_points
+from track.finder.frame_hands import Criteria, FoundHand, HandFinder
+from track.finder.links import following_points
 
 SIDES: Final = (1, -1)
 """Right, left."""
@@ -58,7 +58,7 @@ class Follower:
         frames: Points of each frame [m].
         by_side: The hands that were found in each frame; those that are followed are added.
         finder: Finds and labels hands.
-        previous: See `train.hands.links.previous_points`.
+        previous: See `track.finder.links.previous_points`.
         rate: Frames per second [Hz].
     """
 

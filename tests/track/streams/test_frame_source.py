@@ -9,9 +9,9 @@ import time
 import numpy as np
 import pytest
 
+from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-from track.streams.frame_source import StreamedFrame
-from track.streams.source_stream import SourceStream
+from track.streams.frame_source import LiveStream, SourceStream, StreamedFrame, capture_frames
 
 
 def frame(number: int, points: object = None, **changes: object) -> StreamedFrame:
@@ -110,3 +110,32 @@ def test_a_close_that_fails_is_told_and_loses_nothing():
     assert next(stream).number == 0
     with pytest.warns(HandSimWarning, match=r"mine: close failed \(OSError: stuck\)"):
         stream.close()
+
+
+def test_a_column_is_an_id_until_its_point_is_lost():
+    positions = np.full((5, 2, 3), np.nan)
+    positions[[0, 1, 3, 4], 0], positions[1:, 1] = 0.0, 1.0
+    frames = list(capture_frames(Capture(("a", "b"), positions, 100.0)))
+    assert [frame.ids.tolist() for frame in frames] == [[0], [0, 1], [1], [2, 1], [2, 1]]
+    assert [len(frame.points) for frame in frames] == [1, 2, 1, 2, 2]
+    np.testing.assert_allclose([frame.time for frame in frames], 0.01 * np.arange(5))
+
+
+class Arriving:
+    """Frames as they arrive, of which nothing is counted."""
+
+    def __init__(self, times: list[float]) -> None:
+        self.counts: dict[str, int] = {}
+        self.frames = iter([frame(number, time=time) for number, time in enumerate(times)])
+
+    def __next__(self) -> StreamedFrame:
+        return next(self.frames)
+
+    def close(self) -> None:
+        self.frames = iter(())
+
+
+def test_time_goes_on_when_a_recording_begins_anew():
+    with LiveStream(Arriving([5.0, 5.1, 5.2, 0.1, 0.2, 0.1])) as stream:
+        times = [one.time for one in stream]
+    np.testing.assert_allclose(times, [5.0, 5.1, 5.2, 5.21, 5.31, 5.32], atol=0.005)

@@ -7,9 +7,9 @@ the last half second, whatever ends the process. `finish` turns it into `take.np
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
 from gloves.takes.columns import FRAMES, KEYPOINTS, NUMBERS
@@ -23,7 +23,7 @@ from gloves.takes.take import (
     usual_rate,
     worn_arrays,
 )
-from handsim.errors import CaptureError
+from handsim.errors import ArgumentError, CaptureError
 from track.capture_tracking import frame_values
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
@@ -32,20 +32,29 @@ from track.tracker import Tracker
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
 
 
-class LiveRecorder:
-    """Records tracked frames on disk; the end of a `with` block closes the file and leaves it where it is.
+class Recorder:
+    """Records tracked frames on disk in a `with` block, frame by frame with `add`.
+
+    The end of the block writes the take, also when Ctrl-C ends it. After any other exception the recording
+    stays as it is, in `part`.
 
     Args:
+        path: The take's file, .npz; until its end the recording is beside it.
         tracker: The tracker, for its hands, bodies and settings.
-        out: The take's file, .npz; until `finish` the recording is beside it.
-        settings: What made the take, as JSON.
+        settings: What else made the take, as JSON.
 
     Raises:
+        ArgumentError: The path does not end in .npz.
         CaptureError: A recording that was cut off is in the way.
         OSError: The file cannot be written.
     """
 
-    def __init__(self, tracker: Tracker, out: Path, settings: dict[str, Any]) -> None:
+    def __init__(
+        self, path: str | Path, tracker: Tracker, settings: Mapping[str, Any] = MappingProxyType({})
+    ) -> None:
+        out = Path(path)
+        if out.suffix.lower() != ".npz":
+            raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")
         self.part = growing_path(out)
         """The file of the recording."""
         self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
@@ -58,6 +67,7 @@ class LiveRecorder:
             [column.sized(sizes) for column in (*FRAMES, NUMBERS, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
+        self._closed = False
 
     @property
     def num_frames(self) -> int:
@@ -90,14 +100,17 @@ class LiveRecorder:
         self._times = (self._times[0] if self._times else frame.time, frame.time)
 
     def close(self) -> None:
-        """Write what still waits, and close the file."""
+        """Write what still waits, and close the recording without writing the take."""
+        self._closed = True
         self._archive.close()
 
-    def finish(self, stream: dict[str, int], *, told: Callable[[], None] = lambda: None) -> tuple[Take, int]:
+    def finish(
+        self, stream: Mapping[str, int] | None = None, *, told: Callable[[], None] = lambda: None
+    ) -> tuple[Take, int]:
         """Write the take and remove the recording; without at least two frames, remove it only.
 
         Args:
-            stream: What became of the stream's frames, for the settings of the take.
+            stream: What became of the stream's frames (`counts` of `open_source`), for the take's settings.
             told: Called after every part.
 
         Returns:
@@ -111,7 +124,8 @@ class LiveRecorder:
         if self.num_frames < 2:
             self.part.unlink()
             raise CaptureError(f"{self.num_frames} frames came, expected two or more")
-        self._settings["stream"] = stream
+        if stream is not None:
+            self._settings["stream"] = dict(stream)
         grown = GrownArchive(self.part, check=False)
         header = self._header(usual_rate(grown.first("times", RATED_FRAMES)))
         try:
@@ -135,4 +149,7 @@ class LiveRecorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if self._closed or not (error is None or isinstance(error, KeyboardInterrupt)):
+            self.close()
+        else:
+            self.finish()

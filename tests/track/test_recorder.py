@@ -16,10 +16,11 @@ from gloves.takes.take import Take, load_take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
 from render.shown_take import load_shown_take
-from track import live_recording
+from track import recorder as module
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import TakeRecorder, capture_frames, track_stream
-from track.live_recording import LiveRecorder
+from track.capture_tracking import TakeRecorder
+from track.recorder import Recorder
+from track.streams.frame_source import capture_frames
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler
 from train.simulation.takes import simulate_take
@@ -34,12 +35,14 @@ def tracked():
     take = simulate_take(kind="hand-controller", num_frames=FRAMES)
     hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
     tracker = Tracker(hands, load_labeler("dense19"), (RigidTemplate.of(named_object("controller")),))
-    return tracker, list(track_stream(capture_frames(take.capture()), tracker))
+    return tracker, [
+        (frame, tracker.step(frame.points, frame.ids, frame.time)) for frame in capture_frames(take.capture())
+    ]
 
 
-def recorded(folder, *, frames: int = FRAMES) -> LiveRecorder:
+def recorded(folder, *, frames: int = FRAMES) -> Recorder:
     tracker, pairs = tracked()
-    recorder = LiveRecorder(tracker, folder / "new" / "take.npz", {"capture": "natnet://here"})
+    recorder = Recorder(folder / "new" / "take.npz", tracker, {"capture": "natnet://here"})
     for frame, one in pairs[:frames]:
         recorder.add(frame, one)
         recorder.add(dataclasses.replace(frame, silent=True), one)
@@ -107,9 +110,9 @@ def test_too_few_frames_leave_nothing(frames, tmp_path):
 
 
 def test_of_a_long_take_parts_are_read_for_its_summary(tmp_path, monkeypatch):
-    monkeypatch.setattr(live_recording, "_SUMMARIZED", 10)
+    monkeypatch.setattr(module, "_SUMMARIZED", 10)
     tracker, pairs = tracked()
-    recorder = LiveRecorder(tracker, tmp_path / "take.npz", {})
+    recorder = Recorder(tmp_path / "take.npz", tracker)
     for number, (frame, one) in enumerate(pairs):
         recorder.add(frame, one)
         if number % 4 == 3:
