@@ -32,7 +32,7 @@ def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
 
 
 def main() -> None:
-    truth = simulate_take("hand-hand", num_frames=120)  # 1 s at 120 Hz
+    truth = simulate_take(kind="hand-hand", num_frames=120)  # 1 s at 120 Hz
     tracked = track_capture(truth.capture(), glove="dense19")  # nobody was calibrated
     tone = SkinLook(lightness=45.0).typology_angle  # [deg]; people with skin about as dark as this
     config = RenderConfig(

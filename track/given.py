@@ -9,7 +9,6 @@ from gloves.captures.formats import read_capture
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim.errors import WeightsError
-from track.bodies.rigid_body import RigidTemplate
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
@@ -18,8 +17,6 @@ AnyCapture = Capture | Take | str | Path
 AnyGlove = MarkerLayout | str | Path
 AnyLabeler = Labeler | str | Path | None
 """A labeler, what `load_labeler` reads, or None for the one of the glove."""
-AnyBody = RigidTemplate | str | Path
-"""A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
 
 
 def capture_of(capture: AnyCapture) -> Capture:

@@ -74,7 +74,8 @@ def evaluate_labeler(
         raise CaptureError(f"given {shown} and other kinds of truth, expected one kind; evaluate each alone")
     if takes and (corruption != CLEAN or every > 1):
         raise CaptureError(
-            "a take is counted whole, with its own gaps and ghosts: leave out --occlude, --ghosts and --every"
+            "a simulated take is counted whole, with its own gaps and ghosts: leave out --occlude, --ghosts "
+            "and --every"
         )
     for one in takes:
         take = one if isinstance(one, Take) else load_take(one)

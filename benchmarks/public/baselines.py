@@ -21,7 +21,7 @@ from gloves.captures.capture import Capture
 from gloves.fit import GloveFit
 from handsim.files.json_files import claim
 from handsim.hand.topology import NUM_QPOS
-from track.calibration.hand_size import measure_hands
+from track.setup import measure_hands
 from track.streams.frame_source import capture_frames
 from track.tracked_frame import FrameTracker
 from track.tracker import Tracker

@@ -243,7 +243,7 @@ def _draw_labeled_frame(out: Path, frame: LabeledFrame) -> Section:
 def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
     """Track a simulated capture of two hands, say how far its joints are off, and draw it."""
     take = simulate_take("hand-hand", num_frames=_TRACKED, seed=seed)
-    tracked = track_capture(take, hands=take.hands, labeler=labeler)
+    tracked = track_capture(take.capture(), hands=take.hands, labeler=labeler)
     errors = []
     for number, hand in enumerate(take.hands):
         model, found = hand.model, tracked.motion(hand.side).qpos

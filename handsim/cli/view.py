@@ -17,10 +17,9 @@ from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from handsim.space.cameras import load_rig
-from track.calibration.hand_size import USUAL_SIZE
 from track.config import TrackerConfig
 from track.live import measured_setup
-from track.setup import Size, TrackerSetup, warm_up
+from track.setup import USUAL_SIZE, Size, TrackerSetup, warm_up
 from track.streams.addresses import open_source
 from track.viewer.contents import Content, first_look, open_content
 from track.viewer.live_view import LiveView

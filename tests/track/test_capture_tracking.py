@@ -24,8 +24,9 @@ from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import TakeRecorder, track_capture
+from track.capture_tracking import track_capture
 from track.config import TrackerConfig
+from track.recorder import TakeRecorder
 from track.streams.addresses import open_source
 from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
@@ -192,7 +193,7 @@ from gloves.layout import load_layout
 from track.capture_tracking import track_capture
 from track.setup import warm_up
 from train.glove_labeler import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 def ready():
     kernels = [one for one in gc.get_objects() if isinstance(one, CPUDispatcher)]

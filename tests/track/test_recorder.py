@@ -18,8 +18,7 @@ from handsim.space.objects import named_object
 from render.shown_take import load_shown_take
 from track import recorder as module
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import TakeRecorder
-from track.recorder import Recorder
+from track.recorder import Recorder, TakeRecorder
 from track.streams.frame_source import capture_frames
 from track.tracker import Tracker
 from train.glove_labeler import load_labeler

@@ -18,7 +18,7 @@ from gloves.takes.take import INITIALIZED, TRACKED, Take
 from handsim.errors import HandSimWarning
 from handsim.hand.topology import Side
 from track.calibration.frames import CalibrationError
-from track.calibration.hand_size import measured_user, sample_frames
+from track.calibration.hand_size import sample_frames
 from track.calibration.user_calibration import (
     MOST_STEPS,
     Calibration,
@@ -30,7 +30,7 @@ from track.capture_tracking import track_capture
 from track.config import TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.kinematics.pose_solver import PoseSolver
-from track.setup import BOTH, AnyHands, Size, TrackerSetup
+from track.setup import BOTH, AnyHands, Size, TrackerSetup, measured_user
 from track.streams.frame_source import checked_frames
 from track.user import User
 from train.labelers.protocol import Labeler
