@@ -24,7 +24,7 @@ from train import TakeConfig, load_labeler, simulate_take
 def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
     camera: Camera = frame.camera
     for hand, true in zip(frame.hands, truth.hands, strict=True):
-        off = np.linalg.norm(hand.pixels - camera.project(true.keypoints), axis=1)[hand.visible]
+        off = np.linalg.norm(hand.keypoints - camera.project(true.keypoints_world), axis=1)[hand.visible]
         shown = frame.ideal.depth[frame.ideal.depth > 0]
         print(
             f"{frame.key}, {hand.shape.side}: {hand.visible.sum()} of 21 keypoints visible, "

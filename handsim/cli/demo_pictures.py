@@ -16,11 +16,11 @@ from handsim.hand.records import unpack_hand
 from handsim.space.cameras import named_rig
 from poses.shapes.library import gesture
 from render.config import RenderConfig
+from render.drawing import draw
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
 from render.illustrations.scene import PosedHand
-from render.session import draw_frames
 
 GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")
 """Drawn in a row; the last one is the thumb's opposition to the little finger."""
@@ -112,7 +112,7 @@ def draw_tracked_take(run: DemoRun) -> Section:
     take = load_tracked_take(run.tracked_take)
     frames = np.linspace(0, take.num_frames - 1, _PICTURES).astype(int).tolist()
     config = RenderConfig(seed=run.seed, vary="frame")
-    write_png(run.out / "pictures.png", contact_sheet(list(draw_frames(take, config, frames))))
+    write_png(run.out / "pictures.png", contact_sheet(list(draw(take, config=config, frames=frames))))
     return Section(
         "Pictures of tracked hands",
         "The tracked hands are drawn, with the truth of every pixel.",

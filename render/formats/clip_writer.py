@@ -14,7 +14,7 @@ from render.formats.annotations import hand_crops, hands_json
 from render.formats.annotations.common import shape_record, to_json
 from render.formats.png_depth import encode_pictures
 from render.formats.shards import new_tar, one_sentence, shard_name, shards_in
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 
 _STREAM: Final = re.compile(r"[A-Za-z0-9_-]+")
 TAR: Final = ".tar"

@@ -23,7 +23,7 @@ from render.formats.shards import (
     shard_name,
     shards_in,
 )
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 
 _NUMBERS: Final = "numbers.json"
 _KINDS: Final = {"rgb": ".jpg", "mask": ".jpg", "depth": ".png"}

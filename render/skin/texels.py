@@ -17,7 +17,7 @@ from handsim.hand.topology import DIGITS, NUM_BONES
 from render.skin.atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin.fields import smooth
 from render.skin.forearm import Forearm
-from render.skin.mesh import SkinMesh
+from render.skin.mesh import PosableSkin
 
 REFERENCE: Final = Forearm(length=0.5)
 """The forearm whose texels are painted; a longer one is stretched."""
@@ -62,7 +62,7 @@ class Texels(NamedTuple):
 def skin_texels() -> Texels:
     """The texels; cached."""
     model, atlas = HandModel.named("M"), skin_atlas()
-    mesh = SkinMesh(model, REFERENCE)
+    mesh = PosableSkin(model, REFERENCE)
     normals = vertex_normals(mesh.rest, mesh.faces)
     weights = np.zeros((atlas.num_vertices, NUM_BONES))
     surface = model.surface

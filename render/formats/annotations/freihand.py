@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from render.formats.annotations.common import centered_K, is_seen, rounded
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 
 SET: Final = "training"
 LISTS: Final = ("K", "xyz", "scale", "mano", "info")
@@ -35,10 +35,10 @@ def hand_entries(frame: RenderedFrame, *, vertices: bool) -> list[tuple[int, dic
         if not is_seen(hand):
             continue
         # The bone that FreiHAND measures hands by: the middle finger's first.
-        scale = float(np.linalg.norm(hand.keypoints[10] - hand.keypoints[9]))
+        scale = float(np.linalg.norm(hand.keypoints_world[10] - hand.keypoints_world[9]))
         entry: dict[str, Any] = {
             "K": K,
-            "xyz": rounded(frame.camera.local(hand.keypoints), 9),
+            "xyz": rounded(frame.camera.local(hand.keypoints_world), 9),
             "scale": scale,
             "mano": None,
             "info": {"side": hand.shape.side, "frame": frame.number, "camera": frame.camera.name},

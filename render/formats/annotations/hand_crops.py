@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from handsim.space.camera import Camera
 from render.formats.annotations.common import by_side, is_seen, rigid_record
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 
 _FILLED: Final = 0.8  # of the crop's half width, by the keypoint that is farthest from its middle
 _WIDEST: Final = np.deg2rad(120.0)  # a flat picture of more is mostly stretching
@@ -40,7 +40,7 @@ def crops_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
     record: dict[str, Any] = {"left": {}, "right": {}}
     for frame in frames:
         for side, hand in by_side(frame).items():
-            crop = crop_camera(frame.camera, hand.keypoints) if is_seen(hand) else None
+            crop = crop_camera(frame.camera, hand.keypoints_world) if is_seen(hand) else None
             if crop is not None:
                 T_world_crop, angle = crop
                 record[side][frame.camera.name] = {

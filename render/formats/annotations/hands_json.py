@@ -26,7 +26,7 @@ from render.formats.annotations.common import (
 from render.formats.annotations.joint_orders import to_order
 from render.formats.annotations.umetrack_hand import umetrack_hand, umetrack_wrist
 from render.formats.png_depth import METERS_PER_UNIT
-from render.frames.frame import HandTruth, RenderedFrame
+from render.frames import HandTruth, RenderedFrame
 
 HAND_SHAPES: Final = "__hand_shapes.json__"
 """File of a clip with the hand model; webdataset passes over such names."""
@@ -84,9 +84,9 @@ def hands_record(frames: Sequence[RenderedFrame]) -> dict[str, Any]:
                 "wrist_xform": wrist.tolist(),
                 "T_world_from_wrist": rigid_record(wrist),
             },
-            "landmarks": rounded(to_order(hand.keypoints, "umetrack"), 9),
+            "landmarks": rounded(to_order(hand.keypoints_world, "umetrack"), 9),
             **_truth(hand),
-            "pixels": {name: rounded(hands[side].pixels - CENTER, 5) for name, hands in streams},
+            "pixels": {name: rounded(hands[side].keypoints - CENTER, 5) for name, hands in streams},
             "visible": {name: hands[side].visible for name, hands in streams},
             "boxes": {name: rounded(hands[side].box, 3) for name, hands in streams},
         }
@@ -135,7 +135,7 @@ def frame_record(frame: RenderedFrame) -> dict[str, Any]:
             {
                 "side": hand.shape.side,
                 **_truth(hand),
-                "pixels": rounded(hand.pixels, 5),
+                "pixels": rounded(hand.keypoints, 5),
                 "visible": hand.visible,
                 "box": rounded(hand.box, 3),
             }
@@ -149,7 +149,7 @@ def frame_record(frame: RenderedFrame) -> dict[str, Any]:
 
 def _truth(hand: HandTruth) -> dict[str, Any]:
     return {
-        "keypoints": rounded(hand.keypoints, 9),
+        "keypoints": rounded(hand.keypoints_world, 9),
         "qpos": hand.qpos.tolist(),
         "shape": shape_record(hand.shape),
     }

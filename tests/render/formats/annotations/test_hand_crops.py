@@ -36,7 +36,7 @@ def test_each_seen_hand_has_a_crop_in_each_stream(make_frame, camera: Camera) ->
     for frame in frames:
         for hand in frame.hands:
             entry = record[hand.shape.side][frame.camera.name]
-            pixels = pixels_in_crop(entry, hand.keypoints)
+            pixels = pixels_in_crop(entry, hand.keypoints_world)
             low, high = pixels.min(axis=0), pixels.max(axis=0)
             np.testing.assert_allclose((low + high) / 2, (PIXELS - 1) / 2, atol=0.01)  # in the middle
             np.testing.assert_allclose((high - low).max(), 0.8 * PIXELS, atol=0.01)  # with room around

@@ -69,8 +69,8 @@ def test_hands_are_named_by_side_and_stream(make_frame, camera: Camera) -> None:
     assert record["right"] is None
     hand = views[0].hands[0]
     assert set(record["left"]["pixels"]) == {"small", "other"}
-    np.testing.assert_allclose(np.array(record["left"]["pixels"]["small"]) + 0.5, hand.pixels, atol=1e-4)
-    np.testing.assert_allclose(record["left"]["landmarks"][5], hand.keypoints[0], atol=1e-8)
+    np.testing.assert_allclose(np.array(record["left"]["pixels"]["small"]) + 0.5, hand.keypoints, atol=1e-4)
+    np.testing.assert_allclose(record["left"]["landmarks"][5], hand.keypoints_world[0], atol=1e-8)
     np.testing.assert_allclose(record["left"]["umetrack_pose"]["joint_angles"], hand.qpos[7:])
     pose = record["left"]["umetrack_pose"]["T_world_from_wrist"]
     np.testing.assert_allclose(pose["translation_xyz"], hand.qpos[:3])
@@ -94,6 +94,6 @@ def test_our_own_record_counts_from_the_corner(make_frame) -> None:
     frame = make_frame(away=True, sides=("right", "right"))  # here two of a side are welcome
     record = json.loads(to_json(frame_record(frame)))
     pixels = np.array(record["hands"][0]["pixels"], dtype=float)  # null becomes NaN
-    np.testing.assert_allclose(pixels, frame.hands[0].pixels, atol=1e-4)
+    np.testing.assert_allclose(pixels, frame.hands[0].keypoints, atol=1e-4)
     assert record["hands"][0]["box"] == [None] * 4
     assert record["choices"]["light"] == {"strength": 1.5, "direction": [0.0, 1.0, None]}
