@@ -30,7 +30,7 @@ from machine import describe
 from rendering import COLORS, draw, rate, rate_in_processes
 from training_scaling import train
 
-from render.painting.hardware import _renderer_name, opengl_has_hardware
+from render.painting.gl import _renderer_name, opengl_has_hardware
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
 from train.labelers import batch_network

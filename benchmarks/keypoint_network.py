@@ -38,6 +38,7 @@ import numpy as np
 import torch
 import trimesh
 from machine import describe
+from render.own_poses import PoseFile, load_poses
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
@@ -45,7 +46,6 @@ from handsim.hand.topology import SIDES
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.frames import RenderedFrame
-from render.own_poses import PoseFile, load_poses
 from render.painting.figures import Appearance, sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV

@@ -28,6 +28,7 @@ import mujoco
 import numpy as np
 import trimesh
 from machine import describe
+from render.shown_take import ShownTake, show_take
 
 from handsim.app.workers import in_processes
 from render.cameras.viewpoints import ViewConfig, Viewpoints
@@ -39,7 +40,6 @@ from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
 from render.session import draw_frames
-from render.shown_take import ShownTake, show_take
 from render.skin.look import ALL_TONES
 from render.studio import Studio
 from train.simulation.takes import TakeConfig, simulate_take

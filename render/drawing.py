@@ -23,7 +23,7 @@ from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.painter import choose_painter
 from render.scenery.enclosures import enclose
-from render.scenery.surroundings import sample_surroundings
+from render.scenery.lights import sample_surroundings
 from render.sensors.depth_noise import sample_depth_noise
 from render.sensors.exposure import sample_exposure
 from render.sensors.shutter import sample_shutter

@@ -21,11 +21,11 @@ from handsim.space.transforms import pose_matrices
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
 from render.frames import PASSES, BodyTruth, Pictures, RenderedFrame
 from render.hand_truth import hand_truth
-from render.painting.cast_shadow import light_behind
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
 from render.painting.shading import GAMMA
+from render.painting.shadows import light_behind
 from render.scenery.backgrounds import Background, draw_background
 from render.scenery.enclosures import Enclosure, draw_surroundings
 from render.scenery.lights import Lighting

@@ -1,14 +1,15 @@
-"""Hands and rigid bodies as surfaces with ids and materials."""
+"""Hands, rigid bodies and balls as surfaces with ids and materials."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+import trimesh
+from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
@@ -27,7 +28,6 @@ from render.painting.materials import (
     skin_material,
 )
 from render.painting.rasterizer import Triangles
-from render.painting.spheres import SphereSurface, sphere_surface
 from render.skin.forearm import Forearm, sample_forearm
 from render.skin.glove_look import GloveLook, glove_texture, sample_glove_look
 from render.skin.look import SkinLook, sample_skin_look
@@ -36,6 +36,34 @@ from render.skin.texture import skin_texture
 
 _BALL_LEVEL: Final = 2
 _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
+
+
+class SphereSurface(NamedTuple):
+    """Balls in a row, each with as many vertices and faces as the next."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+
+
+def sphere_surface(centers: Float[np.ndarray, "N 3"], radius: float, *, level: int) -> SphereSurface:
+    """Balls around these centers [m].
+
+    Args:
+        centers: Centers; none of them NaN.
+        radius: Of all of them [m].
+        level: How often an icosahedron is refined: 20 times 4 to this power triangles a ball.
+    """
+    ball = _unit_ball(level)
+    count, each = len(centers), len(ball.vertices)
+    vertices = (centers[:, None] + radius * ball.vertices).reshape(-1, 3)
+    faces = (ball.faces + each * np.arange(count)[:, None, None]).reshape(-1, 3)
+    return SphereSurface(vertices, np.tile(ball.vertices, (count, 1)), faces)
+
+
+@functools.cache
+def _unit_ball(level: int) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=level)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,7 @@ from poses.shapes.library import gesture
 from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import skin_material
-from render.painting.opengl_lights import add_lights
-from render.painting.opengl_painter import OPENGL_FROM_OPENCV, pyrender_material
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV, add_lights, pyrender_material
 from render.scenery.lights import Lamp, Lighting
 from render.skin.atlas import skin_atlas
 from render.skin.mesh import PosableSkin

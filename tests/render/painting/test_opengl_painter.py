@@ -8,8 +8,7 @@ from poses.shapes.library import gesture
 from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import shade_colors, skin_material
-from render.painting.opengl_lights import add_lights, frame_with_z
-from render.painting.opengl_painter import OPENGL_FROM_OPENCV, pyrender_material
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV, add_lights, frame_with_z, pyrender_material
 from render.scenery.lights import STUDIO, Lamp, Lighting
 from render.skin.look import SkinLook
 from render.skin.mesh import PosableSkin

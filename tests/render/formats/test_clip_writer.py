@@ -14,7 +14,7 @@ from handsim.space.camera import Camera, pinhole
 from handsim.space.cameras import look_at
 from handsim.space.transforms import quaternion_matrix
 from render.formats.annotations.common import to_json
-from render.formats.annotations.hand_crops import crop_camera, crops_record
+from render.formats.clip_writer import crop_camera, crops_record
 
 PIXELS = 128
 
