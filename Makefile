@@ -4,13 +4,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+DEVELOPER := $(VENV)/.developer
 # What --painter opengl needs on Debian and Ubuntu: EGL, OpenGL and Mesa's software driver.
 DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint format fuzz fuzz-coverage figures chaos truth docs clean drawing
+.PHONY: help demo test test-slow lint format fuzz fuzz-coverage figures chaos truth docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -19,36 +20,39 @@ help:  ## list the targets (this)
 demo: $(INSTALLED)  ## run the whole chain on a built-in example, into demo/
 	$(BIN)/handsim demo --out demo
 
-test: $(INSTALLED) drawing lint  ## every check there is: lint, then the tests (which build the documents)
-	$(BIN)/pytest -n 2 --dist loadgroup --durations 20
+test: $(DEVELOPER) drawing lint  ## lint, and every test that is quick
+	$(BIN)/pytest -n 2 --dist loadgroup --durations 20 -m "not slow"
 
-lint: $(INSTALLED)  ## style, format, types and the order of imports
+test-slow: $(DEVELOPER) drawing  ## the other tests
+	$(BIN)/pytest -n 2 --dist loadgroup --durations 20 -m slow
+
+lint: $(DEVELOPER)  ## style, format, types and the order of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: $(INSTALLED)  ## put the code into its format
+format: $(DEVELOPER)  ## put the code into its format
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-fuzz: $(INSTALLED)  ## damaged files for every reader: CASES=20000 of each, TARGET=c3d for one
+fuzz: $(DEVELOPER)  ## damaged files for every reader: CASES=20000 of each, TARGET=c3d for one
 	$(BIN)/python -m tests.fuzzing --cases $(or $(CASES),20000) $(if $(TARGET),--target $(TARGET))
 
-fuzz-coverage: $(INSTALLED)  ## the same by coverage: MOST=600 seconds of each, TARGET=c3d for one; installs atheris
+fuzz-coverage: $(DEVELOPER)  ## the same by coverage: MOST=600 seconds of each, TARGET=c3d for one; installs atheris
 	$(BIN)/pip install --quiet --constraint constraints.txt atheris
 	$(BIN)/python -m tests.fuzzing.coverage --seconds $(or $(MOST),600) $(if $(TARGET),--target $(TARGET))
 
-docs: $(INSTALLED)  ## the guide, the commands and the API reference, into build/docs
+docs: $(DEVELOPER)  ## the guide, the commands and the API reference, into build/docs
 	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs build/docs
 
-figures: $(INSTALLED)  ## write docs/figures.toml into the pages; ONLY=table5 runs that command anew
+figures: $(DEVELOPER)  ## write docs/figures.toml into the pages; ONLY=table5 runs that command anew
 	$(BIN)/python docs/renew_figures.py $(if $(ONLY),--only $(ONLY))
 
-chaos: $(INSTALLED)  ## kill every long command at random moments and run it again; KILLS=20
+chaos: $(DEVELOPER)  ## kill every long command at random moments and run it again; KILLS=20
 	$(BIN)/python benchmarks/chaos.py --kills $(or $(KILLS),20)
 
-truth: $(INSTALLED)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data
+truth: $(DEVELOPER)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data
 	@test -d "$(DATA)" || { echo "make truth needs DATA, the path of a folder of Mocap_SIG18_Data"; exit 1; }
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/real_motion.py $(DATA)
 
@@ -60,9 +64,14 @@ clean:  ## remove .venv, caches and what the demo wrote
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; (3, 11) <= sys.version_info < (3, 14) or sys.exit(1)' || { \
 	  echo "handsim needs Python 3.11, 3.12 or 3.13 and '$(PYTHON)' is none of them; try make PYTHON=python3.12"; exit 1; }
-	@echo "making $(VENV): one to ten minutes, 1.8 GB with torch's CPU build (CONTRIBUTING.md says how to get it)"
+	@echo "making $(VENV): one to ten minutes (CONTRIBUTING.md says how to get torch's CPU build)"
 	$(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/pip install --quiet --constraint constraints.txt setuptools
+	$(BIN)/pip install --quiet --constraint constraints.txt --no-build-isolation --editable .
+	@touch $@
+
+$(DEVELOPER): $(INSTALLED)
+	@echo "adding what developers need"
 	$(BIN)/pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
 	@touch $@
 

@@ -110,7 +110,7 @@ def move_flesh(markers: np.ndarray, qpos: np.ndarray, true: GloveFit, rng: np.ra
 
 def held_out_gaps(hand: GloveFit, true: GloveFit, take: Take) -> np.ndarray:
     """Means over each finger's touches (4, 2) [m]: flesh from touching, skins from the true ones."""
-    markers, qpos = take.observed(take.hand_labels[0]), take.hands[0].qpos
+    markers, qpos = take.observed(true.side), take.qpos[:, 0]
     gaps = np.full((len(FINGERS), 2), np.nan)
     for number, finger in enumerate(FINGERS):
         touching = is_touching(true.model, qpos[:, 7:], finger)
@@ -155,12 +155,12 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
     made = CalibrationTakeConfig(free=arguments.free, rounds=arguments.rounds)
     take = simulate_calibration(worn, made, rng=rng)
     held_out = simulate_calibration(worn, CalibrationTakeConfig(free=3.0, rounds=4), rng=rng)
-    markers = take.observed(take.hand_labels[0])
+    markers = take.observed(true.side)
     ways = {
         "after": (markers, start),
         "from the next size": (markers, farther),
         "1 % wrong labels": (exchange_labels(markers, true, rng), start),
-        "flesh": (move_flesh(markers, take.hands[0].qpos, true, rng), start),
+        "flesh": (move_flesh(markers, take.qpos[:, 0], true, rng), start),
     }
     print(f"user {number}, {true.side}: {take.num_frames} frames")
     rows = {"before": tell("before", start, true, held_out)}

@@ -50,18 +50,19 @@ def with_drum(take: Take, first: int, *, rng: np.random.Generator) -> Take:
     runs = number_runs(np.isfinite(ghosts[..., 0]))
     ids = np.where(runs >= 0, runs + take.ids.max() + 1, -1)
     order = rng.permutation(take.points.shape[1] + ghosts.shape[1])
+    points = np.concatenate([take.points, ghosts], axis=1)[:, order]
     return dataclasses.replace(
         take,
-        points=np.concatenate([take.points, ghosts], axis=1)[:, order],
+        points=points,
         ids=np.concatenate([take.ids, ids], axis=1)[:, order],
         labels=np.concatenate([take.labels, owned], axis=1)[:, order],
+        confidence=np.where(np.isfinite(points[..., 0]), 1.0, np.nan),
     )
 
 
 def _places(take: Take, number: int) -> np.ndarray:
     """Where the markers of a hand truly are (T, M, 3) [m]."""
-    hand = take.hands[number]
-    return hand.fit.markers(hand.qpos)[0]
+    return take.hands[number].markers(take.qpos[:, number])[0]
 
 
 def _life(take: Take, markers: np.ndarray, frame: int, rng: np.random.Generator) -> np.ndarray:

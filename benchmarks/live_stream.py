@@ -28,8 +28,7 @@ import numpy as np
 from machine import describe
 
 from gloves.takes.growing import GrownArchive
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import load_tracked_take
+from gloves.takes.take import Take, load_take
 from track.capture_tracking import track_stream
 from track.evaluation.take_evaluation import true_users
 from track.live_recording import LiveRecorder
@@ -215,7 +214,7 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
             recorder.finish(stream.counts)
     print(f"written as .npz in {time.perf_counter() - at:.0f} s; {_resident() / 1e6:.0f} MB resident")
     if recorded < 200_000:
-        loaded = load_tracked_take(out)
+        loaded = load_take(out)
         gaps = np.diff(loaded.times).max()
         print(f"it opens: {loaded.num_frames} frames, {loaded.times[-1]:.1f} s, longest gap {gaps:.2f} s")
     return frames / RATE / seconds
@@ -240,7 +239,7 @@ def kill(take: Take, rate: float, folder: Path) -> None:
             code = process.wait()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            numbers = load_tracked_take(part if part.exists() else out).numbers
+            numbers = load_take(part if part.exists() else out).numbers
         assert numbers is not None
         missing = sent - len(numbers)
         name = (part if part.exists() else out).name

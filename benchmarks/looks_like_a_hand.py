@@ -30,7 +30,7 @@ from render.shown_take import ShownTake
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
-from gloves.takes.tracked_take import load_tracked_take
+from gloves.takes.take import load_take
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
@@ -113,7 +113,7 @@ def load_tracked(paths: list[Path]) -> Tracked:
     """The hands of tracked takes and their poses (T, 27) where they were tracked, the wrists in one place."""
     found: Tracked = {side: [] for side in SIDES} if paths else {}
     for path in paths:
-        take = load_tracked_take(path)
+        take = load_take(path)
         for number, hand in enumerate(take.hands):
             rows = take.qpos[np.isfinite(take.qpos[:, number, 0]), number, 7:]
             found[hand.model.shape.side].append((hand.model, join_qpos(rows)))

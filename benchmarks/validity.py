@@ -20,7 +20,7 @@ from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import EVERYBODY, sample_shape
 from handsim.space.objects import named_object
-from handsim.space.transforms import quaternion_matrix
+from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.object_motion import object_penetration
 from poses.motion.scripts import script_names, scripted_motion
@@ -49,13 +49,13 @@ def out_of_range(qpos: np.ndarray) -> int:
 
 def overlaps(take: Take) -> tuple[float, float, float]:
     """Deepest in themselves, between hands, and with the object [mm]."""
-    right, left = models = [hand.fit.model for hand in take.hands]
-    qpos = [hand.qpos for hand in take.hands]
+    right, left = models = [hand.model for hand in take.hands]
+    qpos = [hand.qpos for hand in take.moving_hands()]
     own = max(model.penetration(values).max() for model, values in zip(models, qpos, strict=True))
     between = two_hands_penetration(right, left, *qpos).max()
     thing = 0.0
-    if take.body is not None:
-        poses, held = take.body.T_world_body, named_object(take.body.name)
+    for number, body in enumerate(take.bodies):
+        poses, held = pose_matrices(take.body_poses[:, number]), named_object(body.name)
         thing = max(
             object_penetration(model, held, values, poses).max()
             for model, values in zip(models, qpos, strict=True)
@@ -74,9 +74,9 @@ def twins(frames: int | None, seeds: int) -> None:
     for kind, seed in itertools.product(KINDS, range(seeds)):
         take = simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed))
         own, between, thing = overlaps(take)
-        outside = sum(out_of_range(hand.qpos) for hand in take.hands)
-        speeds = np.max([fastest(hand.qpos, take.rate) for hand in take.hands], axis=0)
-        reach = max(np.abs(hand.qpos[:, :3] - [0.0, 0.0, 1.1]).max() for hand in take.hands)
+        outside = sum(out_of_range(hand.qpos) for hand in take.moving_hands())
+        speeds = np.max([fastest(hand.qpos, take.rate) for hand in take.moving_hands()], axis=0)
+        reach = max(np.abs(hand.qpos[:, :3] - [0.0, 0.0, 1.1]).max() for hand in take.moving_hands())
         print(
             f"  {kind:16s} seed {seed}, {take.num_frames} frames: {own:.3f}, {between:.3f}, {thing:.3f}; "
             f"{outside}; {speeds[0]:.2f}, {speeds[1]:.1f}, {speeds[2]:.1f}; {reach:.2f}"

@@ -16,8 +16,8 @@ import viser
 from machine import describe
 from websockets.sync.client import ClientConnection, connect
 
-from gloves.takes.tracked_take import load_tracked_take
-from track.viewer.recordings.takes import TrackedRecording
+from gloves.takes.take import load_take
+from track.viewer.recordings.takes import TakeRecording
 from track.viewer.scene.frame_view import FrameView
 from track.viewer.server import LOOPBACK, opened_server
 from track.viewer.timeline import Timeline
@@ -51,7 +51,7 @@ def main() -> None:
     options = parser.parse_args()
     print(describe("viser"))
     start = time.perf_counter()
-    recording = TrackedRecording(load_tracked_take(options.take))
+    recording = TakeRecording(load_take(options.take))
     print(f"{recording.num_frames} frames read in {time.perf_counter() - start:.2f} s")
     with opened_server(LOOPBACK, 0, "benchmark") as server:
         start = time.perf_counter()

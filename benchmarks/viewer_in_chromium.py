@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from gloves.takes.tracked_take import LOST, TrackedTake, load_tracked_take
+from gloves.takes.take import LOST, Take, load_take
 from track.viewer.contents import open_content
 from track.viewer.server import LOOPBACK, address_of, opened_server
 
@@ -73,7 +73,7 @@ OTHER = """(address) => new Promise(done => {
 })"""
 
 
-def exchanged(take: TrackedTake) -> tuple[TrackedTake, int, tuple[int, int]]:
+def exchanged(take: Take) -> tuple[Take, int, tuple[int, int]]:
     """The take with two labels exchanged in some frames: its first of them, and the columns there."""
     for frame in range(take.num_frames // 3, take.num_frames - SPAN):
         rows = slice(frame, frame + SPAN)
@@ -107,7 +107,7 @@ def choose(page: Any, label: str, option: str) -> None:
     time.sleep(0.5)
 
 
-def check_bones(page: Any, take: TrackedTake) -> None:
+def check_bones(page: Any, take: Take) -> None:
     """Where the joints are in the scene, beside where the model has them."""
     worst, checked = 0.0, 0
     for frame in np.linspace(0, take.num_frames - 1, 9).astype(int).tolist():
@@ -123,7 +123,7 @@ def check_bones(page: Any, take: TrackedTake) -> None:
     print(f"{checked} joints of 9 frames read back: at most {1e3 * worst:.1e} mm from the model's")
 
 
-def correct(page: Any, path: Path, true: TrackedTake, frame: int, columns: tuple[int, int]) -> None:
+def correct(page: Any, path: Path, true: Take, frame: int, columns: tuple[int, int]) -> None:
     """Correct both labels in the page, one by a click on its ball and one from the list; save; read again."""
     names, (one, other) = true.label_names, columns
     go_to(page, frame + SPAN // 2)
@@ -141,7 +141,7 @@ def correct(page: Any, path: Path, true: TrackedTake, frame: int, columns: tuple
     page.get_by_text(f"corrected: {names[true.labels[middle, other]]}").wait_for()
     page.get_by_role("button", name="Save take", exact=True).click()
     page.get_by_text(f"saved {path}").first.wait_for()
-    wrong = int((load_tracked_take(path).labels != true.labels).sum())
+    wrong = int((load_take(path).labels != true.labels).sum())
     print(f"two labels exchanged in {SPAN} frames, corrected and saved in the page: {wrong} labels differ")
 
 
@@ -167,7 +167,7 @@ def main() -> None:
     parser.add_argument("--chromium", default="/usr/bin/chromium")
     parser.add_argument("--picture")
     options = parser.parse_args()
-    true = load_tracked_take(options.take)
+    true = load_take(options.take)
     take, frame, columns = exchanged(true)
     ended = threading.Event()
     with tempfile.TemporaryDirectory() as folder, opened_server(LOOPBACK, 0, "benchmark") as server:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gloves import GlovedHand, Take, load_layout, nominal_fit
+from gloves import Take, load_layout, nominal_fit
 from handsim import HandModel
-from track import TrackedTake, Tracker, track_capture
+from track import Tracker, track_capture
 from train import TakeConfig, load_labeler, simulate_take
 
 
@@ -21,21 +21,20 @@ def joints(model: HandModel, qpos: np.ndarray) -> np.ndarray:
     return model.forward_kinematics(qpos)[..., :3, 3]
 
 
-def compare(name: str, tracked: TrackedTake, truth: Take) -> None:
+def compare(name: str, tracked: Take, truth: Take) -> None:
     for number, hand in enumerate(truth.hands):
-        true: GlovedHand = hand
-        motion = tracked.motion(true.side)  # without gaps, also where the hand was lost for a while
+        motion = tracked.motion(hand.side)  # without gaps, also where the hand was lost for a while
         ours = joints(tracked.hands[number].model, motion.qpos)
-        off = np.linalg.norm(ours - joints(true.fit.model, true.qpos), axis=-1)
-        filled = 100 * tracked.filled[:, number].mean()
-        print(f"{name}, {true.side}: joints {1e3 * off.mean():.2f} mm off, {filled:.1f} % filled in")
+        off = np.linalg.norm(ours - joints(hand.model, truth.qpos[:, number]), axis=-1)
+        filled = 100 * tracked.filled(hand.side).mean()
+        print(f"{name}, {hand.side}: joints {1e3 * off.mean():.2f} mm off, {filled:.1f} % filled in")
 
 
 def main() -> None:
     truth = simulate_take(TakeConfig(kind="hand-controller", num_frames=240))  # 2 s at 120 Hz
     capture = truth.capture()  # no names, many gaps, some ghosts
     labeler = load_labeler("dense19")
-    known = [hand.fit for hand in truth.hands]
+    known = list(truth.hands)
     usual = [nominal_fit(load_layout("dense19"), "M", hand.side) for hand in truth.hands]
     for name, hands in (("known hands", known), ("hands of size M", usual)):
         compare(name, track_capture(capture, Tracker(hands, labeler)), truth)

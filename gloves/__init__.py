@@ -1,7 +1,8 @@
 """Markers on the hand, and what an optical system sees of them.
 
 A `MarkerLayout` (a TOML file) is put on a hand by `attach`; the result is a `GloveFit`. `read_capture` and
-`write_capture` read and write marker files of other programs. A `Take` is a simulated capture with truth.
+`write_capture` read and write marker files of other programs. A `Take` has hands over time, what was seen of
+them and the labels, simulated or tracked; `load_take` reads one.
 """
 
 from typing import TYPE_CHECKING

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from gloves.fit import GloveFit
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import MarkedBody, TrackedTake
+from gloves.takes.take import RigidBody, Take
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera
 from render.cameras.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
@@ -38,7 +37,7 @@ Cameras = Camera | Sequence[Camera] | str
 
 
 def draw(
-    source: Take | TrackedTake | str | Path | ArrayLike,
+    source: Take | str | Path | ArrayLike,
     *,
     model: Model | tuple[Model, Model] | None = None,
     camera: Cameras | None = None,
@@ -193,7 +192,7 @@ def open_studio(
     hands: Sequence[GloveFit],
     config: RenderConfig,
     *,
-    bodies: Sequence[MarkedBody] = (),
+    bodies: Sequence[RigidBody] = (),
     rng: np.random.Generator,
 ) -> Studio:
     """A studio of one person, whose looks are drawn.

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
 from handsim.app.executors.executor import Executor, executor_of
 from handsim.app.executors.output import FolderOutput, Make, Output, open_output
 from handsim.app.interrupts import Stopped
@@ -45,7 +44,7 @@ _ON_SHEET: Final = 9
 
 
 def render_take(
-    source: Take | TrackedTake | str | Path | PoseFile | ArrayLike,
+    source: Take | str | Path | PoseFile | ArrayLike,
     out: str | Path | ObjectFolder,
     formats: str | Sequence[str] = ("webdataset",),
     config: RenderConfig | None = None,

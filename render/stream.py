@@ -15,7 +15,6 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
 from handsim.errors import ArgumentError, choices
 from handsim.hand.keypoints import NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
@@ -38,7 +37,7 @@ _CROPPED: Final = 0.5  # of the share that hands have of a crop: what they have 
 _TRIES: Final = 20  # of a viewpoint that is outside of hands and objects
 _SIDE_CHOICES: Final = (*SIDES, "either")
 
-TakeSource = Take | TrackedTake | str | Path
+TakeSource = Take | str | Path
 
 
 class _Sitting(NamedTuple):
@@ -143,7 +142,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         self._model, self._side, self._glove = model, side, glove
         self._sampler = load_sampler(sampler) if isinstance(sampler, str) else sampler
         self._poses = None if poses is None else np.asarray(poses, dtype=np.float64)
-        given = (takes,) if isinstance(takes, Take | TrackedTake | str | Path) else takes or ()
+        given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
         self._takes = [load_subject(source_of(take, model=model), seed=self.seed) for take in given]
         if len({len(one.take.hands) for one in self._takes}) > 1:
             raise ArgumentError("the takes have different numbers of hands, expected the same in all")

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from gloves.takes.tracked_take import MarkedBody, TrackedTake
+from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
@@ -57,7 +57,7 @@ class FrameChoices:
 class Moment:
     """One frame of a take, and the time around it, which shutters blur."""
 
-    take: TrackedTake
+    take: Take
     frame: int
     person: Int[np.ndarray, "T"] | None = None
     """Who is in each frame, where that changes: the time around a frame ends where another person comes."""
@@ -118,7 +118,7 @@ class Studio:
         self,
         hands: Sequence[GloveFit],
         people: Sequence[Appearance],
-        bodies: Sequence[MarkedBody] = (),
+        bodies: Sequence[RigidBody] = (),
         body_colors: Sequence[tuple[float, float, float]] = (),
         passes: Sequence[str] = PASSES,
         painter: Painter = "compiled",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,22 +9,18 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from numpy.typing import ArrayLike
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
-from gloves.takes.motion import load_any_take
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import LOST, TRACKED, MarkedBody, TrackedTake
+from gloves.takes.take import Take, load_take
 from handsim.errors import ArgumentError, CaptureError, choices
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.shape import HandShape, sample_shape
 from handsim.hand.topology import SIDES, Side
-from handsim.space.objects import named_object, object_names
-from handsim.space.transforms import rotation_quaternions
 from render.config import SpawnKey
 from render.pose_file import MOST_PEOPLE, OwnPoses, check_poses, read_pose_file
 
@@ -72,7 +67,7 @@ class Cast:
 class Subject:
     """What pictures show."""
 
-    take: TrackedTake
+    take: Take
     """Poses, NaN where a hand is not there; rigid bodies; points of the optical system."""
     name: str
     """What a rendering's settings call it: its file, or the digest of what is in memory."""
@@ -119,7 +114,7 @@ Source = Path | PoseFile | Subject
 
 
 def source_of(
-    source: Take | TrackedTake | str | Path | PoseFile | ArrayLike,
+    source: Take | str | Path | PoseFile | ArrayLike,
     *,
     model: Model | tuple[Model, Model] | None = None,
     times: ArrayLike | None = None,
@@ -135,11 +130,11 @@ def source_of(
             drawn.
     """
     given = {"model": model, "times": times, "people": people, "person": person, "glove": glove}
-    if isinstance(source, Take | TrackedTake | str | Path | PoseFile):
+    if isinstance(source, Take | str | Path | PoseFile):
         for name, value in given.items():
             if value is not None:
                 raise ArgumentError(f"{name} belongs to poses of your own; a take and a file have their own")
-        if isinstance(source, Take | TrackedTake):
+        if isinstance(source, Take):
             return subject_of_take(source)
         return Path(source) if isinstance(source, str) else source
     return subject_of_poses(
@@ -168,21 +163,20 @@ def load_subject(source: Source, *, seed: int) -> Subject:
         return source
     if isinstance(source, PoseFile):
         return _load_poses(source, seed)
-    take = as_tracked(load_any_take(source))
+    take = load_take(source)
     try:
         return Subject(take, source.name)
     except ArgumentError as error:
         raise CaptureError(f"{source}: {error}") from error
 
 
-def subject_of_take(take: Take | TrackedTake) -> Subject:
+def subject_of_take(take: Take) -> Subject:
     """A take in memory.
 
     Raises:
         ArgumentError: There is no hand in any frame.
     """
-    shown = as_tracked(take)
-    return Subject(shown, _digest(shown.times, shown.qpos))
+    return Subject(take, _digest(take.times, take.qpos))
 
 
 def subject_of_poses(
@@ -270,7 +264,7 @@ def _posed(
     hands = tuple(fit.with_side(model.shape.side) for fit, model in zip(hands, models, strict=True))
     times = _SECOND * np.arange(len(poses.qpos)) if poses.times is None else poses.times
     rate = _SECOND if poses.times is None else 1.0 / max(float(np.median(np.diff(times))), 1e-6)
-    take = _bare_take(rate, times, hands, poses.qpos)
+    take = Take.of_poses(hands, poses.qpos, rate=rate, times=times)
     return Subject(take, name, cast, poses.times is not None, record)
 
 
@@ -314,59 +308,3 @@ def _digest(*arrays: np.ndarray) -> str:
     for array in arrays:
         content.update(np.ascontiguousarray(array).tobytes())
     return f"sha256:{content.hexdigest()}"
-
-
-def as_tracked(take: Take | TrackedTake) -> TrackedTake:
-    """The truth of a simulated take in the form of a tracked one; NaN where a hand is lost."""
-    if isinstance(take, TrackedTake):
-        return dataclasses.replace(take, qpos=np.where(take.status[..., None] == LOST, np.nan, take.qpos))
-    qpos = np.stack([hand.qpos for hand in take.hands], axis=1)
-    hands = tuple(hand.fit for hand in take.hands)
-    shown = _bare_take(take.rate, np.arange(take.num_frames) / take.rate, hands, qpos)
-    bodies: tuple[MarkedBody, ...] = ()
-    poses = np.empty((take.num_frames, 0, 7))
-    if take.body is not None:
-        name, motion = take.body.name, take.body.T_world_body
-        known = named_object(name).markers if name in object_names() else np.empty((0, 3))
-        bodies = (MarkedBody(name, take.body.marker_names, known),)
-        poses = np.concatenate([motion[:, :3, 3], rotation_quaternions(motion[:, :3, :3])], axis=1)[:, None]
-    count = (take.num_frames, len(bodies))
-    return dataclasses.replace(
-        shown,
-        points=take.points,
-        ids=take.ids,
-        labels=take.labels.astype(np.int64),
-        confidence=np.where(np.isfinite(take.points[..., 0]), 1.0, np.nan),
-        bodies=bodies,
-        body_poses=poses,
-        body_status=np.full(count, TRACKED),
-        body_rms=np.zeros(count),
-    )
-
-
-def _bare_take(
-    rate: float, times: Float[np.ndarray, "T"], hands: tuple[GloveFit, ...], qpos: Float[np.ndarray, "T H 27"]
-) -> TrackedTake:
-    """A take of hands alone."""
-    frames, count = qpos.shape[:2]
-    there = np.isfinite(qpos).all(axis=2)
-    markers = np.full((frames, count, hands[0].layout.num_markers, 3), np.nan)
-    return TrackedTake(
-        rate=rate,
-        times=times,
-        hands=hands,
-        qpos=qpos,
-        status=np.where(there, TRACKED, LOST),
-        rms=np.where(there, 0.0, np.nan),
-        markers=markers,
-        filled=np.zeros(markers.shape[:3], dtype=bool),
-        points=np.empty((frames, 0, 3)),
-        ids=np.empty((frames, 0), dtype=np.int64),
-        labels=np.empty((frames, 0), dtype=np.int64),
-        confidence=np.empty((frames, 0)),
-        bodies=(),
-        body_poses=np.empty((frames, 0, 7)),
-        body_status=np.empty((frames, 0), dtype=np.int64),
-        body_rms=np.empty((frames, 0)),
-        settings={},
-    )

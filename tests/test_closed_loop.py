@@ -7,7 +7,6 @@ import pytest
 
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
-from gloves.takes.tracked_take import load_tracked_take
 from handsim.cli.simulate import simulate
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
@@ -38,13 +37,13 @@ def tracked(truth):
     capture = read_capture(folder / "take.c3d")
     result = track_capture(capture, Tracker(true_users(take), load_labeler("dense19")))
     result.save(folder / "tracked.npz")
-    return load_tracked_take(folder / "tracked.npz"), folder
+    return load_take(folder / "tracked.npz"), folder
 
 
 def test_hands_are_tracked_to_a_millimeter(truth, tracked):
     take, _ = truth
     result, _ = tracked
-    for hand in take.hands:
+    for hand in take.moving_hands():
         place = result.hand(hand.shape.side)
         there = np.isfinite(result.qpos[:, place, 0])
         assert there.mean() >= 0.98
@@ -63,7 +62,7 @@ def test_pictures_of_tracked_hands_have_their_keypoints_where_the_truth_is(truth
     for frame in draw(folder / "tracked.npz", config=config, frames=range(10, FRAMES, 20)):
         assert frame.camera.size == (640, 480) and len(frame.hands) == 2
         for hand in frame.hands:
-            true = next(one for one in take.hands if one.shape.side == hand.shape.side)
+            true = next(one for one in take.moving_hands() if one.shape.side == hand.shape.side)
             points = hand_keypoints(HandModel(true.shape), true.qpos[frame.number : frame.number + 1])[0]
             off.append(np.linalg.norm(frame.camera.project(points) - hand.keypoints, axis=-1))
     assert np.mean(off) <= MOST_PIXELS

@@ -1,7 +1,7 @@
 """From unlabeled points to hand motion, online.
 
 A `Tracker` takes one frame of points at a time and gives a `TrackedFrame`; `track_capture` runs it over a
-capture and returns a `TrackedTake`, `track_stream` over a live stream from `open_source`; `open_sinks` takes
+capture and returns a `gloves.Take`, `track_stream` over a live stream from `open_source`; `open_sinks` takes
 the hands to other programs. `calibrate` fits hand and glove to their user. `solve_pose` is the inverse
 kinematics alone: poses from labeled markers.
 """
@@ -12,7 +12,6 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from gloves.takes.tracked_take import TrackedTake, load_tracked_take
     from track.calibration.user_calibration import calibrate
     from track.capture_tracking import track_capture, track_stream
     from track.config import TrackerConfig
@@ -31,11 +30,9 @@ __getattr__, __dir__ = lazy_exports(
         "LiveMessage": "track.sinks.message",
         "StreamedFrame": "track.streams.frame_source",
         "TrackedFrame": "track.tracked_frame",
-        "TrackedTake": "gloves.takes.tracked_take",
         "Tracker": "track.tracker",
         "TrackerConfig": "track.config",
         "calibrate": "track.calibration.user_calibration",
-        "load_tracked_take": "gloves.takes.tracked_take",
         "load_user": "track.user",
         "open_sinks": "track.sinks.addresses",
         "open_source": "track.streams.addresses",
@@ -49,12 +46,10 @@ __all__ = [
     "LiveMessage",
     "StreamedFrame",
     "TrackedFrame",
-    "TrackedTake",
     "Tracker",
     "TrackerConfig",
     "__version__",
     "calibrate",
-    "load_tracked_take",
     "load_user",
     "open_sinks",
     "open_source",

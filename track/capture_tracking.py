@@ -1,4 +1,4 @@
-"""Tracking of a whole capture or stream, frame by frame, and its result as a tracked take.
+"""Tracking of a whole capture or stream, frame by frame, and its result as a take.
 
 Marker files have no IDs. Every format that is read has one column per trajectory,
 so a column is an ID for as long as it has a point. After a gap it is a new ID, because a column of
@@ -13,16 +13,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.captures.plausibility import check_place, check_unit
 from gloves.fit import GloveFit
 from gloves.optics.identities import number_runs
-from gloves.takes.tracked_take import STATUSES, TrackedTake, usual_rate
+from gloves.takes.take import STATUSES, Take
 from handsim.errors import CaptureError
 from handsim.hand.topology import NUM_QPOS
+from track.intake import FARTHEST
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
@@ -35,14 +35,12 @@ _LOOP_GAP: Final = 0.01
 """Time between the last frame of a recording and its first, when it starts again [s]."""
 _HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
 _UNSURE_EXTENT: Final = 0.12  # of clouds that no labeler is sure of [m]
-_MISSING: Final = {"points": np.nan, "ids": -1, "labels": -1, "confidence": np.nan}
-"""The arrays with an entry per point, and what stands where there is no point."""
 _NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
 def track_capture(
     capture: Capture, tracker: Tracker, *, progress: Progress | None = None, taken: Taken | None = None
-) -> TrackedTake:
+) -> Take:
     """Track a capture.
 
     Args:
@@ -60,7 +58,7 @@ def track_capture(
     """
     frames = list(capture_frames(capture))
     check_unit([frame.points for frame in frames])
-    check_place(capture, tracker.config.intake.farthest)
+    check_place(capture, FARTHEST)
     recorder = TakeRecorder(tracker)
     for frame, tracked in track_stream(frames, tracker):
         if taken is not None:
@@ -164,8 +162,8 @@ class TakeRecorder:
         if not frame.silent:
             self._rows.append(frame_values(frame, tracked))
 
-    def take(self, capture: Capture | None = None) -> TrackedTake:
-        """The tracked take so far.
+    def take(self, capture: Capture | None = None) -> Take:
+        """The take so far.
 
         Args:
             capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
@@ -177,32 +175,13 @@ class TakeRecorder:
         rows = self._rows
         if not rows or (capture is None and len(rows) < 2):
             raise CaptureError(f"{len(rows)} frames came, expected two or more")
-        counts = np.array([len(row["points"]) for row in rows])
-        present = np.arange(counts.max(initial=0)) < counts[:, None]
-        if capture is not None:
-            present = np.isfinite(capture.positions[: len(rows), :, 0])
-        per_frame = {name: np.array([row[name] for row in rows]) for name in rows[0] if name not in _MISSING}
-        numbers = per_frame.pop("numbers")
-        return TrackedTake(
-            rate=usual_rate(per_frame["times"]) if capture is None else capture.rate,
-            hands=self._hands,
-            **per_frame,
-            **{
-                name: _spread(present, [row[name] for row in rows], missing)
-                for name, missing in _MISSING.items()
-            },
-            bodies=self._bodies,
-            settings={"tracker": dataclasses.asdict(self._config)},
-            numbers=numbers if capture is None else None,
-        )
+        settings = {"tracker": dataclasses.asdict(self._config)}
+        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=settings)
 
 
 def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
-    """A frame's entries of the arrays of a tracked take, by their names; those of points for its N points."""
+    """A frame's entries of the arrays of a take, by their names; those of points for its N points."""
     hands, bodies = tracked.hands, tracked.bodies
-    filled = np.zeros((len(hands), len(hands[0].markers)), dtype=bool)
-    for row, hand in zip(filled, hands, strict=True):
-        row[hand.filled] = True
     poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
     return {
         "times": np.array(frame.time),
@@ -210,8 +189,6 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "qpos": np.array([hand.qpos for hand in hands]),
         "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
         "rms": np.array([hand.rms for hand in hands]),
-        "markers": np.array([hand.markers for hand in hands]),
-        "filled": filled,
         "body_poses": np.array(poses).reshape(len(bodies), 7),
         "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
@@ -220,11 +197,3 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "labels": tracked.labels.astype(np.int16),
         "confidence": tracked.confidence,
     }
-
-
-def _spread(present: Bool[np.ndarray, "T N"], rows: list[NDArray[Any]], missing: float) -> NDArray[Any]:
-    """A table (T, N, ...) of the values of all frames' points, each in its column; `missing` elsewhere."""
-    values = np.concatenate(rows)
-    table = np.full(present.shape + values.shape[1:], missing, dtype=values.dtype)
-    table[present] = values
-    return table

@@ -5,13 +5,23 @@ A bad frame does not stop a stream. What cannot be used is left out, and a note 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike, NDArray
 
+from handsim._checks import check_type, shown_value
 from handsim.errors import ArgumentError
-from track.config import IntakeConfig
+from track.config import TrackerConfig
+
+FARTHEST: Final = 1e3
+"""Largest coordinate of a point [m]; no capture volume is larger."""
+_LATEST_TIME: Final = 1e11  # [s]; beyond it a clock of doubles does not move on by a frame
+_USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] until a stream has shown its own; usual for optical systems
+_INTERVAL_SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
+_SHORTEST_INTERVAL: Final = 0.1  # of the usual interval, at least between two frames on the tracker's clock
+_LONGEST_INTERVAL: Final = 2.0  # of the usual interval, which counts in it at most
 
 
 class IncomingFrame(NamedTuple):
@@ -23,6 +33,10 @@ class IncomingFrame(NamedTuple):
     """Their IDs; -1 where a point has none of its own."""
     kept: Int[np.ndarray, "P"]
     """Indices of these points in the frame as it came."""
+    num_points: int
+    """Points of the frame as it came."""
+    stamp: float
+    """Time stamp of the frame as it came [s]."""
     time: float
     """Time on a clock that only goes forward [s]."""
     notes: tuple[str, ...]
@@ -33,50 +47,54 @@ class Intake:
     """Checks the frames of one stream.
 
     Args:
-        config: Bounds, and the usual interval between frames.
+        silence: Time without a frame that is noted [s].
     """
 
-    def __init__(self, config: IntakeConfig = IntakeConfig()) -> None:  # noqa: B008 (frozen)
-        self._config = config
+    def __init__(self, silence: float = TrackerConfig.silence) -> None:
+        self._silence = silence
         self._last = np.nan
         self._clock = 0.0
-        self._interval = config.usual_interval
+        self._interval = _USUAL_INTERVAL
 
-    def take(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> IncomingFrame:
+    def check_frame(
+        self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"] | None, time: float | None
+    ) -> IncomingFrame:
         """Check the next frame.
 
         Args:
             points: Points [m].
-            ids: Their IDs; -1 where there is none.
+            ids: Their IDs; -1 where there is none, None where the stream has none.
             time: Time stamp of the frame [s].
 
         Raises:
-            ArgumentError: `points` and `ids` do not fit together, which is the caller's mistake, not the
-                stream's.
+            ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time,
+                which is the caller's mistake, not the stream's.
         """
-        points, ids = np.asarray(points, dtype=np.float64), np.asarray(ids, dtype=np.int64)
-        if points.shape != (len(ids), 3):
-            raise ArgumentError(
-                f"points have shape {points.shape}, expected ({len(ids)}, 3) for {len(ids)} IDs"
-            )
-        notes = self._tick(float(time))
+        points = _numbers("points", points, np.float64)
+        ids = np.full(points.shape[:1], -1) if ids is None else _numbers("ids", ids, np.int64)
+        if ids.ndim != 1 or points.shape != (len(ids), 3):
+            count = ids.size
+            raise ArgumentError(f"points have shape {points.shape}, expected ({count}, 3) for {count} IDs")
+        check_type("time", time, (int, float, np.integer, np.floating), "the time of the frame in seconds")
+        stamp = float(cast("float", time))
+        notes = self._tick(stamp)
         with np.errstate(invalid="ignore"):
-            usable = np.abs(points).max(axis=1, initial=0.0) < self._config.farthest  # which NaN is not
+            usable = np.abs(points).max(axis=1, initial=0.0) < FARTHEST  # which NaN is not
         if not usable.all():
             notes.append(f"{np.sum(~usable)} of {len(points)} points are nowhere and left out")
         kept = np.flatnonzero(usable)
-        points, ids = points[kept], ids[kept]
+        num_points, points, ids = len(points), points[kept], ids[kept]
         known = [number for number in ids.tolist() if number >= 0]
         if len(set(known)) < len(known):
             several = sorted({number for number in known if known.count(number) > 1})
             notes.append(f"IDs of several points at once: {', '.join(map(str, several[:5]))}")
             ids = np.where(np.isin(ids, several), -1, ids)
-        return IncomingFrame(points, np.maximum(ids, -1), kept, self._clock, tuple(notes))
+        return IncomingFrame(points, np.maximum(ids, -1), kept, num_points, stamp, self._clock, tuple(notes))
 
     def _tick(self, time: float) -> list[str]:
         """Advance the clock; return notes on what was wrong with the time stamp."""
         span = time - self._last
-        if abs(time) < self._config.latest_time:
+        if abs(time) < _LATEST_TIME:
             self._last = time
         else:
             self._clock += self._interval
@@ -88,9 +106,21 @@ class Intake:
             self._clock += self._interval
             return [f"the time went back by {-span:.3g} s" if span else "the time stood still"]
         # Time stamps jitter, and velocities are divided by their differences.
-        self._clock += max(span, self._config.shortest_interval * self._interval)
-        if span > self._config.silence:
+        self._clock += max(span, _SHORTEST_INTERVAL * self._interval)
+        if span > self._silence:
             return [f"no frame for {span:.3g} s"]
-        newest = min(span, self._config.longest_interval * self._interval)
-        self._interval += self._config.interval_smoothing * (newest - self._interval)
+        newest = min(span, _LONGEST_INTERVAL * self._interval)
+        self._interval += _INTERVAL_SMOOTHING * (newest - self._interval)
         return []
+
+
+def _numbers(name: str, values: ArrayLike, kind: type) -> NDArray[Any]:
+    """An array of a kind of numbers.
+
+    Raises:
+        ArgumentError: The values are no numbers.
+    """
+    try:
+        return np.asarray(values, dtype=kind)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ArgumentError(f"{name} is {shown_value(values)}, expected an array of numbers") from error

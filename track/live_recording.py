@@ -12,15 +12,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from gloves.takes.columns import FRAMES, KEYPOINTS, NUMBERS
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
-from gloves.takes.tracked_take import (
-    KEYPOINTS,
-    KIND,
+from gloves.takes.take import (
     RATED_FRAMES,
-    SCHEMA,
-    TrackedTake,
+    Take,
     keypoints_of,
-    take_columns,
     take_header,
     unpack_take,
     usual_rate,
@@ -53,12 +50,12 @@ class LiveRecorder:
         """The file of the recording."""
         self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
         self._settings = {"tracker": dataclasses.asdict(tracker.config), **settings}
-        markers = tracker.hands[0].layout.num_markers
+        sizes = {"H": len(self._hands), "B": len(self._bodies)}
         self._archive = GrowingArchive(
             self.part,
             self._header(None),
             worn_arrays(self._hands, self._bodies),
-            take_columns(len(self._hands), markers, len(self._bodies)),
+            [column.sized(sizes) for column in (*FRAMES, NUMBERS, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
 
@@ -84,7 +81,7 @@ class LiveRecorder:
                 return
             values = frame_values(frame, tracked)
             keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
-            self._archive.add({**values, KEYPOINTS: keypoints}, len(frame.points))
+            self._archive.add({**values, KEYPOINTS.name: keypoints}, len(frame.points))
         except OSError as error:
             raise CaptureError(
                 f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "
@@ -96,9 +93,7 @@ class LiveRecorder:
         """Write what still waits, and close the file."""
         self._archive.close()
 
-    def finish(
-        self, stream: dict[str, int], *, told: Callable[[], None] = lambda: None
-    ) -> tuple[TrackedTake, int]:
+    def finish(self, stream: dict[str, int], *, told: Callable[[], None] = lambda: None) -> tuple[Take, int]:
         """Write the take and remove the recording; without at least two frames, remove it only.
 
         Args:
@@ -132,8 +127,7 @@ class LiveRecorder:
         return take, step
 
     def _header(self, rate: float | None) -> dict[str, Any]:
-        header = take_header(self._hands, self._bodies, rate, self._settings)
-        return {"kind": KIND, "schema": SCHEMA, **header}
+        return take_header(self._hands, self._bodies, rate, self._settings)
 
     def __enter__(self) -> Self:
         return self

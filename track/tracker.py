@@ -2,97 +2,145 @@
 
 Section 4 of Han et al. 2018 with more history: labels go along with IDs while they fit, new points are
 labeled by the pose that is predicted (`track.association`), and hands without history are initialized with
-the labeler.
+the labeler. A frame goes one way, as a `FrameState` that every step replaces by the next.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
+from handsim._checks import check_type
+from handsim.errors import ArgumentError
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
-from track.association.frame_state import FrameState
-from track.association.hand_state import Estimate, HandState, Prediction
+from track.association.candidates import SETTLED_EVIDENCE
+from track.association.frame_state import FrameState, Numbering, targets_of
+from track.association.hand_state import HandEstimate, HandState, HandTrack, Prediction
 from track.association.initialization import HandInitializer, InitializedHand
-from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, targets_of
-from track.association.label_new_points import HandTrack, label_new_points
+from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, refit_labels
+from track.association.label_new_points import digit_table, label_new_points
 from track.association.labeler_review import LabelerReview
-from track.association.point_linking import PointLinker
+from track.association.point_linking import PointHistory
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
 from train.labelers.protocol import Labeler
+from train.labelers.storage import load_labeler
+
+_EVIDENCE_PER_FRAME: Final = (
+    2.0  # of a label (log-odds), less half the squared Mahalanobis distance of its point
+)
+_MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost
+_DOUBT_SHARE: Final = 0.6  # a track with a smaller share of its markers labeled is doubted
+_DOUBT_RMS: Final = 0.003  # [m], biases removed, from which on a track is doubted
+_DOUBT_RADIUS: Final = 0.2  # [m] from the wrist within which points without a label confirm the doubt
+_REPLACEMENT_MARGIN: Final = 20.0  # log-odds by which another pose must be better to replace a doubted track
+
+
+class _Outcome(NamedTuple):
+    """What a frame brought for a hand."""
+
+    status: Status
+    estimate: HandEstimate | None = None
+    """The pose fitted to its labels; None where it is predicted, or there is none."""
 
 
 class Tracker:
     """Tracks the user's hands, and bodies with markers of their own, from frame to frame.
 
     Args:
-        hands: The user's hands, each side at most once.
-        labeler: Labels the markers of the hands' glove.
+        hands: The user's hands, each side at most once, or a `User` with such hands.
+        labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`.
         bodies: Rigid bodies beside the hands.
-        config: All settings.
+        config: Settings.
+
+    Raises:
+        ArgumentError: An argument is of another type, or two hands are of one side.
+        WeightsError: There is no labeler of that name.
     """
 
     def __init__(
         self,
         hands: Sequence[GloveFit],
-        labeler: Labeler,
+        labeler: Labeler | str | Path,
         bodies: Sequence[RigidTemplate] = (),
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     ) -> None:
-        self.hands = tuple(hands)
+        check_type("config", config, TrackerConfig, "a TrackerConfig")
+        self.hands = _checked_hands(hands)
         self.bodies = tuple(bodies)
         self.config = config
-        self._intake = Intake(config.intake)
-        self._bodies = [BodyTracker(body) for body in bodies]
-        self._states = [HandState(hand, config) for hand in hands]
-        self._initializer = HandInitializer(self._states, labeler, config)
-        self._linker = PointLinker(config.linking)
-        self._review = LabelerReview(labeler, len(hands), config)
-        sizes = [state.num_markers for state in self._states]
-        self._first = np.cumsum([0, *sizes, *(len(body.marker_names) for body in bodies)])
-        self._labels: dict[int, tuple[int, float]] = {}  # label and evidence of each ID
-        self._first_seen: dict[int, float] = {}  # [s] of each ID
-        self._last_time = -np.inf  # [s] of the last frame
-        self._last_sound = np.zeros(len(hands))  # [s] when each track was last beyond doubt
+        named = load_labeler(labeler) if isinstance(labeler, str | Path) else labeler
+        self._intake = Intake(config.silence)
+        self._bodies = [BodyTracker(body) for body in self.bodies]
+        self._states = [HandState(hand, config) for hand in self.hands]
+        counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]
+        self._numbering = Numbering(counts)
+        self._history = PointHistory(self._numbering, config.silence)
+        self._digits = digit_table(self._states, self._numbering)
+        self._initializer = HandInitializer(self._states, named, config)
+        self._review = LabelerReview(named, len(self.hands), config)
+        self._last_sound = np.zeros(len(self.hands))  # [s] when each track was last beyond doubt
 
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
+    def step(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        ids: Int[np.ndarray, "N"] | None = None,
+        time: float | None = None,
+    ) -> TrackedFrame:
         """Track the next frame; whatever a stream may bring ends in a status or a note.
 
         Args:
             points: Points [m]; those without finite coordinates are left out.
             ids: The system's IDs: a point keeps its own for as long as it is visible; -1 where there is none.
+                Without IDs the tracker links the points of one frame with those of the next itself.
             time: Time of the frame [s].
 
         Raises:
-            ArgumentError: `points` and `ids` do not fit together.
+            ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time.
         """
-        incoming = self._intake.take(points, ids, time)
-        if incoming.time - self._last_time > self.config.intake.silence:
-            self._labels = {}  # IDs may be those of other points by now
-        self._last_time = incoming.time
+        incoming = self._intake.check_frame(points, ids, time)
         bodies, labels = self._track_bodies(incoming)
-        confidence, free = np.ones(len(labels)), labels < 0
-        frame = self._frame_state(incoming.points[free], incoming.ids[free], incoming.time)
-        hands, labels[free] = self._track_hands(frame)
-        confidence[free] = frame.confidence
-        all_labels, all_confidence = np.full(len(points), -1), np.ones(len(points))
-        all_labels[incoming.kept], all_confidence[incoming.kept] = labels, confidence
-        return TrackedFrame(time, hands, all_labels, all_confidence, bodies, incoming.notes)
+        free = labels < 0
+        predictions = {
+            hand: state.predict(incoming.time)
+            for hand, state in enumerate(self._states)
+            if state.qpos is not None
+        }
+        expected = self._marker_positions(predictions)
+        carried = self._history.carry(incoming.points[free], incoming.ids[free], incoming.time, expected)
+        followed = self._give_up_old_poses(carried)
+        exchanged = exchange_labels(followed, expected)
+        fitted, tracks = self._fit_kept_labels(exchanged, predictions)
+        labeled = label_new_points(fitted, tracks, self._digits)
+        reviewed, tracks = self._review_labels(fitted, labeled, tracks)
+        updated, outcomes = self._update(reviewed, tracks)
+        started, outcomes = self._initialize_lost(updated, outcomes)
+        final, outcomes = self._replace_doubted(started, outcomes)
+        self._history.keep(final)
+        hands = tuple(
+            _tracked_hand(state, outcome, final.points, final.markers(hand))
+            for hand, (state, outcome) in enumerate(zip(self._states, outcomes, strict=True))
+        )
+        all_labels, all_confidence = np.full(incoming.num_points, -1), np.ones(incoming.num_points)
+        all_labels[incoming.kept] = labels
+        all_labels[incoming.kept[free]], all_confidence[incoming.kept[free]] = final.labels, final.confidence
+        return TrackedFrame(float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes)
 
     def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
         """Every body, and the labels (P,) of their points."""
         labels, bodies = np.full(len(incoming.points), -1), []
-        for number, tracker in enumerate(self._bodies, start=len(self._states)):
+        for owner, tracker in enumerate(self._bodies, start=len(self._states)):
             body = tracker.step(incoming.points, incoming.ids, incoming.time)
-            labels[body.labels >= 0] = self._first[number] + body.labels[body.labels >= 0]
+            labels = self._numbering.with_markers(owner, body.labels, labels)
             position, rotation = np.full(3, np.nan), np.full(4, np.nan)
             if body.T_world_body is not None:
                 position = body.T_world_body[:3, 3]
@@ -100,190 +148,164 @@ class Tracker:
             bodies.append(TrackedBody(tracker.template.name, body.status, position, rotation, body.rms))
         return tuple(bodies), labels
 
-    def _frame_state(self, points: NDArray[np.float64], ids: NDArray[np.int64], time: float) -> FrameState:
-        """The frame with the labels and the evidence that its points carry over."""
-        ids = self._linker.number(points, ids, self._labels, lambda: self._predict_points(time))
-        known = [self._labels.get(point, (-1, 0.0)) for point in ids.tolist()]
-        carried = np.array([label for label, _ in known], dtype=np.int64)
-        first = self._first[: len(self._states) + 1, None]
-        labels = carried - first[:-1]
-        labels[(labels < 0) | (carried >= first[1:])] = -1
-        evidence = np.array([evidence for _, evidence in known])
-        self._first_seen = {point: self._first_seen.get(point, time) for point in ids.tolist() if point >= 0}
-        first_seen = np.array([self._first_seen.get(point, time) for point in ids.tolist()])
-        confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
-        return FrameState(points, ids, labels, evidence, confidence, first_seen, time)
+    def _marker_positions(self, predictions: Mapping[int, Prediction]) -> Float[np.ndarray, "K 3"]:
+        """Predicted position of the marker of each label [m], NaN for hands without a pose and for bodies."""
+        positions = np.full((len(self._numbering.owners), 3), np.nan)
+        for hand, prediction in predictions.items():
+            positions[self._numbering.part(hand)] = prediction.positions
+        return positions
 
-    def _predict_points(self, time: float) -> dict[int, tuple[int, NDArray[np.float64]]]:
-        """Hand and predicted position of the points that had a label in the last frame."""
-        positions = [None if state.qpos is None else state.predict(time).positions for state in self._states]
-        predicted = {}
-        for number, (label, _) in self._labels.items():
-            hand = int(np.searchsorted(self._first, label, side="right")) - 1
-            if hand < len(positions) and (own := positions[hand]) is not None:
-                predicted[number] = hand, own[label - self._first[hand]]
-        return predicted
-
-    def _track_hands(self, frame: FrameState) -> tuple[tuple[TrackedHand, ...], NDArray[np.int64]]:
-        """Every hand, and the labels (P,) of points, counted through the hands."""
-        estimates = self._associate(frame)
-        hands = [self._update(index, frame, estimates.get(index)) for index in range(len(self._states))]
-        self._initialize_lost(frame, hands)
-        self._replace_doubted(frame, hands)
-        first = self._first[: len(hands), None]
-        labels = np.where(frame.labels >= 0, frame.labels + first, -1).max(axis=0, initial=-1)
-        self._labels = {
-            point: (label, evidence)
-            for point, label, evidence in zip(
-                frame.ids.tolist(), labels.tolist(), frame.evidence.tolist(), strict=True
-            )
-            if label >= 0 and point >= 0
-        }
-        return tuple(hands), labels
-
-    def _associate(self, frame: FrameState) -> dict[int, Estimate]:
-        """Predict the hands that have a pose, test and complete their labels, and fit their poses."""
-        predictions: dict[int, Prediction] = {}
-        for index, state in enumerate(self._states):
-            labels = frame.labels[index]
-            if (labels >= 0).sum() < self.config.track.fewest_labels and self._coasted_out(state, frame.time):
+    def _give_up_old_poses(self, frame: FrameState) -> FrameState:
+        """Hands without a pose that can be predicted lose it, and their labels."""
+        for hand, state in enumerate(self._states):
+            labeled = int((frame.markers(hand) >= 0).sum())
+            if labeled < self.config.fewest_labels and self._coasted_out(state, frame.time):
                 state.qpos = None
-            if state.qpos is None:
-                labels[:] = -1
-                continue
-            predictions[index] = state.predict(frame.time)
-        self._exchange(frame, predictions)
-        hands = []
-        for index, prediction in predictions.items():
-            state, labels = self._states[index], frame.labels[index]
-            gate_labels(state, frame.points, labels, prediction, self.config.gating)
-            estimate = fit_labels(state, frame.points, labels, prediction, self.config.gating)
-            hands.append(HandTrack(index, state, prediction, estimate))
-        before = frame.labels.copy()
-        confidence = label_new_points(hands, frame)
-        changed = np.isfinite(confidence)
-        frame.evidence[changed], frame.confidence[changed] = 0.0, confidence[changed]
-        estimates = {}
-        for hand in hands:
-            labels, estimate = frame.labels[hand.index], hand.estimate
-            if (labels != before[hand.index]).any():
-                estimate = fit_labels(hand.state, frame.points, labels, hand.prediction, self.config.gating)
-            estimates[hand.index] = estimate
-            proposal = self._review.review(hand, estimates[hand.index], frame)
-            if proposal is not None:
-                changed = (proposal.labels != labels) & (proposal.labels >= 0)
-                frame.evidence[changed], frame.confidence[changed] = 0.0, proposal.confidence[changed]
-                labels[:], estimates[hand.index] = proposal.labels, proposal.estimate
-        return estimates
+            if state.qpos is None and labeled:
+                frame = frame.with_markers(hand, np.full(len(frame.points), -1))
+        return frame
 
-    def _exchange(self, frame: FrameState, predictions: dict[int, Prediction]) -> None:
-        """Exchange labels of points whose IDs the system has exchanged."""
-        if not predictions:
-            return
-        indices = list(predictions)
-        first = self._first[indices, None]
-        own = frame.labels[indices]
-        assigned = np.where(own >= 0, own + first, -1).max(axis=0, initial=-1)
-        positions = np.full((self._first[len(self._states)], 3), np.nan)
-        for index, prediction in predictions.items():
-            positions[self._first[index] : self._first[index + 1]] = prediction.positions
-        changed = exchange_labels(frame.points, assigned, positions, self.config.gating)
-        if len(changed):
-            frame.evidence[changed] = 0.0
-            frame.confidence[changed] = 0.5
-            last = self._first[np.array(indices) + 1, None]
-            frame.labels[indices] = np.where((assigned >= first) & (assigned < last), assigned - first, -1)
+    def _fit_kept_labels(
+        self, frame: FrameState, predictions: Mapping[int, Prediction]
+    ) -> tuple[FrameState, list[HandTrack]]:
+        """The hands that have a pose, fitted to the labels that are consistent with it."""
+        tracks = []
+        for hand, state in enumerate(self._states):
+            if state.qpos is not None:
+                prediction = predictions[hand]
+                frame = gate_labels(frame, hand, state, prediction)
+                frame, estimate = fit_labels(frame, hand, state, prediction)
+                tracks.append(HandTrack(hand, state, prediction, estimate))
+        return frame, tracks
+
+    def _review_labels(
+        self, fitted: FrameState, frame: FrameState, tracks: Sequence[HandTrack]
+    ) -> tuple[FrameState, list[HandTrack]]:
+        """Fit hands with new labels again, and compare their labels with the labeler's."""
+        reviewed = []
+        for fit in tracks:
+            frame, track = refit_labels(fitted, frame, fit)
+            frame, track = self._review.review(frame, track)
+            reviewed.append(track)
+        return frame, reviewed
 
     def _coasted_out(self, state: HandState, time: float) -> bool:
         """Whether a pose is too old to be predicted on."""
-        return time - state.time > self.config.track.longest_coast
+        return time - state.time > self.config.longest_coast
 
-    def _update(self, index: int, frame: FrameState, estimate: Estimate | None) -> TrackedHand:
-        """Take over a hand's estimate, or reject it; the evidence of its labels is updated."""
-        state, labels = self._states[index], frame.labels[index]
-        track, association = self.config.track, self.config.association
-        labeled = np.flatnonzero(labels >= 0)
-        enough = len(labeled) >= track.fewest_labels
-        if estimate is not None and enough and estimate.rms <= self.config.initialization.most_rms:
-            settled = np.zeros(state.num_markers, dtype=bool)
-            settled[labels[labeled]] = frame.evidence[labeled] >= association.settled_evidence
-            state.update(estimate, settled, frame.time)
-            squares = ((frame.points[labeled] - state.positions[labels[labeled]]) ** 2).sum(axis=1)
-            gain = association.evidence_per_frame - 0.5 * squares / state.variance[labels[labeled]]
-            frame.evidence[labeled] = np.clip(frame.evidence[labeled] + gain, 0.0, association.most_evidence)
-            return _tracked(state, Status.TRACKED, frame.points, labels, estimate)
-        if state.qpos is not None and self._coasted_out(state, frame.time):
-            state.qpos = None
-        if state.qpos is None:
-            labels[:] = -1
-            return _tracked(state, Status.LOST, frame.points, labels, None)
-        return _tracked(state, Status.COASTING, frame.points, labels, None)
+    def _update(
+        self, frame: FrameState, tracks: Sequence[HandTrack]
+    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+        """Take over the hands' estimates, or reject them; the evidence of their labels is updated."""
+        estimates, outcomes = {track.hand: track.estimate for track in tracks}, []
+        evidence = frame.evidence.copy()
+        for hand, state in enumerate(self._states):
+            markers, estimate = frame.markers(hand), estimates.get(hand)
+            labeled = np.flatnonzero(markers >= 0)
+            enough = len(labeled) >= self.config.fewest_labels
+            if estimate is not None and enough and estimate.rms <= self.config.most_rms:
+                own, before = markers[labeled], evidence[labeled]
+                settled = np.zeros(state.num_markers, dtype=bool)
+                settled[own] = before >= SETTLED_EVIDENCE
+                state.update(estimate, settled, frame.time)
+                squares = ((frame.points[labeled] - state.positions[own]) ** 2).sum(axis=1)
+                gain = _EVIDENCE_PER_FRAME - 0.5 * squares / state.variance[own]
+                evidence[labeled] = np.clip(before + gain, 0.0, _MOST_EVIDENCE)
+                outcomes.append(_Outcome(Status.TRACKED, estimate))
+                continue
+            if state.qpos is not None and self._coasted_out(state, frame.time):
+                state.qpos = None
+            if state.qpos is None and len(labeled):
+                frame = frame.with_markers(hand, np.full(len(markers), -1))
+            outcomes.append(_Outcome(Status.LOST if state.qpos is None else Status.COASTING))
+        return frame._replace(evidence=evidence), tuple(outcomes)
 
-    def _initialize_lost(self, frame: FrameState, hands: list[TrackedHand]) -> None:
-        """Initialize hands without a pose with the points that the others leave; `hands` is overwritten."""
-        lost = [index for index, hand in enumerate(hands) if hand.status in (Status.LOST, Status.COASTING)]
+    def _initialize_lost(
+        self, frame: FrameState, outcomes: tuple[_Outcome, ...]
+    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+        """Initialize hands without a pose with the points that the others leave."""
+        lost = tuple(
+            hand for hand, one in enumerate(outcomes) if one.status in (Status.LOST, Status.COASTING)
+        )
         if not lost:
-            return
-        free = frame.unlabeled_by_others(lost)
-        for hand in self._initializer.initialize(frame.points[free], tuple(lost)):
-            hands[hand.index] = self._start(hand, free, frame)
-            lost.remove(hand.index)
-            for other in lost:  # it may have kept labels of some of these points
-                frame.labels[other, frame.labels[hand.index] >= 0] = -1
-                state = self._states[other]
-                hands[other] = _tracked(state, hands[other].status, frame.points, frame.labels[other], None)
+            return frame, outcomes
+        free = frame.free_for(lost)
+        for found in self._initializer.initialize(frame.points[free], lost):
+            frame, outcomes = self._start(frame, outcomes, found, free)
+        return frame, outcomes
 
-    def _replace_doubted(self, frame: FrameState, hands: list[TrackedHand]) -> None:
+    def _replace_doubted(
+        self, frame: FrameState, outcomes: tuple[_Outcome, ...]
+    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
         """Initialize a hand again that lacks most of its labels, or fits badly, with points around it.
 
-        A track can hold on to a wrong pose with a few points; it must not stay there. `hands` is overwritten.
+        A track can hold on to a wrong pose with a few points; it must not stay there.
         """
-        track = self.config.track
-        for index, (hand, state) in enumerate(zip(hands, self._states, strict=True)):
-            count = int((frame.labels[index] >= 0).sum())
-            fewest = track.doubt_share * state.num_markers
-            sound = count >= fewest and state.rms < track.doubt_rms
-            if hand.status is not Status.TRACKED or sound:
-                self._last_sound[index] = frame.time
+        for hand, state in enumerate(self._states):
+            count = int((frame.markers(hand) >= 0).sum())
+            fewest = _DOUBT_SHARE * state.num_markers
+            sound = count >= fewest and state.rms < _DOUBT_RMS
+            if outcomes[hand].status is not Status.TRACKED or state.qpos is None or sound:
+                self._last_sound[hand] = frame.time
                 continue
-            free = frame.unlabeled_by_others(index)
-            around = np.linalg.norm(frame.points[free] - hand.qpos[:3], axis=1) < track.doubt_radius
+            free = frame.free_for((hand,))
+            around = np.linalg.norm(frame.points[free] - state.qpos[:3], axis=1) < _DOUBT_RADIUS
             if around.sum() < fewest:
-                self._last_sound[index] = frame.time
-            if frame.time - self._last_sound[index] < track.doubt_time:
+                self._last_sound[hand] = frame.time
+            if frame.time - self._last_sound[hand] < self.config.doubt_time:
                 continue
-            self._last_sound[index] = frame.time
-            least_score = self._initializer.score(count, state.rms) + track.replacement_margin
-            for again in self._initializer.initialize(frame.points[free], [index]):
+            self._last_sound[hand] = frame.time
+            least_score = self._initializer.score(count, state.rms) + _REPLACEMENT_MARGIN
+            for again in self._initializer.initialize(frame.points[free], (hand,)):
                 if again.score > least_score:
-                    hands[index] = self._start(again, free, frame)
+                    frame, outcomes = self._start(frame, outcomes, again, free)
+        return frame, outcomes
 
-    def _start(self, hand: InitializedHand, among: NDArray[np.int64], frame: FrameState) -> TrackedHand:
-        """Start a track from a hand that was initialized among some points; its labels are overwritten."""
-        state, labels = self._states[hand.index], frame.labels[hand.index]
-        labels[:] = -1
-        labels[among] = hand.labels
-        targets = targets_of(frame.points, labels, state.num_markers)
-        estimate = state.initialize(hand.fit.qpos[0], targets, frame.time)
-        self._review.restart(hand.index, frame.time)
-        return _tracked(state, Status.INITIALIZED, frame.points, labels, estimate)
+    def _start(
+        self,
+        frame: FrameState,
+        outcomes: tuple[_Outcome, ...],
+        found: InitializedHand,
+        among: NDArray[np.int64],
+    ) -> tuple[FrameState, tuple[_Outcome, ...]]:
+        """Start a track from a hand that was initialized among some points."""
+        state, markers = self._states[found.index], np.full(len(frame.points), -1)
+        markers[among] = found.labels
+        targets = targets_of(frame.points, markers, state.num_markers)
+        estimate = state.initialize(found.fit.qpos[0], targets, frame.time)
+        self._review.restart(found.index, frame.time)
+        started = _Outcome(Status.INITIALIZED, estimate)
+        others = outcomes[: found.index], outcomes[found.index + 1 :]
+        return frame.with_markers(found.index, markers), (*others[0], started, *others[1])
 
 
-def _tracked(
-    state: HandState,
-    status: Status,
-    points: NDArray[np.float64],
-    labels: NDArray[np.int64],
-    estimate: Estimate | None,
+def _checked_hands(hands: object) -> tuple[GloveFit, ...]:
+    """Hands, or those of a user.
+
+    Raises:
+        ArgumentError: They are something else, or two are of one side.
+    """
+    given: Any = getattr(hands, "hands", hands)
+    check_type("hands", given, (list, tuple), "a user, or a sequence of hands in their gloves (GloveFit)")
+    for number, hand in enumerate(given):
+        check_type(f"hands[{number}]", hand, GloveFit, "a hand in its glove (GloveFit)")
+    sides = [hand.side for hand in given]
+    if len(set(sides)) < len(sides):
+        raise ArgumentError(f"hands are {', '.join(sides)}, expected each side at most once")
+    return tuple(given)
+
+
+def _tracked_hand(
+    state: HandState, outcome: _Outcome, points: NDArray[np.float64], own: NDArray[np.int64]
 ) -> TrackedHand:
     """The output for a hand: labeled points (N, 3) [m] where there are some, the pose's markers elsewhere."""
     count, side = state.num_markers, state.hand.side
     if state.qpos is None:
         no_markers = np.full((count, 3), np.nan)
-        return TrackedHand(side, status, np.full(NUM_QPOS, np.nan), np.nan, no_markers, np.arange(0))
-    markers, labeled = state.positions.copy(), labels >= 0
-    markers[labels[labeled]] = points[labeled]
+        return TrackedHand(side, outcome.status, np.full(NUM_QPOS, np.nan), np.nan, no_markers, np.arange(0))
+    markers, labeled = state.positions.copy(), own >= 0
+    markers[own[labeled]] = points[labeled]
     present = np.zeros(count, dtype=bool)
-    present[labels[labeled]] = True
-    rms = np.nan if estimate is None else state.rms_without_bias(estimate)
-    return TrackedHand(side, status, state.qpos.copy(), rms, markers, np.flatnonzero(~present))
+    present[own[labeled]] = True
+    rms = np.nan if outcome.estimate is None else state.rms_without_bias(outcome.estimate)
+    return TrackedHand(side, outcome.status, state.qpos.copy(), rms, markers, np.flatnonzero(~present))

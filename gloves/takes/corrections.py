@@ -10,19 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from gloves.takes.take import Take
 from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, numbers, quoted, shown, tables_of, text_of, written
-
-if TYPE_CHECKING:
-    from gloves.takes.tracked_take import TrackedTake
-
 
 SUFFIX: Final = ".corrections.toml"
 """How the names of such files end."""
@@ -206,7 +203,7 @@ def pin_labels(labels: Int[np.ndarray, "T N"], pinned: Int[np.ndarray, "T N"]) -
     return result
 
 
-def applied_corrections(take: TrackedTake) -> tuple[dict[str, Any], ...]:
+def applied_corrections(take: Take) -> tuple[dict[str, Any], ...]:
     """The records of the corrections that a take was saved with."""
     records = take.settings.get("corrections", ())
     return (

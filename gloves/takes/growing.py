@@ -24,6 +24,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from gloves.takes.columns import Column
 from handsim.errors import CaptureError
 from handsim.files.atomic import atomic_write
 
@@ -40,28 +41,7 @@ _MOST_EXPANSION: Final = 32  # memory of a recording as a multiple of the file's
 _EXPANSION_ALLOWANCE: Final = 1 << 26  # beside so many bytes: columns are as many as points in any frame
 
 
-class Column(NamedTuple):
-    """A column that grows by an entry per frame, or per point of each frame."""
-
-    name: str
-    dtype: str
-    shape: tuple[int, ...]
-    """Of one entry."""
-    missing: float | None = None
-    """Of a point: what stands where a frame has fewer points than another. None: an entry per frame."""
-
-    @property
-    def of_points(self) -> bool:
-        """Whether there is an entry per point."""
-        return self.missing is not None
-
-    @property
-    def size(self) -> int:
-        """Bytes of an entry."""
-        return np.dtype(self.dtype).itemsize * math.prod(self.shape)
-
-
-_COUNTS: Final = Column("counts", "<u4", ())  # points of each frame
+_COUNTS: Final = Column("counts", "<u4", ("T",))  # points of each frame
 
 
 def growing_path(archive: Path) -> Path:
@@ -76,7 +56,7 @@ class GrowingArchive:
         path: The file, which must not exist; `growing_path` names it.
         header: The header, as JSON.
         arrays: The arrays that do not grow, by name.
-        columns: Those that do.
+        columns: Those that do, with numbers for all letters but T and N.
 
     Raises:
         CaptureError: The file exists: a recording that was cut off is never overwritten.
@@ -123,7 +103,7 @@ class GrowingArchive:
         packed = []
         for column in self._columns:
             row = np.asarray(rows[column.name], column.dtype)
-            if row.shape != ((num_points,) if column.of_points else ()) + column.shape:
+            if row.shape != ((num_points,) if column.of_points else ()) + column.entry:
                 raise ValueError(f"{column.name} has shape {row.shape}")
             packed.append(row.tobytes())
         for waiting, one in zip(self._waiting, packed, strict=True):
@@ -269,7 +249,7 @@ class GrownArchive:
 
     def _empty(self, column: Column) -> NDArray[Any]:
         wide = (self._most_points,) if column.of_points else ()
-        return np.empty((0, *wide, *column.shape), column.dtype)
+        return np.empty((0, *wide, *column.entry), column.dtype)
 
     def _parts(self, column: Column, blocks: Sequence[_Block]) -> Iterator[NDArray[Any]]:
         """A column block by block; a column of points with NaN or -1 where there is no point."""
@@ -277,7 +257,7 @@ class GrownArchive:
             values = self._column(column, block)
             if column.of_points:
                 present = np.arange(self._most_points) < self._column(_COUNTS, block)[:, None]
-                table = np.full((*present.shape, *column.shape), column.missing, column.dtype)
+                table = np.full((*present.shape, *column.entry), column.missing, column.dtype)
                 table[present] = values
                 values = table
             yield values
@@ -293,7 +273,7 @@ class GrownArchive:
         with self.path.open("rb") as file:
             file.seek(at)
             content = file.read(column.size * count)
-        return np.frombuffer(content, column.dtype).reshape(count, *column.shape)
+        return np.frombuffer(content, column.dtype).reshape(count, *column.entry)
 
 
 def is_growing(path: Path) -> bool:
@@ -358,13 +338,14 @@ def _unpack_array(content: bytes) -> NDArray[Any]:
 
 
 def _column(stored: Mapping[str, Any]) -> Column:
-    column = Column(
-        str(stored["name"]), str(stored["dtype"]), tuple(map(int, stored["shape"])), stored["missing"]
-    )
+    shape = tuple(size if size in ("T", "N") else int(size) for size in stored["shape"])
+    column = Column(str(stored["name"]), str(stored["dtype"]), shape, stored["missing"])
+    leading = ("T", "N") if column.of_points else ("T",)
     if (
-        np.dtype(column.dtype).hasobject
+        shape[: len(leading)] != leading
+        or np.dtype(column.dtype).hasobject
         or not 0 <= column.size <= _LARGEST_HEADER
-        or min(column.shape, default=0) < 0
+        or min(column.entry, default=0) < 0
     ):
         raise ValueError("a column of no size")
     return column

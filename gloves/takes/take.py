@@ -1,205 +1,662 @@
-"""A take: the output of an optical system, frame by frame, with its truth."""
+"""A take: hands in gloves over time, what an optical system saw of them, and which point is which marker.
+
+Simulated captures with their truth, the output of a tracker, and poses of a user's own are all takes.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
+from gloves.attachment import Attachment
 from gloves.captures.capture import Capture
-from gloves.fit import GlovedHand, attach
+from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import stored_layout
-from gloves.takes.archives import (
-    check_shapes,
-    check_types,
-    names_of,
-    read_archive,
-    settings_of,
-    write_archive,
+from gloves.takes.archives import SCHEMA, names_of, read_archive, settings_of, write_archive
+from gloves.takes.columns import (
+    ATTACHMENT,
+    BODY_MARKERS,
+    FRAMES,
+    KEYPOINTS,
+    NUMBERS,
+    check_stored,
+    fitted,
+    spans,
+    stacked_frames,
 )
-from handsim.errors import ArgumentError
+from gloves.takes.formats import motion_format
+from handsim.errors import ArgumentError, choices
+from handsim.hand.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
+from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
-from handsim.hand.topology import NUM_QPOS
+from handsim.hand.topology import Side
+from handsim.motion_files.motion import UpAxis
+from handsim.space.objects import RigidObject, named_object, object_names
 
-KIND: Final = "take"
-SCHEMA: Final = 1
 SUFFIX: Final = ".truth.npz"
+"""How the names of simulated takes end that lie beside their captures."""
+STATUSES: Final = ("lost", "coasting", "found", "tracked")
+"""Names of the status numbers as files hold them ("found": initialized); only a lost hand has no pose."""
+LOST, COASTING, INITIALIZED, TRACKED = range(4)
+RATED_FRAMES: Final = 100_000
+"""Frames of a stream that its rate is measured on."""
+_LARGEST: Final = 1e9  # [m], of anything
+_CHUNK: Final = 4096  # frames whose markers are filled in at once
+_MOST_LEARNED: Final = 2000  # frames that biases are learned from
+_FEWEST_LEARNED: Final = 30  # frames with a marker from which its bias is learned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeldBody:
-    """A rigid body of a take."""
+class RigidBody:
+    """A rigid body with markers of its own.
+
+    Raises:
+        ArgumentError: A name is no text, or there is not one position per marker.
+    """
 
     name: str
     marker_names: tuple[str, ...]
-    T_world_body: Float[np.ndarray, "T 4 4"]
-    """The body's frame seen from the world [m]."""
+    positions: Float[np.ndarray, "Q 3"]
+    """Its markers in its own frame [m]."""
 
     def __post_init__(self) -> None:
-        if self.T_world_body.ndim != 3 or self.T_world_body.shape[1:] != (4, 4):
-            raise ArgumentError(f"T_world_body has shape {self.T_world_body.shape}, expected (T, 4, 4)")
+        if self.positions.shape != (len(self.marker_names), 3):
+            expected = f"({len(self.marker_names)}, 3)"
+            raise ArgumentError(
+                f"{self.name}: positions has shape {self.positions.shape}, expected {expected}"
+            )
+        if not all(isinstance(name, str) for name in (self.name, *self.marker_names)):
+            raise ArgumentError(f"{self.name!r}: a name is no text, expected text for body and markers")
+
+    @property
+    def shape(self) -> RigidObject | None:
+        """Its surface, if it is an object that comes with handsim; of others only markers are known."""
+        return named_object(self.name) if self.name in object_names() else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Take:
-    """Points of every frame with IDs and truth: T frames, N columns.
+    """Hands in motion and labeled points: T frames, H hands, N columns of points, B rigid bodies.
 
-    A label counts through the markers of the hands, in their order, then those of the body; -1 is a ghost or
-    no point at all. An unbroken stretch of a column is one ID.
+    A label counts through the markers of the hands, in their order, then those of the bodies; -1 is a point
+    of none of them (a ghost), or no point at all. `of_truth`, `of_poses` and `of_frames` make takes of less.
 
     Raises:
-        ArgumentError: The arrays do not fit together, a label names no marker, or the rate is not positive.
+        ArgumentError: The arrays do not fit together, or hold what they cannot.
     """
 
     rate: float
-    """Frames per second [Hz]."""
+    """Frames per second [Hz]; of a stream, the usual one."""
+    times: Float[np.ndarray, "T"]
+    """Time of each frame [s], increasing."""
+    hands: tuple[GloveFit, ...]
+    """The hands with their gloves as worn, at most one per side."""
+    qpos: Float[np.ndarray, "T H 27"]
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand has no pose."""
+    status: Int[np.ndarray, "T H"]
+    """Indices into `STATUSES`; true poses are tracked."""
+    rms: Float[np.ndarray, "T H"]
+    """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     points: Float[np.ndarray, "T N 3"]
-    """World frame [m], NaN where a column has no point."""
+    """Observed points in the world [m], NaN where a column has no point. The columns are the capture's; a
+    stream's points are in the order in which they arrived."""
     ids: Int[np.ndarray, "T N"]
-    """The system's ID of each point, -1 where there is none."""
+    """The system's ID of each point, -1 where it has none."""
     labels: Int[np.ndarray, "T N"]
-    """True label of each point."""
-    hands: tuple[GlovedHand, ...]
-    """The hands as they moved, with their gloves as worn: markers after slipping."""
-    body: HeldBody | None
-    """The rigid body that was held, if any."""
+    """Label of each point."""
+    confidence: Float[np.ndarray, "T N"]
+    """Probability of each label, 0 to 1; NaN where there is no point."""
+    bodies: tuple[RigidBody, ...]
+    """The rigid bodies."""
+    body_poses: Float[np.ndarray, "T B 7"]
+    """Position [m] and orientation (wxyz) in the world, NaN where a body has no pose."""
+    body_status: Int[np.ndarray, "T B"]
+    """Indices into `STATUSES`."""
+    body_rms: Float[np.ndarray, "T B"]
+    """3D RMS distance of the labeled markers from the pose's [m]; NaN where no pose was fitted."""
     settings: dict[str, Any]
-    """Settings that made it, as JSON."""
+    """Settings that made it, as JSON; of a stream, also how many frames are missing and were left out."""
+    numbers: Int[np.ndarray, "T"] | None = None
+    """The server's number of each frame of a stream, which shows where frames are missing; None otherwise."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "hands", tuple(self.hands))
+        object.__setattr__(self, "bodies", tuple(self.bodies))
         try:
+            points = np.asarray(self.points)
+            sizes = _sizes(
+                len(self.times), points.shape[1] if points.ndim == 3 else 0, self.hands, self.bodies
+            )
+            for column in FRAMES:
+                object.__setattr__(self, column.name, fitted(column, getattr(self, column.name), sizes))
+            if self.numbers is not None:
+                object.__setattr__(self, NUMBERS.name, fitted(NUMBERS, self.numbers, sizes))
             _check(self)
         except ValueError as error:
             raise ArgumentError(f"not a take: {error}") from error
 
+    @classmethod
+    def of_truth(
+        cls,
+        hands: Sequence[GloveFit],
+        qpos: Float[np.ndarray, "T H 27"],
+        points: Float[np.ndarray, "T N 3"],
+        ids: Int[np.ndarray, "T N"],
+        labels: Int[np.ndarray, "T N"],
+        *,
+        rate: float,
+        bodies: Sequence[RigidBody] = (),
+        body_poses: Float[np.ndarray, "T B 7"] | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """A take whose poses and labels are known: tracked in every frame, with a confidence of 1.
+
+        Args:
+            hands: The hands with their gloves as worn.
+            qpos: Their poses; NaN where one is not there.
+            points: What was seen of them, in the world [m].
+            ids: The system's ID of each point.
+            labels: True label of each point, -1 for a ghost.
+            rate: Frames per second [Hz].
+            bodies: Rigid bodies.
+            body_poses: Their positions [m] and orientations (wxyz).
+            settings: What made it, as JSON.
+
+        Raises:
+            ArgumentError: The arrays do not fit together, or hold what they cannot.
+        """
+        qpos, points = np.asarray(qpos), np.asarray(points)
+        poses = (
+            np.full((len(points), len(bodies), 7), np.nan) if body_poses is None else np.asarray(body_poses)
+        )
+        if not 0.0 < rate < np.inf:
+            raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")
+        return cls(
+            rate=rate,
+            times=np.arange(len(qpos)) / rate,
+            hands=tuple(hands),
+            qpos=qpos,
+            status=_status_of(qpos),
+            rms=np.full(qpos.shape[:2], np.nan),
+            points=points,
+            ids=ids,
+            labels=labels,
+            confidence=np.where(np.isfinite(points[..., 0]), 1.0, np.nan),
+            bodies=tuple(bodies),
+            body_poses=poses,
+            body_status=_status_of(poses),
+            body_rms=np.full(poses.shape[:2], np.nan),
+            settings=dict(settings or {}),
+        )
+
+    @classmethod
+    def of_poses(
+        cls,
+        hands: Sequence[GloveFit],
+        qpos: Float[np.ndarray, "T H 27"],
+        *,
+        rate: float,
+        times: Float[np.ndarray, "T"] | None = None,
+        bodies: Sequence[RigidBody] = (),
+        body_poses: Float[np.ndarray, "T B 7"] | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """A take of poses alone, of which nothing was seen.
+
+        Args:
+            hands: The hands with their gloves as worn.
+            qpos: Their poses; NaN where one is not there.
+            rate: Frames per second [Hz].
+            times: Time of each frame [s]; at the steady rate from 0 when not given.
+            bodies: Rigid bodies.
+            body_poses: Their positions [m] and orientations (wxyz).
+            settings: What made it, as JSON.
+
+        Raises:
+            ArgumentError: The arrays do not fit together, or hold what they cannot.
+        """
+        points, nothing = np.empty((len(qpos), 0, 3)), np.empty((len(qpos), 0), dtype=np.int32)
+        take = cls.of_truth(
+            hands, qpos, points, nothing, nothing, rate=rate, bodies=bodies, body_poses=body_poses,
+            settings=settings,
+        )  # fmt: skip
+        return take if times is None else dataclasses.replace(take, times=times)
+
+    @classmethod
+    def of_frames(
+        cls,
+        frames: Sequence[Mapping[str, NDArray[Any]]],
+        hands: Sequence[GloveFit],
+        bodies: Sequence[RigidBody],
+        *,
+        capture: Capture | None,
+        settings: Mapping[str, Any],
+    ) -> Self:
+        """A take of frames that were tracked one by one.
+
+        Args:
+            frames: By the names of a take's arrays (`gloves.takes.columns.FRAMES` and `numbers`), the entries
+                of each frame; those of points for the points that it has.
+            hands: The hands.
+            bodies: The rigid bodies.
+            capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
+                rate is the median one.
+            settings: What made it, as JSON.
+
+        Raises:
+            ArgumentError: The arrays do not fit together, or hold what they cannot.
+        """
+        if capture is None:
+            counts = np.array([len(frame["points"]) for frame in frames])
+            present = np.arange(counts.max(initial=0)) < counts[:, None]
+        else:
+            present = np.isfinite(capture.positions[: len(frames), :, 0])
+        arrays = stacked_frames(frames, present)
+        numbers = arrays.pop(NUMBERS.name)
+        return cls(
+            rate=usual_rate(arrays["times"]) if capture is None else capture.rate,
+            hands=tuple(hands),
+            bodies=tuple(bodies),
+            settings=dict(settings),
+            numbers=numbers if capture is None else None,
+            **arrays,
+        )
+
     @property
     def num_frames(self) -> int:
         """Number of frames, T."""
-        return len(self.points)
+        return len(self.times)
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Sides of the hands, in their order."""
+        return tuple(hand.side for hand in self.hands)
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Name of each label: `right:ThumbTip`, `pen:Pen1`."""
+        return label_names(self.hands, self.bodies)
 
     @property
     def hand_labels(self) -> tuple[range, ...]:
         """The labels of each hand's markers."""
-        sizes = np.cumsum([0, *(hand.fit.layout.num_markers for hand in self.hands)])
-        return tuple(range(int(low), int(high)) for low, high in itertools.pairwise(sizes))
+        return spans([hand.layout.num_markers for hand in self.hands])
 
-    def observed(self, label: range) -> Float[np.ndarray, "T M 3"]:
-        """Observed positions of the markers with these labels [m], NaN where they were lost."""
-        observed = np.full((self.num_frames, len(label), 3), np.nan)
-        mine = (self.labels >= label.start) & (self.labels < label.stop)
-        frame, column = np.nonzero(mine)
-        observed[frame, self.labels[frame, column] - label.start] = self.points[frame, column]
-        return observed
+    def hand(self, side: Side) -> int:
+        """The index of a hand among the hands.
+
+        Raises:
+            ArgumentError: It is not in the take.
+        """
+        if side not in self.sides:
+            raise ArgumentError(choices(side, self.sides, noun="hand"))
+        return self.sides.index(side)
+
+    def moving_hands(self) -> tuple[GlovedHand, ...]:
+        """Each hand with its poses."""
+        return tuple(
+            GlovedHand(hand, np.ascontiguousarray(self.qpos[:, number]))
+            for number, hand in enumerate(self.hands)
+        )
+
+    def observed(self, of: Side | str | range) -> Float[np.ndarray, "T M 3"]:
+        """The markers of a hand or a body that were seen [m], NaN for the others.
+
+        Args:
+            of: A hand's side, a body's name, or any labels that follow one another.
+
+        Raises:
+            ArgumentError: There is no such hand or body.
+        """
+        return labeled_markers(self.points, self.labels, of if isinstance(of, range) else self._labels_of(of))
+
+    def filled(self, side: Side) -> Bool[np.ndarray, "T M"]:
+        """Which markers of a hand were not seen, in frames with a pose, from which they can be filled in.
+
+        Raises:
+            ArgumentError: The hand is not in the take.
+        """
+        seen = np.isfinite(self.observed(side)[..., 0])
+        filled: NDArray[np.bool_] = ~seen & (self.status[:, self.hand(side)] != LOST)[:, None]
+        return filled
+
+    def markers(self, side: Side) -> Float[np.ndarray, "T M 3"]:
+        """The markers of a hand [m] as seen, or from the pose where they were not; NaN where it has no pose.
+
+        Gloves slip: a marker that is filled in is shifted by its `marker_bias`.
+
+        Raises:
+            ArgumentError: The hand is not in the take.
+        """
+        number, markers = self.hand(side), self.observed(side)
+        worn, there = self.hands[number], self.status[:, number] != LOST
+        filled = np.isnan(markers[..., 0])
+        markers[~there] = np.nan
+        every, bias = np.flatnonzero(there & filled.any(axis=1)), self.marker_bias(side)
+        for first in range(0, len(every), _CHUNK):
+            frames = every[first : first + _CHUNK]
+            bones = worn.model.forward_kinematics(self.qpos[frames, number])
+            rotations = bones[:, worn.attachment.main_bones, :3, :3]
+            expected = worn.attachment.centers(worn.model, bones) - np.einsum("tmij,mj->tmi", rotations, bias)
+            markers[frames] = np.where(filled[frames, :, None], expected, markers[frames])
+        return markers
+
+    def marker_bias(self, side: Side) -> Float[np.ndarray, "M 3"]:
+        """How far each marker of a hand sits from where its glove has it, in the frame of its bone [m].
+
+        It is learned from the frames whose pose was fitted to points; 0 where these are few. A tracker
+        fits poses to markers that are shifted by this; so must be what stands between its poses.
+
+        Raises:
+            ArgumentError: The hand is not in the take.
+        """
+        number = self.hand(side)
+        worn, qpos = self.hands[number], self.qpos[:, number]
+        fits = np.flatnonzero((self.status[:, number] == TRACKED) & np.isfinite(self.rms[:, number]))
+        fits = fits[:: -(-len(fits) // _MOST_LEARNED) or 1]
+        bias = np.zeros((worn.layout.num_markers, 3))
+        if len(fits) < _FEWEST_LEARNED:
+            return bias
+        seen = labeled_markers(self.points[fits], self.labels[fits], self.hand_labels[number])
+        rotations = worn.model.forward_kinematics(qpos[fits])[:, worn.attachment.main_bones, :3, :3]
+        local = np.einsum("tmji,tmj->tmi", rotations, worn.markers(qpos[fits])[0] - seen)
+        enough = np.isfinite(local[..., 0]).sum(axis=0) >= _FEWEST_LEARNED
+        bias[enough] = np.nanmedian(local[:, enough], axis=0)
+        return bias
 
     def markers_present(self) -> Bool[np.ndarray, "T M"]:
-        """Which markers of the hands have a point in each frame."""
-        observed = [self.observed(label) for label in self.hand_labels]
-        present: np.ndarray = np.isfinite(np.concatenate(observed, axis=1)[..., 0])
+        """Which markers of all hands have a point in each frame."""
+        present: NDArray[np.bool_] = np.isfinite(self.observed(range(self.hand_labels[-1].stop))[..., 0])
         return present
 
+    def keypoints(self) -> Float[np.ndarray, "T H 21 3"]:
+        """The wrist, the joints and the tips of the hands in the world [m]; NaN where one has no pose.
+
+        Their names are `handsim.hand.keypoints.KEYPOINT_NAMES`.
+        """
+        return keypoints_of(self.hands, self.qpos)
+
+    def motion(self, side: Side) -> HandMotion:
+        """The motion of a hand without gaps: where it is lost, linear from the pose before to the pose after.
+
+        It keeps its first pose before it and its last pose after it; `status` tells which frames are filled.
+
+        Raises:
+            ArgumentError: The hand is not in the take, or has no pose in any frame.
+        """
+        qpos = self.qpos[:, self.hand(side)]
+        if np.isnan(qpos[:, 0]).all():
+            raise ArgumentError(f"the {side} hand has no pose in any frame")
+        return bridge_gaps(self.times, qpos, self.rate)
+
+    def poses_alone(self, rate: float | None = None) -> Take:
+        """The hands and bodies that have a pose in some frame, without points; at another rate if given.
+
+        Between two frames positions and angles are linear, and rotations take the shortest way. There is no
+        pose where a frame beside it has none, or where these are more than a tenth of a second apart.
+
+        Args:
+            rate: Frames per second [Hz].
+
+        Raises:
+            ArgumentError: No hand has a pose, the rate is not positive, or there would be too many frames.
+        """
+        times, qpos, poses = self.times, self.qpos, self.body_poses
+        if rate is not None:
+            times = times_at(self.times, rate)
+            qpos = between_poses(self.times, times, qpos, self.rate)
+            poses = between_poses(self.times, times, poses, self.rate)
+        shown = np.flatnonzero(np.isfinite(qpos[..., 0]).any(axis=0))
+        moving = np.flatnonzero(np.isfinite(poses[..., 0]).any(axis=0))
+        if not len(shown):
+            raise ArgumentError("no hand has a pose in any frame, expected one at least")
+        return Take.of_poses(
+            [self.hands[number] for number in shown],
+            qpos[:, shown],
+            rate=self.rate if rate is None else rate,
+            times=times,
+            bodies=[self.bodies[number] for number in moving],
+            body_poses=poses[:, moving],
+            settings=self.settings,
+        )
+
     def capture(self) -> Capture:
-        """The points without labels, as an optical system exports them: one trajectory per column."""
+        """The points without labels, as an optical system exports them: one trajectory per column.
+
+        Raises:
+            CaptureError: There are no points.
+        """
         names = tuple(f"*{column}" for column in range(self.points.shape[1]))
         return Capture(names, self.points, self.rate)
 
     def without_body(self) -> Take:
-        """The take without the points of its body, which many optical systems track themselves."""
+        """The take without its bodies and their points, which many optical systems track themselves."""
         gone = self.labels >= self.hand_labels[-1].stop
         return dataclasses.replace(
             self,
             points=np.where(gone[..., None], np.nan, self.points),
             ids=np.where(gone, -1, self.ids),
             labels=np.where(gone, -1, self.labels),
-            body=None,
+            confidence=np.where(gone, np.nan, self.confidence),
+            bodies=(),
+            body_poses=self.body_poses[:, :0],
+            body_status=self.body_status[:, :0],
+            body_rms=self.body_rms[:, :0],
         )
 
-    def save(self, path: Path) -> None:
-        """Write a `.truth.npz`, whole or not at all; `load_take` reads it.
+    def cut(self, first: int, last: int) -> Take:
+        """The frames from `first` to `last`, the latter not included; times go on where they are.
+
+        Raises:
+            ArgumentError: They are no part of the take.
+        """
+        if not 0 <= first < last <= self.num_frames:
+            raise ArgumentError(f"frames {first} to {last}, expected a part of 0 to {self.num_frames}")
+        parts = {column.name: getattr(self, column.name)[first:last] for column in FRAMES}
+        numbers = None if self.numbers is None else self.numbers[first:last]
+        return dataclasses.replace(self, **parts, numbers=numbers)
+
+    def export(self, path: str | Path, *, rate: float | None = None, up: UpAxis = "z") -> None:
+        """Write the motion for other programs, in the format that the name's ending says.
+
+        Args:
+            path: A .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint angles and
+                positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json file.
+            rate: Frames per second of the file [Hz]; those of the take when not given.
+            up: The axis of the take's world that points up.
+
+        Raises:
+            ArgumentError: The ending is another, no hand has a pose, or the rate cannot be.
+            HandSimError: A package that the format needs is not installed.
+            OSError: The file cannot be written.
+        """
+        path = Path(path)
+        form = motion_format(path)
+        motion = self.poses_alone(rate)
+        if form.steady and not is_steady(motion.times, motion.rate):
+            motion = motion.poses_alone(motion.rate)
+        form.write(path, motion, up)
+
+    def save(self, path: str | Path) -> None:
+        """Write the take (.npz), whole or not at all; `load_take` gives the same numbers again.
+
+        The file also holds `keypoints`, for programs that have no model of the hand.
 
         Raises:
             OSError: The file cannot be written.
         """
-        body = self.body
-        header = {
-            "units": "metres, radians, world frame",
-            "rate": self.rate,
-            "layouts": [dataclasses.asdict(hand.fit.layout) for hand in self.hands],
-            "body": None if body is None else {"name": body.name, "marker_names": body.marker_names},
-            "settings": self.settings,
-        }
-        arrays = {
-            "points": self.points,
-            "ids": self.ids.astype(np.int32),
-            "labels": self.labels.astype(np.int16),
-            "hands": np.array([pack_hand(hand.fit.shape) for hand in self.hands], dtype=HAND_DTYPE),
-            "qpos": np.stack([hand.qpos for hand in self.hands]),
-            "T_world_body": np.zeros((0, 4, 4)) if body is None else body.T_world_body,
-        }
-        write_archive(path, KIND, SCHEMA, header, arrays)
+        arrays = {column.name: getattr(self, column.name) for column in FRAMES}
+        arrays |= {} if self.numbers is None else {NUMBERS.name: self.numbers}
+        arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
+        header = take_header(self.hands, self.bodies, self.rate, self.settings)
+        write_archive(Path(path), header, arrays)
+
+    def _labels_of(self, name: str) -> range:
+        """The labels of a hand's markers, or of a body's."""
+        names = [*self.sides, *(body.name for body in self.bodies)]
+        if name not in names:
+            raise ArgumentError(choices(name, names, noun="hand or body"))
+        counts = [hand.layout.num_markers for hand in self.hands]
+        return spans([*counts, *(len(body.marker_names) for body in self.bodies)])[names.index(name)]
 
 
 def load_take(path: str | Path) -> Take:
-    """Read a `.truth.npz`, which `handsim simulate` and `Take.save` write; nothing is unpickled.
+    """Read a take that `handsim simulate`, `handsim track` or `Take.save` wrote; nothing is unpickled.
+
+    The `.npz.part` of a live recording that was cut off, or is still running, is read up to its last whole
+    half second; a `CutOffWarning` says so.
 
     Args:
         path: The file.
 
-    Returns:
-        Points (T, N, 3) [m] with IDs and true labels, and the hands' poses (T, 27) [m, rad].
-
     Raises:
         CaptureError: No such file, of another kind or schema, or damaged.
     """
-    return read_archive(path, KIND, (SCHEMA,), _unpack)
+    return read_archive(path, unpack_take)
 
 
-_TYPES: Final = {"points": "f8", "ids": "i4", "labels": "i2", "qpos": "f8", "T_world_body": "f8"}
+def label_names(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> tuple[str, ...]:
+    """Name of each label of these hands and bodies: `right:ThumbTip`, `pen:Pen1`."""
+    worn = [f"{hand.side}:{name}" for hand in hands for name in hand.layout.names]
+    return (*worn, *(f"{body.name}:{name}" for body in bodies for name in body.marker_names))
 
 
-def _unpack(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Take:
-    check_types(arrays, {**_TYPES, "hands": HAND_DTYPE})
-    if not (np.isfinite(arrays["qpos"]).all() and np.isfinite(arrays["T_world_body"]).all()):
-        raise ValueError("poses are not finite")
-    stored = zip(header["layouts"], arrays["hands"], arrays["qpos"], strict=True)
-    hands = tuple(
-        GlovedHand(attach(stored_layout(layout), HandModel(unpack_hand(record))), qpos)
-        for layout, record, qpos in stored
+def labeled_markers(
+    points: Float[np.ndarray, "T N 3"], labels: Int[np.ndarray, "T N"], of: range
+) -> Float[np.ndarray, "T M 3"]:
+    """The points that have these labels [m], in their order; NaN where there is none."""
+    markers = np.full((len(points), len(of), 3), np.nan)
+    frames, columns = np.nonzero((labels >= of.start) & (labels < of.stop))
+    markers[frames, labels[frames, columns] - of.start] = points[frames, columns]
+    return markers
+
+
+def keypoints_of(
+    hands: Sequence[GloveFit], qpos: Float[np.ndarray, "T H 27"]
+) -> Float[np.ndarray, "T H 21 3"]:
+    """Keypoints in the world [m] of some poses of each hand; NaN where these are."""
+    keypoints = np.full((*qpos.shape[:2], NUM_KEYPOINTS, 3), np.nan)
+    for index, hand in enumerate(hands):
+        there = np.isfinite(qpos[:, index, 0])
+        keypoints[there, index] = hand_keypoints(hand.model, qpos[there, index])
+    return keypoints
+
+
+def usual_rate(times: Float[np.ndarray, "T"]) -> float:
+    """Frames per second of a stream: the median one of its first quarter of an hour."""
+    return 1.0 / float(np.median(np.diff(times[:RATED_FRAMES])))
+
+
+def take_header(
+    hands: Sequence[GloveFit], bodies: Sequence[RigidBody], rate: float | None, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The header of a file, as JSON; without a rate that of a recording, whose rate is its usual one."""
+    return {
+        "kind": "take",
+        "schema": SCHEMA,
+        "units": "metres, radians, seconds, wxyz, world frame",
+        "rate": rate,
+        "layouts": [dataclasses.asdict(hand.layout) for hand in hands],
+        "statuses": STATUSES,
+        "keypoint_names": KEYPOINT_NAMES,
+        "bodies": [{"name": body.name, "marker_names": list(body.marker_names)} for body in bodies],
+        "settings": settings,
+    }
+
+
+def worn_arrays(hands: Sequence[GloveFit], bodies: Sequence[RigidBody]) -> dict[str, NDArray[Any]]:
+    """The arrays of a file that are no motion: hands, gloves and the bodies' markers."""
+    arrays: dict[str, NDArray[Any]] = {
+        "hands": np.array([pack_hand(hand.shape) for hand in hands], dtype=HAND_DTYPE)
+    }
+    for column in ATTACHMENT:
+        field = column.name.removeprefix("attachment_")
+        parts = [getattr(hand.attachment, field) for hand in hands]
+        arrays[column.name] = np.concatenate(parts).astype(column.dtype)
+    markers = [np.zeros((0, 3)), *(body.positions for body in bodies)]
+    return arrays | {BODY_MARKERS.name: np.concatenate(markers)}
+
+
+def unpack_take(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Take:
+    """A take from the header and the arrays of a file; any exception means that they are damaged."""
+    if tuple(header["statuses"]) != STATUSES:
+        raise ValueError("other statuses")
+    layouts = [stored_layout(layout) for layout in header["layouts"]]
+    names = [(stored["name"], names_of(stored["marker_names"])) for stored in header["bodies"]]
+    counts = [layout.num_markers for layout in layouts], [len(markers) for _, markers in names]
+    frames, columns = arrays["ids"].shape
+    sizes = {"T": frames, "N": columns, "H": len(layouts), "B": len(names)}
+    check_stored(arrays, sizes | {"M": sum(counts[0]), "Q": sum(counts[1])})
+    hands = []
+    for record, layout, span in zip(arrays["hands"], layouts, spans(counts[0]), strict=True):
+        parts = (arrays[column.name][span.start : span.stop] for column in ATTACHMENT)
+        hands.append(GloveFit(HandModel(unpack_hand(record)), Attachment(layout, *parts)))
+    bodies = tuple(
+        RigidBody(*name, arrays[BODY_MARKERS.name][span.start : span.stop])
+        for name, span in zip(names, spans(counts[1]), strict=True)
     )
-    body = header["body"] and HeldBody(
-        header["body"]["name"], names_of(header["body"]["marker_names"]), arrays["T_world_body"]
-    )
-    take = Take(
-        rate=float(header["rate"]),
-        points=arrays["points"],
-        ids=arrays["ids"],
-        labels=arrays["labels"],
-        hands=hands,
-        body=body,
+    return Take(
+        rate=usual_rate(arrays["times"]) if header["rate"] is None else float(header["rate"]),
+        hands=tuple(hands),
+        bodies=bodies,
         settings=settings_of(header),
+        numbers=arrays.get(NUMBERS.name),
+        **{column.name: arrays[column.name] for column in FRAMES},
     )
-    return take
+
+
+def _sizes(
+    frames: int, columns: int, hands: Sequence[GloveFit], bodies: Sequence[RigidBody]
+) -> dict[str, int]:
+    """What the letters of shapes stand for."""
+    return {"T": frames, "N": columns, "H": len(hands), "B": len(bodies)}
+
+
+def _status_of(poses: NDArray[np.float64]) -> NDArray[np.int8]:
+    """Tracked where there is a pose, else lost."""
+    return np.where(np.isfinite(poses[..., 0]), TRACKED, LOST).astype(np.int8)
 
 
 def _check(take: Take) -> None:
     """Whether the parts of a take fit together; a `ValueError` says what does not."""
-    if take.points.ndim != 3:
-        raise ValueError(f"points have shape {take.points.shape}, expected (T, N, 3)")
-    frames, columns = take.points.shape[:2]
-    shapes = [
-        (take.points, (frames, columns, 3)),
-        (take.ids, (frames, columns)),
-        (take.labels, take.ids.shape),
-    ]
-    shapes += [(hand.qpos, (frames, NUM_QPOS)) for hand in take.hands]
-    shapes += [] if take.body is None else [(take.body.T_world_body, (frames, 4, 4))]
-    check_shapes(shapes)
-    known = sum(hand.fit.layout.num_markers for hand in take.hands)
-    known += 0 if take.body is None else len(take.body.marker_names)
-    if not 0.0 < take.rate < np.inf or (take.labels < -1).any() or (take.labels >= known).any():
-        raise ValueError("the rate is not positive, or a label names no marker")
+    frames = take.num_frames
+    if not frames or not take.hands or len(set(take.sides)) < len(take.hands):
+        raise ValueError(
+            f"{frames} frames of the hands {take.sides}, expected at least one frame and one hand per side"
+        )
+    if not 0.0 < take.rate < np.inf or not np.isfinite(take.times).all() or (np.diff(take.times) <= 0).any():
+        raise ValueError("the rate is not positive, or times do not increase")
+    for status, poses in ((take.status, take.qpos), (take.body_status, take.body_poses)):
+        if (
+            not _within(status, 0, len(STATUSES) - 1)
+            or (np.isnan(poses) != (status == LOST)[..., None]).any()
+        ):
+            raise ValueError("a status is unknown, or does not fit its pose")
+    for values in (take.qpos, take.points, take.body_poses, *(body.positions for body in take.bodies)):
+        _check_range(values, -_LARGEST, _LARGEST)
+    for values in (take.rms, take.body_rms):
+        _check_range(values, 0.0, _LARGEST)
+    _check_range(take.confidence, 0.0, 1.0)
+    if not _within(take.labels, -1, len(take.label_names) - 1):
+        raise ValueError("a label names no marker")
+
+
+def _check_range(values: NDArray[np.float64], low: float, high: float) -> None:
+    """Raise a `ValueError` unless all numbers that are not NaN are within a range."""
+    if not (
+        np.fmin.reduce(values, axis=None, initial=low) >= low
+        and np.fmax.reduce(values, axis=None, initial=high) <= high
+    ):
+        raise ValueError(f"a number is not from {low:g} to {high:g}")
+
+
+def _within(values: NDArray[Any], low: float, high: float) -> bool:
+    return bool(((values >= low) & (values <= high)).all())

@@ -41,9 +41,9 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
 
 def _take_body(truth: Path) -> RigidTemplate:
     """The object of a simulated take."""
-    held = load_take(truth).body
-    if held is None:
+    bodies = load_take(truth).bodies
+    if not bodies:
         raise ArgumentError(
             f"{truth}: the take has no object, expected one of handsim simulate --kind hand-controller"
         )
-    return RigidTemplate.of(named_object(held.name))
+    return RigidTemplate.of(named_object(bodies[0].name))

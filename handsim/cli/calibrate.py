@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from gloves.fit import GloveFit, attach
-from gloves.takes.tracked_take import INITIALIZED, TRACKED, TrackedTake
+from gloves.takes.take import INITIALIZED, TRACKED, Take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.cli.user_options import BOTH, Size, measured_users, users_of
@@ -84,7 +84,7 @@ def calibrate(
 
 def _round(
     source: Capture, known: Sequence[GloveFit], start: Sequence[GloveFit], labeler: Labeler
-) -> tuple[TrackedTake, tuple[Calibration, ...]]:
+) -> tuple[Take, tuple[Calibration, ...]]:
     """Label a capture with the hands `known` so far, and calibrate those that are in it."""
     with progress_bar("frames") as (bar, task):
         take = track_capture(
@@ -109,21 +109,22 @@ def _round(
         )
 
 
-def _reliable(take: TrackedTake, side: Side) -> Bool[np.ndarray, "T"]:
+def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
     """Frames whose labels are reliable."""
     reliable: Bool[np.ndarray, "T"] = np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))
     return reliable
 
 
-def _leaves_markers(take: TrackedTake, done: Sequence[Calibration]) -> bool:
+def _leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
     """Whether too many missing markers had an unlabeled point nearby."""
     left, total = 0, 0
     for one in done:
-        hand = take.hand(one.hand.side)
-        total += take.filled[:, hand].size
-        for frame in np.flatnonzero(take.filled[:, hand].any(axis=1) & _reliable(take, one.hand.side)):
+        side = one.hand.side
+        filled, markers = take.filled(side), take.markers(side)
+        total += filled.size
+        for frame in np.flatnonzero(filled.any(axis=1) & _reliable(take, side)):
             free = take.points[frame, take.labels[frame] < 0]
-            expected = take.markers[frame, hand, take.filled[frame, hand]]
+            expected = markers[frame, filled[frame]]
             left += int((cdist(expected, free[np.isfinite(free[:, 0])]) < _NEAR).any(axis=1).sum())
     return left > _LEFT_OVER * total
 

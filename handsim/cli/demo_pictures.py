@@ -8,7 +8,7 @@ import numpy as np
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.tracked_take import load_tracked_take
+from gloves.takes.take import load_take
 from handsim.app.page import Section
 from handsim.cli.demo_run import GLOVE, DemoRun
 from handsim.hand.model import HandModel, join_qpos
@@ -109,7 +109,7 @@ def draw_labeled_frame(run: DemoRun) -> Section:
 def draw_tracked_take(run: DemoRun) -> Section:
     """Pictures of the tracked take."""
     run.report("drawing pictures")
-    take = load_tracked_take(run.tracked_take)
+    take = load_take(run.tracked_take)
     frames = np.linspace(0, take.num_frames - 1, _PICTURES).astype(int).tolist()
     config = RenderConfig(seed=run.seed, vary="frame")
     write_png(run.out / "pictures.png", contact_sheet(list(draw(take, config=config, frames=frames))))

@@ -24,9 +24,9 @@ def track_take(run: DemoRun) -> Section:
     tracked = track_capture(take.capture(), Tracker(true_users(take), load_labeler(GLOVE)))
     tracked.save(run.tracked_take)
     errors = []
-    for hand in take.hands:
-        model, found = hand.fit.model, tracked.motion(hand.side).qpos
-        joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, hand.qpos)]
+    for number, hand in enumerate(take.hands):
+        model, found = hand.model, tracked.motion(hand.side).qpos
+        joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, take.qpos[:, number])]
         errors.append(1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
     return Section(
         "Tracking",

@@ -2,36 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated
 
 import numpy as np
 import tyro
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
+from gloves.takes.formats import MOTION_FORMATS, motion_format
 from gloves.takes.growing import SUFFIX as GROWING
-from gloves.takes.motion import load_motion
+from gloves.takes.take import load_take
 from handsim.app.messages import print_line
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import check_outputs
-from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.motion_files import openxr
-from handsim.motion_files.bvh import write_bvh
-from handsim.motion_files.glb_animation import write_glb
-from handsim.motion_files.hands_in_motion import HandsInMotion, UpAxis
-from handsim.motion_files.joint_table import write_joint_csv, write_joint_parquet
-from handsim.motion_files.opensim_motion import write_mot
-from handsim.motion_files.usd import write_usd
-
-
-class _Format(NamedTuple):
-    """A format of motion."""
-
-    write: Callable[[Path, HandsInMotion], None]
-    without_pose: str
-    """What a hand without a pose is in it."""
+from handsim.motion_files.motion import UpAxis
 
 
 def export(
@@ -60,26 +43,22 @@ def export(
 
 
 def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None:
-    form = next((form for ending, form in _FORMATS.items() if out.name.lower().endswith(ending)), None)
-    if form is None:
-        raise ArgumentError(
-            f"cannot write the take '{source}' as '{out}', expected a name that ends in {', '.join(_FORMATS)}"
-        )
+    form = motion_format(out)
     check_outputs([source], [out])
-    motion = load_motion(source, up=up)
-    if fps is not None:
-        motion = motion.resampled(fps)
-    form.write(out, motion)
-    sides = " and ".join(hand.side for hand in motion.hands)
-    things = "".join(f", {thing.name}" for thing in motion.things)
+    take = load_take(source)
+    if not np.isfinite(take.qpos[..., 0]).any():
+        raise CaptureError(f"{source}: there is no hand in any frame, expected one to export")
+    motion = take.poses_alone(fps)
+    motion.export(out, up=up)
+    sides = " and ".join(motion.sides)
+    things = "".join(f", {body.name}" for body in motion.bodies)
     print_line(
         f"{out}: {sides} hand{'s' * (len(motion.hands) > 1)}{things}; {motion.num_frames} frames at "
         f"{motion.rate:g} Hz"
     )
-    for hand in motion.hands:
-        absent = int((~hand.present).sum())
+    for side, absent in zip(motion.sides, np.isnan(motion.qpos[..., 0]).sum(axis=0), strict=True):
         if absent:
-            print_line(f"{hand.side} hand: without a pose in {absent} frames, {form.without_pose} there")
+            print_line(f"{side} hand: without a pose in {absent} frames, {form.without_pose} there")
 
 
 def _export_labeler(source: str, out: Path) -> None:
@@ -89,34 +68,9 @@ def _export_labeler(source: str, out: Path) -> None:
     if out.suffix.lower() != ".onnx":
         raise ArgumentError(
             f"cannot write the labeler '{source}' as '{out}', expected a name that ends in .onnx; takes, "
-            f"which end in .npz, become {', '.join(_FORMATS)}"
+            f"which end in .npz, become {', '.join(MOTION_FORMATS)}"
         )
     check_outputs([source], [out])
     network, card = load_network(source)
     export_onnx(network, card["marker_names"], out)
     print_line(f"{out}: {len(card['marker_names'])} markers")
-
-
-def _write_joint_trc(path: Path, motion: HandsInMotion) -> None:
-    """The keypoints of all hands as markers, in the take's axes, so that they lie among its markers."""
-    steady = motion.steady()
-    positions = []
-    for hand in steady.hands:
-        keypoints = hand_keypoints(hand.model, hand.held_qpos)
-        positions.append(np.where(hand.present[:, None, None], keypoints, np.nan))
-    names = tuple(f"{hand.side}_{name}" for hand in steady.hands for name in KEYPOINT_NAMES)
-    write_capture(path, Capture(names, np.concatenate(positions, axis=1), steady.rate))
-
-
-_FORMATS: Final[dict[str, _Format]] = {
-    ".glb": _Format(write_glb, "hidden (scale 0)"),
-    ".bvh": _Format(write_bvh, "held at its last pose"),
-    ".usda": _Format(write_usd, "invisible"),
-    ".usdc": _Format(write_usd, "invisible"),
-    ".csv": _Format(write_joint_csv, "blank"),
-    ".parquet": _Format(write_joint_parquet, "null"),
-    ".trc": _Format(_write_joint_trc, "blank"),
-    ".mot": _Format(write_mot, "NaN"),
-    openxr.SUFFIX: _Format(openxr.write_openxr, "null"),
-}
-"""Formats of motion by the ends of names."""

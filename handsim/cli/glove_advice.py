@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 
 from gloves.layout import FEWEST_MARKERS, MOST_MARKERS, MarkerLayout, MarkerPlace, load_layout, save_layout
-from gloves.takes.motion import load_any_take
+from gloves.takes.take import load_take
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
@@ -96,7 +96,7 @@ def _hands(
     if not motion.endswith(".npz"):
         raise ArgumentError(f"--motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
     return observe_motion(
-        load_any_take(Path(motion)), layout, rig, frames, rng=rng
+        load_take(Path(motion)), layout, rig, frames, rng=rng
     ), f"the take {Path(motion).name}"
 
 

@@ -10,10 +10,9 @@ import mujoco
 import numpy as np
 import trimesh
 
-from gloves.fit import GloveFit, nominal_fit
+from gloves.fit import GloveFit, attach, nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.motion import load_any_take
-from gloves.takes.take import Take
+from gloves.takes.take import Take, load_take
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError, choices
 from handsim.files.atomic import atomic_write
@@ -22,12 +21,11 @@ from handsim.hand.mjcf import Site, build_spec
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS, Side
 from handsim.hand.urdf import hand_urdf
-from handsim.motion_files.glb_animation import write_glb
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
 from track.user import load_user
 
 Size = Literal["XS", "S", "M", "L", "XL"]
 _USUAL_SIZE: Final = "M"
+_USUAL_GLOVE: Final = "dense19"
 _SUFFIXES: Final = (".xml", ".urdf", ".glb")
 _MESH_SUFFIXES: Final = (".glb", ".obj", ".ply", ".stl")
 
@@ -78,7 +76,8 @@ def hand(
             temporary.write_text(hand_urdf(model), "utf-8")
         extras = f", {NUM_JOINTS} joints"
     else:
-        write_glb(out, HandsInMotion(1.0, np.zeros(1), (MovingHand(model, _flat_pose()),)))
+        worn = attach(load_layout(_USUAL_GLOVE), model)  # a take has gloves; the file has none
+        Take.of_poses([worn], _flat_pose()[:, None], rate=1.0).export(out)
         extras = ", rigged skin"
     print_line(f"{out}: {model.shape.side} hand {words}{extras}")
     if mesh is not None:
@@ -100,7 +99,7 @@ def _chosen_hand(
     if source is not None:
         if glove is not None:
             raise ArgumentError(f"given --glove {glove} and {named[0]}, expected one of them")
-        fits = load_user(source) if take is None else _hands_of(source)
+        fits = load_user(source) if take is None else load_take(source).hands
         fit = _of_side(source, fits, side)
         millimeters = f"{1e3 * fit.shape.length:.0f} x {1e3 * fit.shape.breadth:.0f} mm"
         return fit.model, fit.attachment.sites(fit.model), f"of {source}, {millimeters}"
@@ -109,11 +108,6 @@ def _chosen_hand(
         return HandModel.named(size, side=side or "right"), (), f"of size {size}"
     fit = nominal_fit(load_layout(glove), size, side or "right")
     return fit.model, fit.attachment.sites(fit.model), f"of size {size}"
-
-
-def _hands_of(take: Path) -> tuple[GloveFit, ...]:
-    content = load_any_take(take)
-    return tuple(hand.fit for hand in content.hands) if isinstance(content, Take) else content.hands
 
 
 def _of_side(source: Path, fits: Sequence[GloveFit], side: Side | None) -> GloveFit:

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from gloves.takes.tracked_take import TrackedTake
+from gloves.takes.take import Take
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.live_status import LiveStatus
 from track.capture_tracking import track_stream
@@ -37,7 +37,7 @@ _LEFT_OUT: Final = {
 class TrackedSource(NamedTuple):
     """What was made of a capture or a stream, and written."""
 
-    take: TrackedTake
+    take: Take
     """The take; of a long stream, parts of it."""
     num_frames: int
     """Number of all frames."""

@@ -173,7 +173,7 @@ def _work(
     seed: int,
 ) -> tuple[dict[str, list[SceneMotion]], NDArray[np.float64], str]:
     """Hands at work, the middle of where they are [m], and what they do, in words."""
-    from gloves.takes.motion import load_any_take
+    from gloves.takes.take import load_take
     from train.rig_advice.work import sample_work, work_of_take
 
     middle = _checked_center(ROOM_CENTER if center is None else center)
@@ -182,7 +182,7 @@ def _work(
         rng = np.random.default_rng(seed)
         work = sample_work(layout, middle, sides, frames, _PEOPLE, rng=rng)
         return work, middle, f"simulated people in the glove {layout.name}"
-    work = work_of_take(load_any_take(take), None if glove is None else load_layout(glove), frames)
+    work = work_of_take(load_take(take), None if glove is None else load_layout(glove), frames)
     if center is None:
         wrists = [hand.qpos[:, :3] for scenes in work.values() for one in scenes for hand in one.hands]
         middle = np.concatenate(wrists).mean(axis=0)

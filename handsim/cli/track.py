@@ -21,8 +21,7 @@ from gloves.captures.markers import labeled_capture
 from gloves.fit import GloveFit
 from gloves.optics.identities import number_runs
 from gloves.takes.corrections import Correction, corrections_of, corrections_path, find_pins, told
-from gloves.takes.take import SUFFIX
-from gloves.takes.tracked_take import TrackedTake, label_names, load_tracked_take
+from gloves.takes.take import SUFFIX, Take, label_names, load_take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.cli.live import TrackedSource, track_live
@@ -114,7 +113,7 @@ def track(
         else:
             tracked = _track_file(source, start, out, corrections, sinks, measures=measures)
     if labeled is not None:
-        write_capture(labeled, labeled_points(tracked.take if tracked.whole else load_tracked_take(out)))
+        write_capture(labeled, labeled_points(tracked.take if tracked.whole else load_take(out)))
     rate, frames = tracked.take.rate, tracked.num_frames
     print_line(f"{out}: {frames} frames, {frames / rate:.1f} s at {rate:.4g} Hz")
     for line in (
@@ -184,7 +183,12 @@ class TimedTracker(Tracker):
         super().__init__(hands, labeler, bodies)
         self._seconds = seconds
 
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> TrackedFrame:
+    def step(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        ids: Int[np.ndarray, "N"] | None = None,
+        time: float | None = None,
+    ) -> TrackedFrame:
         """Track the next frame, see `Tracker.step`."""
         start = perf_counter()
         frame = super().step(points, ids, time)
@@ -192,7 +196,7 @@ class TimedTracker(Tracker):
         return frame
 
 
-def labeled_points(take: TrackedTake) -> Capture:
+def labeled_points(take: Take) -> Capture:
     """The labeled points of a take as a capture: one column per marker, then columns for the other points."""
     there = np.isfinite(take.points[..., 0])
     frames = [points[seen] for points, seen in zip(take.points, there, strict=True)]
@@ -235,7 +239,7 @@ def _corrections_for(out: Path, source: Capture | None, names: Sequence[str]) ->
     return corrections
 
 
-def _corrected(take: TrackedTake, out: Path, corrections: Sequence[Correction]) -> TrackedTake:
+def _corrected(take: Take, out: Path, corrections: Sequence[Correction]) -> Take:
     """The take with its corrections, if there are any; what does not fit is told."""
     if not corrections:
         return take

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.topology import NUM_QPOS
+
+_MOST_FRAMES: Final = 1 << 22
+_STEADY: Final = 0.01  # of a frame, by which times may differ from those of a steady rate
+_LONGEST_GAP: Final = 0.1  # [s] that a new frame may bridge,
+_LONGEST_GAP_FRAMES: Final = 2.5  # or so many old frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,3 +108,81 @@ def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], 
     )
     bridged[there] = qpos[there]
     return HandMotion(bridged, rate)
+
+
+def is_steady(times: Float[np.ndarray, "T"], rate: float) -> bool:
+    """Whether frames come at a steady rate [Hz]."""
+    drift = np.abs((times - times[0]) * rate - np.arange(len(times)))
+    return bool((drift < _STEADY).all())
+
+
+def times_at(times: Float[np.ndarray, "T"], rate: float) -> Float[np.ndarray, "K"]:
+    """The times [s] of frames at another rate, from the first to the last.
+
+    Args:
+        times: Time of each frame [s], increasing.
+        rate: Frames per second [Hz].
+
+    Raises:
+        ArgumentError: The rate is not positive, or there would be too many frames.
+    """
+    if not 0.0 < rate < np.inf:
+        raise ArgumentError(f"the rate is {rate:g} Hz, expected a positive number")
+    last = (times[-1] - times[0]) * rate + _STEADY
+    if last >= _MOST_FRAMES:
+        raise ArgumentError(f"{last:.3g} frames at {rate:g} Hz, expected at most {_MOST_FRAMES}")
+    at: NDArray[np.float64] = times[0] + np.arange(int(last) + 1) / rate
+    return at
+
+
+def between_poses(
+    times: Float[np.ndarray, "T"], new: Float[np.ndarray, "K"], poses: Float[np.ndarray, "T H W"], rate: float
+) -> Float[np.ndarray, "K H W"]:
+    """Poses at other times: positions and angles linear, rotations on the shortest way.
+
+    There is none where an old one beside it is missing, or where the old ones are more than a tenth of a
+    second apart.
+
+    Args:
+        times: Time of each old pose [s], increasing.
+        new: The other times [s].
+        poses: Rows of positions, then a quaternion (wxyz), then angles, if any; NaN where there is none.
+        rate: Frames per second of the old poses [Hz].
+    """
+    longest = max(_LONGEST_GAP, _LONGEST_GAP_FRAMES / rate)
+    before, share = _brackets(times - times[0], new - times[0], longest)
+    between = np.empty((len(new), *poses.shape[1:]))
+    for number in range(poses.shape[1]):
+        between[:, number] = _between(poses[:, number], before, share)
+    return between
+
+
+def _brackets(
+    old: NDArray[np.float64], new: NDArray[np.float64], longest: float
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """The old frame before each new time, and the share of the next one; NaN in a gap."""
+    if len(old) == 1:
+        return np.zeros(len(new), dtype=np.intp), np.zeros(len(new))
+    before = np.clip(np.searchsorted(old, new, side="right") - 1, 0, len(old) - 2)
+    step = old[before + 1] - old[before]
+    share = np.clip((new - old[before]) / step, 0.0, 1.0)
+    exact = (share < 1e-6) | (share > 1.0 - 1e-6)
+    return before, np.where(exact, np.round(share), np.where(step > longest, np.nan, share))
+
+
+def _between(
+    rows: NDArray[np.float64], before: NDArray[np.intp], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rows between each old frame and the next; NaN where one that counts is."""
+    quaternions = slice(3, 7)
+    after = np.minimum(before + 1, len(rows) - 1)
+    first = np.where(share[:, None] == 1.0, rows[after], rows[before])
+    second = np.where(share[:, None] == 0.0, rows[before], rows[after])
+    between: NDArray[np.float64] = first + share[:, None] * (second - first)
+    there = np.isfinite(between[:, 0])
+    starts = Rotation.from_quat(first[there, quaternions], scalar_first=True)
+    ends = Rotation.from_quat(second[there, quaternions], scalar_first=True)
+    turns = Rotation.from_rotvec(share[there, None] * (starts.inv() * ends).as_rotvec())
+    between[there, quaternions] = (starts * turns).as_quat(scalar_first=True)
+    between[~there] = np.nan
+    return between

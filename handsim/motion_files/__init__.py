@@ -1,6 +1,6 @@
 """Files of hands in motion for other programs; nothing here reads them.
 
-- hands_in_motion: `HandsInMotion`, what every format is written from
+- motion: `Motion`, what every format is written from; a `gloves.Take` is one
 - local_poses: rotations of the bones relative to their parents
 - mesh_normals: normals of objects that keep their edges
 - glb_buffer: the binary container of glTF

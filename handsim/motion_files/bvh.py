@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, PALM
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
 from handsim.motion_files.local_poses import CHILDREN, local_rotations
+from handsim.motion_files.motion import Motion, PosedHand, UpAxis, file_axes, posed_bodies, posed_hands
 from handsim.space.transforms import euler_angles
 
 ROOT: Final = "world_cm"
@@ -29,32 +29,32 @@ _ROTATIONS: Final = "Zrotation Yrotation Xrotation"
 _POSITIONS: Final = "Xposition Yposition Zposition"
 
 
-def write_bvh(path: Path, motion: HandsInMotion) -> None:
-    """Write hands and things at a steady rate.
+def write_bvh(path: Path, motion: Motion, up: UpAxis = "z") -> None:
+    """Write hands and things.
 
     Args:
         path: A .bvh file.
-        motion: What to write.
+        motion: What to write, at a steady rate.
+        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.
     """
-    steady = motion.steady()
-    turn = steady.R_file_world
-    columns = [np.zeros((steady.num_frames, 6))]
+    turn = file_axes(up)
+    columns = [np.zeros((len(motion.times), 6))]
     lines = [f"ROOT {ROOT}", "{", *_indented(_joint(np.zeros(3), moves=True))]
-    for hand in steady.hands:
+    for hand in posed_hands(motion):
         lines += _indented(_bone_lines(hand.model, hand.side, PALM, _CENTIMETERS * turn))
         columns.append(_hand_columns(hand, turn))
-    for thing in steady.things:
+    for thing in posed_bodies(motion):
         content = [*_joint(np.zeros(3), moves=True), *_end(np.eye(3)[0])]
         lines += _indented([f"JOINT {_word(thing.name)}", "{", *_indented(content), "}"])
-        poses = thing.held_poses
+        poses = thing.T_world_body
         angles = _degrees(turn @ poses[:, :3, :3] @ turn.T)
         columns.append(np.concatenate([_CENTIMETERS * poses[:, :3, 3] @ turn.T, angles], axis=1))
     with atomic_write(path) as temporary, temporary.open("w", encoding="ascii", newline="\n") as file:
         file.write("HIERARCHY\n" + "\n".join([*lines, "}"]) + "\n")
-        _write_motion(file, np.concatenate(columns, axis=1), steady.rate)
+        _write_motion(file, np.concatenate(columns, axis=1), motion.rate)
 
 
 def _write_motion(file: TextIO, table: Float[np.ndarray, "T K"], rate: float) -> None:
@@ -62,9 +62,9 @@ def _write_motion(file: TextIO, table: Float[np.ndarray, "T K"], rate: float) ->
     np.savetxt(file, table, fmt="%.6f")
 
 
-def _hand_columns(hand: MovingHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "T 51"]:
+def _hand_columns(hand: PosedHand, turn: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "T 51"]:
     """Position of the palm [cm] and rotations of all bones [deg] from the flat hand, in the file's order."""
-    qpos = hand.held_qpos
+    qpos = hand.qpos
     rest = hand.model.rest_transforms[:, :3, :3]
     # In BVH all joints have the same axes at rest, here the file's.
     rotations = turn @ hand.model.forward_kinematics(qpos)[..., :3, :3] @ np.swapaxes(rest, -1, -2) @ turn.T

@@ -19,9 +19,19 @@ from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONE_NAMES, NUM_BONES, PALM
 from handsim.motion_files.glb_buffer import GlbBuffer
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand, MovingThing, changes
 from handsim.motion_files.local_poses import CHILDREN, local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals, split_vertices
+from handsim.motion_files.motion import (
+    Motion,
+    PosedBody,
+    PosedHand,
+    UpAxis,
+    changes,
+    file_axes,
+    posed_bodies,
+    posed_hands,
+    seconds_of,
+)
 
 _SKIN, _THING = 0, 1  # materials
 _MATERIALS: Final = [
@@ -41,18 +51,19 @@ _MATERIALS: Final = [
 ]
 
 
-def write_glb(path: Path, motion: HandsInMotion) -> None:
+def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things; a motion of one frame is written as a pose, without an animation.
 
     Args:
         path: A .glb file.
         motion: What to write.
+        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.
         ArgumentError: The file would be larger than a .glb can be.
     """
-    content = _Scene(motion).pack()
+    content = _Scene(motion, up).pack()
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
 
@@ -60,22 +71,22 @@ def write_glb(path: Path, motion: HandsInMotion) -> None:
 class _Scene:
     """The document while it grows."""
 
-    def __init__(self, motion: HandsInMotion) -> None:
-        self._motion = motion
+    def __init__(self, motion: Motion, up: UpAxis) -> None:
+        self._times = seconds_of(motion)
         self._buffer = GlbBuffer()
         self._meshes: list[dict[str, Any]] = []
         self._skins: list[dict[str, Any]] = []
         self._channels: list[dict[str, Any]] = []
         self._samplers: list[dict[str, Any]] = []
-        self._turn = motion.R_file_world
+        self._turn = file_axes(up)
         self._nodes: list[dict[str, Any]] = []
         self._top: list[int] = []
         self._seconds = (
-            self._buffer.add(motion.seconds.astype("<f4"), bounds=True) if motion.num_frames > 1 else None
+            self._buffer.add(self._times.astype("<f4"), bounds=True) if len(self._times) > 1 else None
         )
-        for hand in motion.hands:
+        for hand in posed_hands(motion):
             self._add_hand(hand)
-        for thing in motion.things:
+        for thing in posed_bodies(motion):
             self._add_thing(thing)
 
     def pack(self) -> bytes:
@@ -95,8 +106,8 @@ class _Scene:
             ]
         return self._buffer.pack(document)
 
-    def _add_hand(self, hand: MovingHand) -> None:
-        qpos = hand.held_qpos
+    def _add_hand(self, hand: PosedHand) -> None:
+        qpos = hand.qpos
         positions, rotations = qpos[:, :3] @ self._turn.T, hand.model.forward_kinematics(qpos)[..., :3, :3]
         quaternions = smooth_quaternions(local_rotations(self._turn @ rotations))
         first = len(self._nodes)
@@ -143,8 +154,8 @@ class _Scene:
         }
         return {"name": name, "primitives": [self._primitive(attributes, surface.faces, _SKIN)]}
 
-    def _add_thing(self, thing: MovingThing) -> None:
-        poses = thing.held_poses
+    def _add_thing(self, thing: PosedBody) -> None:
+        poses = thing.T_world_body
         positions = poses[:, :3, 3] @ self._turn.T
         quaternions = _xyzw(smooth_quaternions(self._turn @ poses[:, :3, :3]))
         number = len(self._nodes)
@@ -185,7 +196,7 @@ class _Scene:
         if present.all() or self._seconds is None:
             return
         frames = changes(present)
-        seconds = self._motion.seconds
+        seconds = self._times
         # Halfway: a reader that asks for a frame's time must not meet the other side of a rounded key.
         halfway = 0.5 * (seconds[frames] + seconds[np.maximum(frames - 1, 0)])
         times = self._buffer.add(halfway.astype("<f4"), bounds=True)

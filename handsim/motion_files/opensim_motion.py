@@ -15,23 +15,25 @@ from numpy.typing import NDArray
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.topology import JOINT_NAMES
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
+from handsim.motion_files.motion import Motion, PosedHand, UpAxis, posed_hands, seconds_of
 from handsim.space.transforms import euler_angles, quaternion_matrix
 
 
-def write_mot(path: Path, motion: HandsInMotion) -> None:
+def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the angles of all hands.
 
     Args:
         path: A .mot file.
         motion: What to write.
+        up: Of no effect: the axes are the take's.
 
     Raises:
         OSError: The file cannot be written.
     """
-    table = np.concatenate([motion.seconds[:, None], *(_coordinates(hand) for hand in motion.hands)], axis=1)
+    hands = tuple(posed_hands(motion))
+    table = np.concatenate([seconds_of(motion)[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
     wrist = [f"wrist_{kind}{axis}" for kind in "tr" for axis in "xyz"]
-    names = ["time", *(f"{hand.side}_{name}" for hand in motion.hands for name in (*wrist, *JOINT_NAMES))]
+    names = ["time", *(f"{hand.side}_{name}" for hand in hands for name in (*wrist, *JOINT_NAMES))]
     header = [
         path.stem,
         "version=1",
@@ -46,9 +48,9 @@ def write_mot(path: Path, motion: HandsInMotion) -> None:
         np.savetxt(file, table, fmt="%.9f", delimiter="\t")
 
 
-def _coordinates(hand: MovingHand) -> Float[np.ndarray, "T 26"]:
+def _coordinates(hand: PosedHand) -> Float[np.ndarray, "T 26"]:
     """Position of the wrist [m], its rotations and the joint angles [deg]; NaN without a pose."""
-    qpos = hand.held_qpos
+    qpos = hand.qpos
     # Rx Ry Rz is the inverse of Rz Ry Rx with the opposite angles.
     inverse = np.swapaxes(quaternion_matrix(qpos[:, 3:7]), -1, -2)
     turns = np.unwrap(-euler_angles(inverse)[:, ::-1], axis=0)

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import DIGITS, PALM, bones_of
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
 from handsim.motion_files.local_poses import smooth_quaternions
+from handsim.motion_files.motion import Motion, PosedHand, UpAxis, file_axes, posed_hands
 
 JOINTS: Final[tuple[str, ...]] = (
     "PALM",
@@ -45,16 +45,18 @@ _AXES: Final = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """OpenXR's axes as columns in a frame with x along the bone and z out of the back."""
 
 
-def write_openxr(path: Path, motion: HandsInMotion) -> None:
+def write_openxr(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write the joints of all hands.
 
     Args:
         path: A .json file, by custom `.openxr.json`.
         motion: What to write.
+        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.
     """
+    tracks = tuple(posed_hands(motion))
     header = {
         "format": "XR_EXT_hand_tracking joints by handsim",
         "schema": 1,
@@ -63,15 +65,15 @@ def write_openxr(path: Path, motion: HandsInMotion) -> None:
         "pose": ["x", "y", "z", "qx", "qy", "qz", "qw"],
         "rate": motion.rate,
         "joints": JOINTS,
-        "radius": {hand.side: np.round(joint_radii(hand.model), 7).tolist() for hand in motion.hands},
+        "radius": {hand.side: np.round(joint_radii(hand.model), 7).tolist() for hand in tracks},
     }
-    poses = [_pose_rows(hand, motion.R_file_world) for hand in motion.hands]
+    poses = [_pose_rows(hand, file_axes(up)) for hand in tracks]
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
         file.write(json.dumps(header, indent=1)[:-2] + ',\n "frames": [')
         for frame, time in enumerate(motion.times.tolist()):
             hands = {
                 hand.side: rows[frame].tolist() if hand.present[frame] else None
-                for hand, rows in zip(motion.hands, poses, strict=True)
+                for hand, rows in zip(tracks, poses, strict=True)
             }
             file.write((",\n" if frame else "\n") + json.dumps({"time": time, "hands": hands}))
         file.write("\n ]\n}\n")
@@ -131,9 +133,9 @@ def _palm_joints(model: HandModel) -> Float[np.ndarray, "6 4 4"]:
     return joints
 
 
-def _pose_rows(hand: MovingHand, turn: NDArray[np.float64]) -> Float[np.ndarray, "T 26 7"]:
+def _pose_rows(hand: PosedHand, turn: NDArray[np.float64]) -> Float[np.ndarray, "T 26 7"]:
     """Positions and quaternions (xyzw) in the file's axes."""
-    poses = joint_poses(hand.model, hand.held_qpos)
+    poses = joint_poses(hand.model, hand.qpos)
     quaternions = smooth_quaternions(turn @ poses[..., :3, :3])
     rows = np.concatenate([poses[..., :3, 3] @ turn.T, np.roll(quaternions, -1, axis=-1)], axis=-1)
     return np.round(rows, 8)

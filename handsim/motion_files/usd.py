@@ -19,21 +19,31 @@ from handsim.files.atomic import atomic_write
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import BONES, NUM_BONES, PALM
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand, MovingThing, changes
 from handsim.motion_files.local_poses import local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals
+from handsim.motion_files.motion import (
+    Motion,
+    PosedBody,
+    PosedHand,
+    UpAxis,
+    changes,
+    posed_bodies,
+    posed_hands,
+    seconds_of,
+)
 
 _SKIN_COLOR: Final = (0.66, 0.38, 0.28)
 _THING_COLOR: Final = (0.16, 0.2, 0.26)
 _AROUND: Final = 0.03  # [m] of skin around keypoints
 
 
-def write_usd(path: Path, motion: HandsInMotion) -> None:
+def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """Write hands and things.
 
     Args:
         path: A .usda or .usdc file.
         motion: What to write.
+        up: The axis of its world that points up.
 
     Raises:
         OSError: The file cannot be written.
@@ -44,17 +54,17 @@ def write_usd(path: Path, motion: HandsInMotion) -> None:
     except ImportError as error:
         raise HandSimError(f"{path.suffix} needs usd-core; run `pip install 'handsim[usd]'`") from error
     stage = Usd.Stage.CreateInMemory()
-    UsdGeom.SetStageUpAxis(stage, motion.up.upper())
+    UsdGeom.SetStageUpAxis(stage, up.upper())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    codes = np.round(motion.seconds * motion.rate, 6)  # whole ones at a steady rate
+    codes = np.round(seconds_of(motion) * motion.rate, 6)  # whole ones at a steady rate
     stage.SetTimeCodesPerSecond(motion.rate)
     stage.SetFramesPerSecond(motion.rate)
     stage.SetStartTimeCode(0.0)
     stage.SetEndTimeCode(float(codes[-1]))
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/hands").GetPrim())
-    for hand in motion.hands:
+    for hand in posed_hands(motion):
         _add_hand(stage, hand, codes)
-    for number, thing in enumerate(motion.things):
+    for number, thing in enumerate(posed_bodies(motion)):
         _add_thing(stage, thing, number, codes)
     with atomic_write(path) as temporary:
         if not stage.GetRootLayer().Export(str(temporary)):
@@ -69,7 +79,7 @@ def joint_paths() -> list[str]:
     return paths
 
 
-def _add_hand(stage: Any, hand: MovingHand, codes: NDArray[np.float64]) -> None:
+def _add_hand(stage: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
     from pxr import Gf, UsdSkel, Vt
 
     path = f"/hands/{hand.side}"
@@ -90,14 +100,14 @@ def _add_hand(stage: Any, hand: MovingHand, codes: NDArray[np.float64]) -> None:
     _add_skin(stage, hand, f"{path}/skin", skeleton)
     _add_motion(motion, hand, codes)
     _set_visibility(root, hand.present, codes)
-    keypoints = hand_keypoints(hand.model, hand.held_qpos)
+    keypoints = hand_keypoints(hand.model, hand.qpos)
     extent = root.CreateExtentAttr()
     corners = np.stack([keypoints.min(axis=1) - _AROUND, keypoints.max(axis=1) + _AROUND], axis=1)
     for code, box in zip(codes.tolist(), corners.astype(np.float32), strict=True):
         extent.Set(Vt.Vec3fArray.FromNumpy(box), code)
 
 
-def _add_skin(stage: Any, hand: MovingHand, path: str, skeleton: Any) -> None:
+def _add_skin(stage: Any, hand: PosedHand, path: str, skeleton: Any) -> None:
     """The mesh at rest, bound to the skeleton."""
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
@@ -115,11 +125,11 @@ def _add_skin(stage: Any, hand: MovingHand, path: str, skeleton: Any) -> None:
     binding.CreateJointWeightsPrimvar(False, 4).Set(Vt.FloatArray.FromNumpy(weights))
 
 
-def _add_motion(motion: Any, hand: MovingHand, codes: NDArray[np.float64]) -> None:
+def _add_motion(motion: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
     """Translations, rotations and scales of all bones in every frame."""
     from pxr import Vt
 
-    qpos = hand.held_qpos
+    qpos = hand.qpos
     rotations = smooth_quaternions(local_rotations(hand.model.forward_kinematics(qpos)[..., :3, :3]))
     translations = np.tile(hand.model.skeleton.offsets, (len(qpos), 1, 1))
     translations[:, PALM] = qpos[:, :3]
@@ -135,7 +145,7 @@ def _add_motion(motion: Any, hand: MovingHand, codes: NDArray[np.float64]) -> No
         turns.Set(Vt.QuatfArray.FromNumpy(turn), code)
 
 
-def _add_thing(stage: Any, thing: MovingThing, number: int, codes: NDArray[np.float64]) -> None:
+def _add_thing(stage: Any, thing: PosedBody, number: int, codes: NDArray[np.float64]) -> None:
     from pxr import Gf, Tf, UsdGeom, Vt
 
     path = f"/hands/things/{Tf.MakeValidIdentifier(thing.name)}"
@@ -143,7 +153,7 @@ def _add_thing(stage: Any, thing: MovingThing, number: int, codes: NDArray[np.fl
         path = f"{path}_{number}"
     UsdGeom.Xform.Define(stage, "/hands/things")
     body = UsdGeom.Xform.Define(stage, path)
-    poses = thing.held_poses
+    poses = thing.T_world_body
     move, turn = body.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), body.AddOrientOp()
     for code, place, quaternion in zip(
         codes.tolist(), poses[:, :3, 3].tolist(), smooth_quaternions(poses[:, :3, :3]).tolist(), strict=True

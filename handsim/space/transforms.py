@@ -52,6 +52,11 @@ def pose_matrices(poses: Float[np.ndarray, "T 7"]) -> NDArray[np.float64]:
     return transforms
 
 
+def transform_poses(transforms: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float64]:
+    """Positions and wxyz quaternions (T, 7) of transforms."""
+    return np.concatenate([transforms[:, :3, 3], rotation_quaternions(transforms[:, :3, :3])], axis=1)
+
+
 def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation vectors [rad]."""
     quaternions: NDArray[np.float64] = Rotation.from_rotvec(vectors).as_quat(scalar_first=True)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from gloves.takes.tracked_take import TrackedTake
+from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimWarning, RigError, choices
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera, preset
@@ -98,7 +98,7 @@ class Viewpoints:
         rng: Source of all random choices.
     """
 
-    def __init__(self, config: ViewConfig, take: TrackedTake, *, rng: np.random.Generator) -> None:
+    def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
         if config.cameras is not None:
             own = config.cameras
             self._cameras = load_cameras(own) if isinstance(own, str) else own
@@ -123,7 +123,7 @@ class Viewpoints:
         return [camera.at(path[frame]) for camera, path in zip(self._cameras, self._poses, strict=True)]
 
 
-def hand_centers(take: TrackedTake) -> Float[np.ndarray, "T 3"]:
+def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
     """Center of the hands of each frame [m]; interpolated linearly over frames without hands."""
     middles = take.qpos[..., :3] + _HAND_CENTER * _along(take)
     there = np.isfinite(middles[..., :1])
@@ -134,12 +134,12 @@ def hand_centers(take: TrackedTake) -> Float[np.ndarray, "T 3"]:
     return np.stack([np.interp(frames, known, centers[known, axis]) for axis in range(3)], axis=1)
 
 
-def _along(take: TrackedTake) -> NDArray[np.float64]:
+def _along(take: Take) -> NDArray[np.float64]:
     """Direction (T, H, 3) from each wrist to its fingers; NaN where there is no hand."""
     return quaternion_matrix(take.qpos[..., 3:7])[..., 0]
 
 
-def _towards_user(take: TrackedTake) -> NDArray[np.float64]:
+def _towards_user(take: Take) -> NDArray[np.float64]:
     """Level unit direction (3,) from the hands to the user's body: where the forearms point."""
     level = np.append(np.nanmean(-_along(take)[..., :2].reshape(-1, 2), axis=0), 0.0)
     length = float(np.linalg.norm(level))
@@ -152,12 +152,12 @@ def _spherical(azimuth: float, elevation: float) -> NDArray[np.float64]:
     )
 
 
-def _middle(take: TrackedTake) -> NDArray[np.float64]:
+def _middle(take: Take) -> NDArray[np.float64]:
     middle: NDArray[np.float64] = np.median(hand_centers(take), axis=0)
     return middle
 
 
-def _still(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _still(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """In front of the user; several cameras form a fan."""
     middle, user = _middle(take), _towards_user(take)
     front = np.arctan2(-user[1], -user[0])
@@ -170,7 +170,7 @@ def _still(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> l
     return paths
 
 
-def _orbit(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _orbit(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     middle, paths = _middle(take), []
     for number in range(config.views):
         start = rng.uniform(-np.pi, np.pi) + 2.0 * np.pi * number / config.views
@@ -181,7 +181,7 @@ def _orbit(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> l
     return paths
 
 
-def _head(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _head(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """At the eyes, following the hands with a delay; several cameras are side by side, as two eyes are."""
     centers = uniform_filter1d(
         hand_centers(take), max(1, round(_HEAD_DELAY * take.rate)), axis=0, mode="nearest"
@@ -198,7 +198,7 @@ def _head(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> li
     return paths
 
 
-def _past_forearms(take: TrackedTake, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+def _past_forearms(take: Take, offset: NDArray[np.float64]) -> NDArray[np.float64]:
     """The offset (3,) [m] from the hands, rotated until no forearm usually lies in the line of sight."""
     length = float(np.linalg.norm(offset))
     direction = offset / length
@@ -215,7 +215,7 @@ def _past_forearms(take: TrackedTake, offset: NDArray[np.float64]) -> NDArray[np
     return length * direction
 
 
-def _anywhere(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _anywhere(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     centers, paths = hand_centers(take), []
     for _ in range(config.views):
         positions = np.empty_like(centers)
@@ -233,7 +233,7 @@ def _anywhere(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -
     return paths
 
 
-def _behind_arms(take: TrackedTake, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _behind_arms(take: Take, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether each frame's position (T, 3) [m] is behind a forearm, from where little but the arm is seen."""
     away = positions[:, None] - take.qpos[..., :3]
     cosines = -(away * _along(take)).sum(axis=-1) / np.linalg.norm(away, axis=-1)
@@ -241,11 +241,11 @@ def _behind_arms(take: TrackedTake, positions: NDArray[np.float64]) -> NDArray[n
     return behind  # NaN, where there is no hand, never is
 
 
-def _rig(config: ViewConfig, take: TrackedTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _rig(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     return _kept(load_rig(config.rig).T_world_camera, take)
 
 
-def _kept(poses: Iterable[NDArray[np.float64]], take: TrackedTake) -> list[NDArray[np.float64]]:
+def _kept(poses: Iterable[NDArray[np.float64]], take: Take) -> list[NDArray[np.float64]]:
     """Paths of cameras that stay at their poses (4, 4)."""
     return [np.broadcast_to(pose, (take.num_frames, 4, 4)) for pose in poses]
 
@@ -253,7 +253,7 @@ def _kept(poses: Iterable[NDArray[np.float64]], take: TrackedTake) -> list[NDArr
 _PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "anywhere": _anywhere, "rig": _rig}
 
 
-def check_hands_in_view(name: str, cameras: Sequence[Camera], take: TrackedTake) -> None:
+def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> None:
     """Refuse cameras that never have a hand in their pictures, and tell of those among them.
 
     Args:

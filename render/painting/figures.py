@@ -13,10 +13,9 @@ from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
-from gloves.takes.tracked_take import MarkedBody
+from gloves.takes.take import RigidBody
 from handsim.hand.keypoints import keypoint_flesh
 from handsim.hand.skin.surface import vertex_normals
-from handsim.space.objects import named_object, object_names
 from render.frames import PARTS_A_HAND
 from render.painting.materials import (
     MARKER_COLOR,
@@ -174,12 +173,12 @@ class BodyFigure:
     """One rigid body to draw.
 
     Args:
-        body: The body; its shape is known where its name is an object's that comes with the package.
+        body: The body.
         color: Color of its surface, sRGB in [0, 1].
     """
 
-    def __init__(self, body: MarkedBody, color: tuple[float, float, float]) -> None:
-        self._thing = named_object(body.name) if body.name in object_names() else None
+    def __init__(self, body: RigidBody, color: tuple[float, float, float]) -> None:
+        self._thing = body.shape
         self._markers = body.positions if self._thing is None else self._thing.markers
         self._material = functools.cache(functools.partial(plain_material, color))
         if self._thing is not None:

@@ -13,11 +13,10 @@ import trimesh
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
-from gloves.fit import GlovedHand, GloveFit, attach
+from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout, save_layout, starter_layout
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import STATUSES, MarkedBody, TrackedTake
+from gloves.takes.take import STATUSES, RigidBody, Take
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
@@ -178,16 +177,12 @@ def hands() -> tuple[GloveFit, ...]:
 
 
 def truth(folder: Path) -> list[Path]:
-    qpos = np.zeros((FRAMES, 27))
-    qpos[:, 3] = 1.0
-    take = Take(
-        rate=120.0,
-        points=_rng().uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3)),
-        ids=np.tile(np.arange(COLUMNS), (FRAMES, 1)),
-        labels=np.tile(np.arange(COLUMNS), (FRAMES, 1)),
-        hands=tuple(GlovedHand(hand, qpos) for hand in hands()),
-        body=None,
-        settings={"kind": "single-hand"},
+    qpos = np.zeros((FRAMES, 2, 27))
+    qpos[..., 3] = 1.0
+    columns = np.tile(np.arange(COLUMNS), (FRAMES, 1))
+    points = _rng().uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3))
+    take = Take.of_truth(
+        hands(), qpos, points, columns, columns, rate=120.0, settings={"kind": "single-hand"}
     )
     take.save(folder / "take.truth.npz")
     return [folder / "take.truth.npz"]
@@ -197,20 +192,18 @@ def tracked(folder: Path) -> list[Path]:
     rng, worn = _rng(), hands()
     qpos = np.zeros((FRAMES, 2, 27))
     qpos[..., 3] = 1.0
-    take = TrackedTake(
+    take = Take(
         rate=120.0,
         times=np.arange(FRAMES) / 120.0,
         hands=worn,
         qpos=qpos,
         status=np.full((FRAMES, 2), STATUSES.index("tracked"), dtype=np.int8),
         rms=np.full((FRAMES, 2), 1e-3),
-        markers=rng.uniform(0.0, 0.2, size=(FRAMES, 2, worn[0].layout.num_markers, 3)),
-        filled=np.zeros((FRAMES, 2, worn[0].layout.num_markers), dtype=bool),
         points=rng.uniform(0.0, 0.2, size=(FRAMES, COLUMNS, 3)),
         ids=np.tile(np.arange(COLUMNS, dtype=np.int32), (FRAMES, 1)),
         labels=np.tile(np.arange(COLUMNS, dtype=np.int16), (FRAMES, 1)),
         confidence=np.ones((FRAMES, COLUMNS)),
-        bodies=(MarkedBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3)),),
+        bodies=(RigidBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3)),),
         body_poses=np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (FRAMES, 1, 1)),
         body_status=np.full((FRAMES, 1), STATUSES.index("tracked"), dtype=np.int8),
         body_rms=np.full((FRAMES, 1), 1e-3),

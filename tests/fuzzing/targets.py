@@ -17,7 +17,6 @@ from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
 from gloves.takes.corrections import load_corrections
 from gloves.takes.take import load_take
-from gloves.takes.tracked_take import load_tracked_take
 from handsim.app.executors.output import load_receipt
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
@@ -135,7 +134,7 @@ _ALL: Final = (
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
     Target("truth", seeds.truth, load_take, mutate_archive),
-    Target("tracked", seeds.tracked, load_tracked_take, mutate_archive),
+    Target("tracked", seeds.tracked, load_take, mutate_archive),
     Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
     Target("benchmark", seeds.benchmark, lambda path: load_benchmark(path.parent)),

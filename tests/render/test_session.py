@@ -110,9 +110,9 @@ def test_the_default_sensor_measures_hands_from_the_users_eyes(path):
 def reaching_the_eyes(path, folder, config):
     """A copy of the take whose left hand is at the camera in frames 24 and 25."""
     take = load_take(path)
-    middle = take.hands[1].fit.model.skin(take.hands[1].qpos[24:25])[0].mean(axis=0)
+    middle = take.hands[1].model.skin(take.qpos[24:25, 1])[0].mean(axis=0)
     eye = Drawing(subject_of_take(take), config).viewpoints.cameras(24)[0].T_world_camera[:3, 3]
-    take.hands[1].qpos[24:26, :3] += eye - middle
+    take.qpos[24:26, 1, :3] += eye - middle
     take.save(folder / "reaching.truth.npz")
     return folder / "reaching.truth.npz"
 
@@ -142,10 +142,9 @@ def test_a_rendering_without_any_frame_is_told(path, tmp_path):
     config = dataclasses.replace(PLAIN, view=ViewConfig("head"), every=1)
     take = load_take(reaching_the_eyes(path, tmp_path, config))
     eye = Drawing(subject_of_take(take), config).viewpoints.cameras(24)[0]
-    qpos = np.stack([hand.qpos[24:26] for hand in take.hands], axis=1)
-    models = tuple(hand.fit.model for hand in take.hands)
+    models = tuple(hand.model for hand in take.hands)
     with pytest.raises(HandSimError, match="no pictures: in all 2 frames a camera would be inside a hand"):
-        render_take(qpos, tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
+        render_take(take.qpos[24:26], tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
 
 
 def test_depth_sensors_see_hands_of_all_tones_alike(path):
@@ -236,7 +235,7 @@ def test_what_cannot_be_drawn_is_said_in_a_sentence(path, tmp_path):
 
 
 def test_a_camera_inside_a_hand_is_refused(path):
-    hand, pose = load_take(path).hands[0], np.eye(4)
-    pose[:3, 3] = hand.fit.model.skin(hand.qpos[:1])[0, 100] + 0.002
+    take, pose = load_take(path), np.eye(4)
+    pose[:3, 3] = take.hands[0].model.skin(take.qpos[:1, 0])[0, 100] + 0.002
     with pytest.raises(HandSimError, match="mm from a hand or object in frame 0"):
         list(draw(path, config=PLAIN, frames=[0], camera=preset("vga").at(pose)))

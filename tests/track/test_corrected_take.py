@@ -10,11 +10,11 @@ import pytest
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.corrections import NO_MARKER, Correction
-from gloves.takes.tracked_take import LOST, TRACKED, TrackedTake
+from gloves.takes.take import LOST, TRACKED, Take
 from handsim.errors import CaptureError
 from handsim.hand.model import join_qpos
 from poses.shapes.sampling import sample_poses
-from track.corrected_take import correct_take, learned_bias
+from track.corrected_take import correct_take
 from track.kinematics.pose_solver import solve_pose
 
 FRAMES, COUNT = 50, 19
@@ -23,7 +23,7 @@ SPAN = slice(20, 31)
 
 
 @pytest.fixture(scope="module")
-def right() -> TrackedTake:
+def right() -> Take:
     """Two hands that are tracked without a mistake, between two poses; the last column is a stray."""
     rng = np.random.default_rng(11)
     layout = load_layout("dense19")
@@ -39,15 +39,13 @@ def right() -> TrackedTake:
     markers = np.stack([hand.markers(qpos[:, number])[0] for number, hand in enumerate(hands)], axis=1)
     points = np.concatenate([markers.reshape(FRAMES, -1, 3), np.full((FRAMES, 1, 3), 0.9)], axis=1)
     columns = np.arange(2 * COUNT + 1)
-    return TrackedTake(
+    return Take(
         rate=120.0,
         times=np.arange(FRAMES) / 120.0,
         hands=hands,
         qpos=qpos,
         status=np.full((FRAMES, 2), TRACKED, dtype=np.int8),
         rms=np.full((FRAMES, 2), 1e-4),
-        markers=markers,
-        filled=np.zeros((FRAMES, 2, COUNT), dtype=bool),
         points=points,
         ids=np.tile(100 + columns, (FRAMES, 1)).astype(np.int32),
         labels=np.tile(np.where(columns < 2 * COUNT, columns, -1), (FRAMES, 1)).astype(np.int16),
@@ -61,15 +59,15 @@ def right() -> TrackedTake:
 
 
 @pytest.fixture(scope="module")
-def wrong(right) -> TrackedTake:
+def wrong(right) -> Take:
     """The same with two labels of the right hand exchanged in eleven frames, and a pose bent by that."""
-    labels, markers, qpos = right.labels.copy(), right.markers.copy(), right.qpos.copy()
+    labels, qpos = right.labels.copy(), right.qpos.copy()
     labels[SPAN, SWAPPED] = labels[SPAN, SWAPPED[::-1]]
-    markers[SPAN, 0, SWAPPED] = markers[SPAN, 0, SWAPPED[::-1]]
-    fit = solve_pose(right.hands[0], markers[SPAN, 0], initial=qpos[SPAN, 0])
+    markers = dataclasses.replace(right, labels=labels).observed("right")
+    fit = solve_pose(right.hands[0], markers[SPAN], initial=qpos[SPAN, 0])
     qpos[SPAN, 0], rms = fit.qpos, right.rms.copy()
     rms[SPAN, 0] = fit.rms
-    return dataclasses.replace(right, labels=labels, markers=markers, qpos=qpos, rms=rms)
+    return dataclasses.replace(right, labels=labels, qpos=qpos, rms=rms)
 
 
 def correction(take, column, label, first=20, last=30) -> Correction:
@@ -92,7 +90,7 @@ def test_corrected_labels_bring_the_pose_back(right, wrong):
     np.testing.assert_array_equal(result.take.labels, right.labels)
     assert keypoint_error(result.take, right) < 0.0005
     assert result.take.rms[SPAN, 0].max() < 0.0005 < wrong.rms[SPAN, 0].min()
-    np.testing.assert_allclose(result.take.markers, right.markers)
+    np.testing.assert_allclose(result.take.markers("right"), right.markers("right"))
     assert (result.take.confidence[SPAN, SWAPPED] == 1.0).all()
     outside = np.delete(np.arange(FRAMES), np.arange(20, 31))
     np.testing.assert_array_equal(result.take.qpos[outside], wrong.qpos[outside])
@@ -100,12 +98,12 @@ def test_corrected_labels_bring_the_pose_back(right, wrong):
 
 
 def test_the_file_says_what_was_corrected_and_again_is_the_same(wrong, tmp_path):
-    from gloves.takes.tracked_take import load_tracked_take
+    from gloves.takes.take import load_take
 
     one = [correction(wrong, 3, NO_MARKER)]
     once = correct_take(wrong, one).take
     once.save(tmp_path / "a.npz")
-    again = load_tracked_take(tmp_path / "a.npz")
+    again = load_take(tmp_path / "a.npz")
     assert again.settings == {"user": "L", "corrections": [one[0].record()]}
     twice = correct_take(again, one).take
     np.testing.assert_array_equal(twice.labels, again.labels)
@@ -114,23 +112,23 @@ def test_the_file_says_what_was_corrected_and_again_is_the_same(wrong, tmp_path)
 
 def test_a_marker_that_is_taken_away_is_filled_in_from_the_pose(right):
     result = correct_take(right, [correction(right, 5, NO_MARKER)]).take
-    assert (result.labels[SPAN, 5] == -1).all() and result.filled[SPAN, 0, 5].all()
-    away = np.linalg.norm(result.markers[SPAN, 0, 5] - right.markers[SPAN, 0, 5], axis=1)
+    assert (result.labels[SPAN, 5] == -1).all() and result.filled("right")[SPAN, 5].all()
+    away = np.linalg.norm((result.markers("right") - right.markers("right"))[SPAN, 5], axis=1)
     assert 0.0 < away.max() < 0.01
 
 
 def test_a_label_goes_from_one_hand_to_the_other(right):
     result = correct_take(right, [correction(right, 5, right.label_names[COUNT + 5])]).take
     assert (result.labels[SPAN, 5] == COUNT + 5).all() and (result.labels[SPAN, COUNT + 5] == -1).all()
-    assert result.filled[SPAN, 0, 5].all() and not result.filled[SPAN, 1, 5].any()
+    assert result.filled("right")[SPAN, 5].all() and not result.filled("left")[SPAN, 5].any()
 
 
 def test_lost_hands_and_hands_with_few_markers_keep_what_they_have(right):
-    status, qpos, markers = right.status.copy(), right.qpos.copy(), right.markers.copy()
-    status[25, 0], qpos[25, 0], markers[25, 0] = LOST, np.nan, np.nan
+    status, qpos = right.status.copy(), right.qpos.copy()
+    status[25, 0], qpos[25, 0] = LOST, np.nan
     rms = right.rms.copy()
     rms[25, 0] = np.nan
-    lost = dataclasses.replace(right, status=status, qpos=qpos, markers=markers, rms=rms)
+    lost = dataclasses.replace(right, status=status, qpos=qpos, rms=rms)
     result = correct_take(lost, [correction(lost, 5, NO_MARKER)]).take
     assert np.isnan(result.qpos[25, 0]).all() and (result.labels[25, 5] == -1)
     labels = right.labels.copy()
@@ -138,7 +136,7 @@ def test_lost_hands_and_hands_with_few_markers_keep_what_they_have(right):
     few = dataclasses.replace(right, labels=labels)
     result = correct_take(few, [correction(few, 0, NO_MARKER)]).take
     np.testing.assert_array_equal(result.qpos[22, 0], few.qpos[22, 0])
-    assert result.filled[22, 0].sum() == 16 and np.isnan(result.rms[22, 0])
+    assert result.filled("right")[22].sum() == 16 and np.isnan(result.rms[22, 0])
 
 
 def test_the_bias_of_a_glove_is_learned_from_the_take(right):
@@ -147,14 +145,13 @@ def test_the_bias_of_a_glove_is_learned_from_the_take(right):
     rng = np.random.default_rng(3)
     bias = rng.normal(scale=0.003, size=(COUNT, 3))
     turns = worn.model.forward_kinematics(qpos)[:, worn.attachment.main_bones, :3, :3]
-    points, markers = right.points.copy(), right.markers.copy()
+    points = right.points.copy()
     points[:, :COUNT] -= np.einsum("tmij,mj->tmi", turns, bias)
-    markers[:, 0] = points[:, :COUNT]
-    take = dataclasses.replace(right, points=points, markers=markers)
-    np.testing.assert_allclose(learned_bias(take, 0), bias, atol=1e-9)
+    take = dataclasses.replace(right, points=points)
+    np.testing.assert_allclose(take.marker_bias("right"), bias, atol=1e-9)
     result = correct_take(take, [correction(take, 5, NO_MARKER)]).take
     assert keypoint_error(result, right) < 0.004
-    plain = solve_pose(worn, markers[SPAN, 0], initial=qpos[SPAN])
+    plain = solve_pose(worn, points[SPAN, :COUNT], initial=qpos[SPAN])
     assert (
         np.abs(plain.qpos[:, 7:] - qpos[SPAN, 7:]).max()
         > np.abs(result.qpos[SPAN, 0, 7:] - qpos[SPAN, 7:]).max()

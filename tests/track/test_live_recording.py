@@ -11,8 +11,8 @@ import pytest
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.archives import CutOffWarning, archive_kind
-from gloves.takes.tracked_take import KIND, TrackedTake, load_tracked_take
+from gloves.takes.archives import CutOffWarning
+from gloves.takes.take import Take, load_take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
 from render.subject import load_subject
@@ -46,7 +46,7 @@ def recorded(folder, *, frames: int = FRAMES) -> LiveRecorder:
     return recorder
 
 
-def in_memory() -> TrackedTake:
+def in_memory() -> Take:
     tracker, pairs = tracked()
     recorder = TakeRecorder(tracker)
     for frame, one in pairs:
@@ -54,8 +54,8 @@ def in_memory() -> TrackedTake:
     return recorder.take()
 
 
-def assert_equal(one: TrackedTake, other: TrackedTake) -> None:
-    for field in dataclasses.fields(TrackedTake):
+def assert_equal(one: Take, other: Take) -> None:
+    for field in dataclasses.fields(Take):
         ours, theirs = getattr(one, field.name), getattr(other, field.name)
         if isinstance(ours, np.ndarray):
             assert ours.dtype == theirs.dtype
@@ -69,7 +69,7 @@ def test_the_take_on_disk_is_that_in_memory(tmp_path):
     summarized, step = recorder.finish(COUNTS)
     out = tmp_path / "new" / "take.npz"
     assert os.listdir(out.parent) == ["take.npz"], "the recording became the take"
-    take = load_tracked_take(out)
+    take = load_take(out)
     assert step == 1
     for one in (take, summarized):
         assert_equal(one, in_memory())
@@ -77,7 +77,7 @@ def test_the_take_on_disk_is_that_in_memory(tmp_path):
         assert one.settings["stream"] == COUNTS and one.settings["capture"] == "natnet://here"
         assert one.settings["tracker"] == dataclasses.asdict(tracked()[0].config)
     take.save(tmp_path / "again.npz")
-    assert_equal(load_tracked_take(tmp_path / "again.npz"), take)
+    assert_equal(load_take(tmp_path / "again.npz"), take)
 
 
 def test_a_recording_that_was_cut_off_is_read(tmp_path):
@@ -86,13 +86,11 @@ def test_a_recording_that_was_cut_off_is_read(tmp_path):
     with recorder.part.open("ab") as file:
         file.write(b"blk\n and no more")
     with pytest.warns(CutOffWarning, match=r"take\.npz\.part: a recording that was cut off .* 24 frames"):
-        assert_equal(load_tracked_take(recorder.part), in_memory())
-    with pytest.warns(CutOffWarning):
-        assert archive_kind(recorder.part) == KIND
+        assert_equal(load_take(recorder.part), in_memory())
     with pytest.warns(CutOffWarning):
         assert load_subject(recorder.part, seed=0).take.num_frames == FRAMES
     with pytest.raises(CaptureError, match=r"take\.npz: no such file, but .*take\.npz\.part is a recording"):
-        load_tracked_take(tmp_path / "new" / "take.npz")
+        load_take(tmp_path / "new" / "take.npz")
     with pytest.raises(CaptureError, match="exists: a recording that was cut off"):
         recorded(tmp_path)
 
@@ -102,7 +100,7 @@ def test_too_few_frames_leave_nothing(frames, tmp_path):
     recorder = recorded(tmp_path, frames=frames)
     recorder._archive.flush()
     with pytest.raises(CaptureError, match=f"{frames} frames, expected two or more"):
-        load_tracked_take(recorder.part)
+        load_take(recorder.part)
     with pytest.raises(CaptureError, match=f"{frames} frames came, expected two or more"):
         recorder.finish(COUNTS)
     assert not list((tmp_path / "new").iterdir())
@@ -119,7 +117,7 @@ def test_of_a_long_take_parts_are_read_for_its_summary(tmp_path, monkeypatch):
     take, step = recorder.finish(COUNTS)
     assert step == 3
     np.testing.assert_array_equal(take.numbers, [0, 1, 2, 3, 12, 13, 14, 15])
-    assert load_tracked_take(tmp_path / "take.npz").num_frames == FRAMES
+    assert load_take(tmp_path / "take.npz").num_frames == FRAMES
 
 
 def test_a_disk_that_is_full_keeps_the_recording(tmp_path):
@@ -138,7 +136,7 @@ def test_a_disk_that_is_full_keeps_the_recording(tmp_path):
         recorder.add(frame, one)
     recorder.close()
     with pytest.warns(CutOffWarning):
-        assert_equal(load_tracked_take(recorder.part), in_memory())
+        assert_equal(load_take(recorder.part), in_memory())
 
 
 def test_a_take_that_cannot_be_written_keeps_the_recording(tmp_path):
@@ -147,4 +145,4 @@ def test_a_take_that_cannot_be_written_keeps_the_recording(tmp_path):
     with pytest.raises(CaptureError, match=r"cannot be written .*; the recording is kept in .*\.part"):
         recorder.finish(COUNTS)
     with pytest.warns(CutOffWarning):
-        assert load_tracked_take(recorder.part).num_frames == FRAMES
+        assert load_take(recorder.part).num_frames == FRAMES

@@ -27,7 +27,7 @@ def take() -> Take:
 
 
 def users(take: Take) -> list[GloveFit]:
-    return [hand.fit for hand in take.hands]
+    return list(take.hands)
 
 
 def seen(take: Take, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -49,7 +49,7 @@ def test_hands_are_initialized_and_tracked(take, labeler):
     assert all(hand.status is Status.TRACKED for frame in tracked[1:] for hand in frame.hands)
     right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
     assert np.mean(right) >= 0.98
-    for number, hand in enumerate(take.hands):
+    for number, hand in enumerate(take.moving_hands()):
         model = HandModel(hand.shape)
         poses = np.array([frame.hands[number].qpos for frame in tracked])
         bones = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (poses, hand.qpos)]

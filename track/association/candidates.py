@@ -8,21 +8,24 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from handsim.kernels.kernel import kernel
-from track.config import AssociationConfig
 
 MAX_CANDIDATES: Final = 7
-"""Candidates of a digit at most; the number of hypotheses and the bits of `joint_assignment` grow with it."""
+"""Candidates of a digit at most; the number of hypotheses and the bits of a joint assignment grow with it."""
+SETTLED_EVIDENCE: Final = 4.0
+"""Evidence from which on a label is settled (log-odds); below it the label can be reassigned."""
+_SEEN_RADIUS: Final = 0.012  # [m] from a marker that has a point, within which others are its candidates
+_MISSING_RADIUS: Final = 0.05  # [m] from a missing marker, within which points are its candidates
 
 
 class MarkerTable(NamedTuple):
-    """The K markers of all hands in a row, and the marker of each of N points."""
+    """The K markers of all hands by their labels, and the label of each of N points."""
 
     positions: Float[np.ndarray, "K 3"]
     """Predicted positions [m]."""
     digits: Int[np.ndarray, "K"]
     """Digit of each marker, counted through the hands; -1 on a palm."""
     assigned: Int[np.ndarray, "N"]
-    """Marker of each point, -1 for none."""
+    """Label of each point, -1 for none."""
 
 
 class DigitCandidates(NamedTuple):
@@ -41,7 +44,6 @@ def find_candidates(
     evidence: Float[np.ndarray, "N"],
     table: MarkerTable,
     num_digits: int,
-    config: AssociationConfig,
 ) -> DigitCandidates:
     """The candidates of each digit.
 
@@ -50,22 +52,13 @@ def find_candidates(
         evidence: Evidence for the label of each point (log-odds).
         table: The markers of all hands.
         num_digits: Digits of all hands.
-        config: Radii, and the evidence of a settled label.
     """
     found = DigitCandidates(
         np.full((num_digits, MAX_CANDIDATES), -1),
         np.zeros(num_digits, dtype=np.int64),
         np.zeros(num_digits, dtype=np.int64),
     )
-    _find_candidates(
-        points,
-        evidence,
-        table,
-        config.settled_evidence,
-        config.seen_radius,
-        config.missing_radius,
-        found,
-    )
+    _find_candidates(points, evidence, table, found)
     return found
 
 
@@ -74,18 +67,15 @@ def _find_candidates(
     points: Float[np.ndarray, "N 3"],
     evidence: Float[np.ndarray, "N"],
     table: MarkerTable,
-    settled: float,
-    seen_radius: float,
-    missing_radius: float,
     found: DigitCandidates,
 ) -> None:
-    """Fill `found`; arguments as of `find_candidates`, `settled` in log-odds, radii in [m]."""
+    """Fill `found`; the other arguments are those of `find_candidates`."""
     positions, digits, assigned = table
     missing = np.ones(len(positions), dtype=np.bool_)
     for owner in assigned:
         if owner >= 0:
             missing[owner] = False
-    contested = _find_contested(points, evidence, table, missing, settled, missing_radius)
+    contested = _find_contested(points, evidence, table, missing)
     distances = np.full((len(found.counts), len(points)), np.inf)
     for digit in range(len(found.counts)):
         incomplete, undecided = False, False
@@ -98,14 +88,16 @@ def _find_candidates(
                 distance = _distance(points[point], positions[marker])
                 distances[digit, point] = min(distances[digit, point], distance)
                 if assigned[point] < 0:
-                    rivals[point] |= distance < (missing_radius if missing[marker] else seen_radius)
+                    rivals[point] |= distance < (_MISSING_RADIUS if missing[marker] else _SEEN_RADIUS)
                 elif contested[point] and missing[marker]:
-                    rivals[point] |= distance < missing_radius
+                    rivals[point] |= distance < _MISSING_RADIUS
         count = 0
         for point in range(len(points)):
             if assigned[point] >= 0 and digits[assigned[point]] == digit:
                 rivals[point] = False
-                undecided = undecided or contested[point] or (incomplete and evidence[point] < settled)
+                undecided = (
+                    undecided or contested[point] or (incomplete and evidence[point] < SETTLED_EVIDENCE)
+                )
                 found.candidates[digit, count] = point
                 count += 1
         if not (undecided or rivals.any()):
@@ -120,18 +112,16 @@ def _find_contested(
     evidence: Float[np.ndarray, "N"],
     table: MarkerTable,
     missing: Bool[np.ndarray, "K"],
-    settled: float,
-    radius: float,
 ) -> Bool[np.ndarray, "N"]:
-    """Points with an unsettled label and a missing marker of another digit within the radius [m]."""
+    """Points with an unsettled label and a missing marker of another digit nearby."""
     contested = np.zeros(len(points), dtype=np.bool_)
     for point in range(len(points)):
         owner = table.assigned[point]
-        if owner < 0 or table.digits[owner] < 0 or evidence[point] >= settled:
+        if owner < 0 or table.digits[owner] < 0 or evidence[point] >= SETTLED_EVIDENCE:
             continue
         for marker in range(len(missing)):
             other = missing[marker] and table.digits[marker] not in (-1, table.digits[owner])
-            if other and _distance(points[point], table.positions[marker]) < radius:
+            if other and _distance(points[point], table.positions[marker]) < _MISSING_RADIUS:
                 contested[point] = True
     return contested
 

@@ -24,6 +24,11 @@ from track.kinematics.marker_prediction import MarkerPrediction
 
 IMPOSSIBLE: Final = 1e9
 """Minus the score of a hypothesis that is excluded."""
+_LENGTH_TOLERANCE: Final = 0.003  # [m] of the distances between two markers of a digit over all poses
+_PRUNING_MARGIN: Final = 7.0  # log-odds behind another hypothesis from which on one is not fitted
+_START_DISTANCE: Final = float(
+    np.deg2rad(5.0)
+)  # largest difference of a hinge of starts of which one is enough
 
 
 class DigitRanges(NamedTuple):
@@ -91,12 +96,6 @@ class DigitModel(NamedTuple):
     """Distance by which each marker may be off its position on the hand of the ranges [m]."""
     ranges: DigitRanges
     """Distances between markers of a digit over all poses."""
-    length_tolerance: float
-    """See `AssociationConfig` [m]."""
-    pruning_margin: float
-    """See `AssociationConfig` [log-odds]."""
-    start_distance: float
-    """See `AssociationConfig` [rad]."""
 
 
 @kernel
@@ -196,7 +195,7 @@ def _fit_hypotheses(
     compute_markers(hand, angles_before, work)
     hypothesis, angles = np.full(count, -1), np.empty(4)
     current = angles_before[4 * digit : 4 * digit + 4]
-    starts = 2 if np.abs(mean - current).max() > model.start_distance else 1
+    starts = 2 if np.abs(mean - current).max() > _START_DISTANCE else 1
     total = choices**count
     costs, poses = np.zeros(total), np.empty((total, 4))
     subset_scores = np.full(len(scores), -IMPOSSIBLE)
@@ -213,7 +212,7 @@ def _fit_hypotheses(
             continue
         subset_score = _best_subset_score(points_used, scores, subset_scores)
         cutoff = bound - max(
-            runners_up[points_used], max(scores[points_used], subset_score) - model.pruning_margin
+            runners_up[points_used], max(scores[points_used], subset_score) - _PRUNING_MARGIN
         )
         if costs[subset] >= cutoff:
             continue
@@ -314,7 +313,7 @@ def _upper_bound(
                 distance += (points[point, i] - points[hypothesis[other], i]) ** 2
             distance = np.sqrt(distance)
             one, two = markers[slot], markers[other]
-            tolerance = model.length_tolerance + slack[one] + slack[two]
+            tolerance = _LENGTH_TOLERANCE + slack[one] + slack[two]
             if (
                 distance < ranges.nearest[one, two] - tolerance
                 or distance > ranges.farthest[one, two] + tolerance

@@ -7,8 +7,7 @@ the pose and its bias, which is nearly as accurate for an uncalibrated hand as f
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,13 +17,41 @@ from gloves.fit import GloveFit
 from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
 from handsim.kernels.integration import move, velocity_of
 from handsim.kernels.kernel import kernel
+from track.association.assignment import peak_log_odds
 from track.association.digit_hypotheses import DigitModel, digit_ranges
-from track.association.point_matching import peak_log_odds
 from track.config import TrackerConfig
 from track.kinematics.frame_fits import FEWEST_MARKERS
 from track.kinematics.joint_prior import JointPrior, predict_joints, resting_covariance, resting_prior
 from track.kinematics.marker_prediction import MarkerPrediction
 from track.kinematics.pose_solver import PoseSolver
+
+# Process model.
+_LONGEST_EXTRAPOLATION: Final = 0.05  # [s] for which a motion goes on; later the hand is predicted to stand
+_VELOCITY_SMOOTHING: Final = 0.6  # share of the newest velocity in the smoothed one
+_HIDDEN_DIGIT_DAMPING: Final = 0.7  # factor per frame of the velocity of a digit that lacks markers
+_WRIST_SPREAD: Final = 0.001  # [m] of the wrist's predicted position in the same frame
+_WRIST_ACCELERATION: Final = 10.0  # [m/s^2] unforeseen
+_WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # of its predicted orientation in the same frame
+_WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] unforeseen
+# Measurement model: spread and bias of markers.
+_FIRST_SPREAD: Final = 1.2  # of the markers of a hand that was just initialized, over the RMS of the fit
+_FIRST_SPREAD_LEAST, _FIRST_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of that spread
+_LEAST_SPREAD: Final = 0.0005  # [m] of a marker: the noise of one that few cameras see
+_BIAS_VARIATION: Final = 0.3  # share of the hand's typical bias by which a bias changes as the hand moves
+_BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker may be off by the typical bias again
+_AVERAGING_FRAMES: Final = 120.0  # that a bias is averaged over; one second at 120 Hz
+_LEARNING_FRAMES: Final = 30.0  # after which the spread of a hand's markers is known
+_BIAS_REUSE_RMS: Final = 0.002  # [m] below which a hand that is initialized again keeps its biases
+_BIAS_SLACK: Final = 2.5  # standard deviations that count in how far a marker may be off its design
+# When markers come back, and how long strays live.
+_RETURN_TIME: Final = 0.01  # [s] over the time it was hidden is a marker's chance to come back in a frame
+_RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that chance
+SEEN_ELSEWHERE: Final = -7.0
+"""Log probability that a point is a marker that had another point while this one was visible."""
+STRAY_LIFETIME: Final = 0.1
+"""Mean time for which a stray point lives [s]."""
+MOST_AGE_LOG_ODDS: Final = 3.0
+"""Largest log-odds that a point's age contributes."""
 
 
 class Prediction(NamedTuple):
@@ -40,7 +67,7 @@ class Prediction(NamedTuple):
     """Standard deviations of the wrist's position [m] and orientation [rad]."""
 
 
-class Estimate(NamedTuple):
+class HandEstimate(NamedTuple):
     """A hand's pose that was fitted to the markers of a frame."""
 
     qpos: Float[np.ndarray, "27"]
@@ -63,18 +90,31 @@ class Estimate(NamedTuple):
         return self.predicted.covariances
 
 
+class Biases(NamedTuple):
+    """What is known of the biases of a hand's markers."""
+
+    bias: Float[np.ndarray, "M 3"]
+    """In the frames of the bones [m]."""
+    frames: Float[np.ndarray, "M"]
+    """Frames that each is averaged over."""
+    learned_variance: Float[np.ndarray, "M"]
+    """Variance of each marker while its bias is certain [m^2]."""
+    variance: Float[np.ndarray, "M"]
+    """Variance of each marker at the last prediction [m^2]."""
+
+
 class HandState:
     """Filter state of one of the user's hands.
 
     Args:
         hand: The hand and its glove.
-        config: Process and measurement models, solver weights, presence model.
+        config: Noise of the markers, and density of strays.
     """
 
     def __init__(self, hand: GloveFit, config: TrackerConfig = TrackerConfig()) -> None:  # noqa: B008
         self.hand = hand
         self.config = config
-        self.solver = PoseSolver(hand, config=config.solver)
+        self.solver = PoseSolver(hand)
         self.qpos: NDArray[np.float64] | None = None
         """The pose of the last frame with one; None where the hand is lost."""
         self.time = 0.0
@@ -86,15 +126,15 @@ class HandState:
         """Digit of each marker (M,), -1 for the palm."""
         self.adapted = self.solver.hand
         """The hand as arrays, its markers shifted by their biases."""
-        self.variance = np.full(count, config.noise.first_spread_most**2)
+        self.variance = np.full(count, _FIRST_SPREAD_MOST**2)
         """Variance (M,) of each marker around its position on the hand [m^2], at the last prediction."""
         self.positions = np.full((count, 3), np.nan)
         """Positions (M, 3) of the pose's markers [m]."""
         self.confirmed = np.zeros(len(DIGITS), dtype=bool)
         """Digits that have had a settled label since the hand was initialized."""
         self._velocity = np.zeros(6 + NUM_JOINTS)  # [m/s, rad/s] in MuJoCo's order
-        self._joint_covariance = resting_covariance(config.motion)  # [rad^2] of the last estimate
-        self._resting_prior = resting_prior(config.motion)
+        self._joint_covariance = resting_covariance()  # [rad^2] of the last estimate
+        self._resting_prior = resting_prior()
         self._bias = np.zeros((count, 3))  # [m] in the frames of the bones
         self._bias_frames = np.zeros(count)  # that each bias is averaged over
         self._variance = self.variance.copy()  # [m^2] while the biases are certain
@@ -107,26 +147,23 @@ class HandState:
     def predict(self, time: float) -> Prediction:
         """The pose at a time [s] if the hand goes on with its velocity; for a hand that has a pose."""
         assert self.qpos is not None
-        motion = self.config.motion
         self._now = time
         span = time - self.time
-        doubt = self._typical_bias * np.minimum(
-            (time - self._last_seen) / self.config.noise.bias_doubt_time, 1.0
-        )
+        doubt = self._typical_bias * np.minimum((time - self._last_seen) / _BIAS_DOUBT_TIME, 1.0)
         self.variance = self._variance + doubt**2
         moved: NDArray[np.float64] = move(
-            self.qpos[None], min(span, motion.longest_extrapolation) * self._velocity[None]
+            self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self._velocity[None]
         )[0]
         wrist_spread = (
-            motion.wrist_spread + 0.5 * motion.wrist_acceleration * span**2,
-            motion.wrist_rotation_spread + 0.5 * motion.wrist_angular_acceleration * span**2,
+            _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2,
+            _WRIST_ROTATION_SPREAD + 0.5 * _WRIST_ANGULAR_ACCELERATION * span**2,
         )
-        joint_prior = predict_joints(moved[7:], self._joint_covariance, span, motion)
+        joint_prior = predict_joints(moved[7:], self._joint_covariance, span)
         return Prediction(moved, self.solver.marker_positions(moved), joint_prior, wrist_spread)
 
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
-    ) -> Estimate:
+    ) -> HandEstimate:
         """Fit the pose to labeled markers; what they leave open follows the prediction.
 
         Args:
@@ -152,37 +189,33 @@ class HandState:
             prediction.joint_prior,
             wrist_spread=prediction.wrist_spread,
             variance=self.variance,
-            noise=self.config.noise.marker_noise,
+            noise=self.config.marker_noise,
         )
-        return Estimate(predicted.qpos, rms, residuals, predicted)
+        return HandEstimate(predicted.qpos, rms, residuals, predicted)
 
-    def digit_models(self, prediction: Prediction, estimate: Estimate) -> tuple[DigitModel, DigitModel]:
+    def digit_models(self, prediction: Prediction, estimate: HandEstimate) -> tuple[DigitModel, DigitModel]:
         """Models for new points of a digit: of one with settled labels, and of one without.
 
         The second has the resting prior: the pose that a wrong label gave to a digit must not confirm that
         label.
         """
-        association = self.config.association
-        slack = association.bias_slack * np.sqrt(self.variance) + np.sqrt((self._bias**2).sum(axis=1))
+        slack = _BIAS_SLACK * np.sqrt(self.variance) + np.sqrt((self._bias**2).sum(axis=1))
         confirmed = DigitModel(
             prediction.joint_prior,
             estimate.predicted,
             self.variance,
-            peak_log_odds(self.variance, association.stray_density),
+            peak_log_odds(self.variance, self.config.stray_density),
             slack,
             self._ranges,
-            association.length_tolerance,
-            association.pruning_margin,
-            association.start_distance,
         )
         return confirmed, confirmed._replace(joint_prior=self._resting_prior)
 
     @property
     def spread(self) -> float | None:
         """Standard deviation of the markers in each direction [m]; None while unknown."""
-        if np.median(self._bias_frames) < self.config.noise.learning_frames:
+        if np.median(self._bias_frames) < _LEARNING_FRAMES:
             return None
-        return max(float(np.sqrt(np.median(self._variance))), self.config.noise.marker_noise)
+        return max(float(np.sqrt(np.median(self._variance))), self.config.marker_noise)
 
     def presence_log_odds(self, first_seen: Float[np.ndarray, "P"]) -> Float[np.ndarray, "P M"]:
         """Log-odds of a marker coming back when a point appeared, against a stray as old as the point.
@@ -190,18 +223,17 @@ class HandState:
         Args:
             first_seen: Time at which each point appeared [s].
         """
-        presence = self.config.presence
         gap = first_seen[:, None] - self._last_seen
         log_odds: NDArray[np.float64] = np.log(
-            np.clip(presence.return_time / np.maximum(gap, 1e-3), presence.return_least, presence.return_most)
+            np.clip(_RETURN_TIME / np.maximum(gap, 1e-3), _RETURN_LEAST, _RETURN_MOST)
         )
-        log_odds[gap < 0.0] = presence.seen_elsewhere
+        log_odds[gap < 0.0] = SEEN_ELSEWHERE
         age = np.maximum(self._now - first_seen, 0.0)[:, None]
-        return log_odds + np.minimum(age / presence.stray_lifetime, presence.most_age_log_odds)
+        return log_odds + np.minimum(age / STRAY_LIFETIME, MOST_AGE_LOG_ODDS)
 
     def initialize(
         self, qpos: Float[np.ndarray, "27"], targets: Float[np.ndarray, "M 3"], time: float
-    ) -> Estimate:
+    ) -> HandEstimate:
         """Start from a pose without history; the biases are kept if they still fit.
 
         Args:
@@ -209,56 +241,49 @@ class HandState:
             targets: Labeled markers [m]; NaN where missing.
             time: Time of the frame [s].
         """
-        noise = self.config.noise
         self._velocity[:] = 0.0
         self._last_seen[:] = time
         self.confirmed[:] = False
         positions = self.solver.marker_positions(qpos)
         unknown = Prediction(qpos, positions, self._resting_prior, (1.0, 1.0))
         estimate = self.fit(targets, qpos, unknown)
-        if not (self._bias_frames.any() and estimate.rms < noise.bias_reuse_rms):
+        if not (self._bias_frames.any() and estimate.rms < _BIAS_REUSE_RMS):
             self._bias[:], self._bias_frames[:], self._variance[:] = 0.0, 0.0, 0.0
             self._shift_markers()
             estimate = self.fit(targets, qpos, unknown)
-            spread = noise.first_spread_factor * estimate.rms
-            self._variance[:] = np.clip(spread, noise.first_spread_least, noise.first_spread_most) ** 2
+            spread = _FIRST_SPREAD * estimate.rms
+            self._variance[:] = np.clip(spread, _FIRST_SPREAD_LEAST, _FIRST_SPREAD_MOST) ** 2
         self._store(estimate, time)
         return estimate
 
-    def unbiased_positions(self, estimate: Estimate) -> Float[np.ndarray, "M 3"]:
+    def unbiased_positions(self, estimate: HandEstimate) -> Float[np.ndarray, "M 3"]:
         """Where a pose's markers would be in the world if the glove had no bias [m]."""
         offsets: NDArray[np.float64] = np.einsum("mij,mj->mi", estimate.predicted.rotations, self._bias)
         return estimate.positions + offsets
 
-    def forget(self, markers: Int[np.ndarray, "K"]) -> Callable[[], None]:
-        """Forget the biases of some markers: they are where the glove has them again, give or take.
+    @property
+    def biases(self) -> Biases:
+        """A copy of what is known of the markers' biases, for `recall`."""
+        return Biases(
+            self._bias.copy(), self._bias_frames.copy(), self._variance.copy(), self.variance.copy()
+        )
 
-        Args:
-            markers: The markers.
-
-        Returns:
-            A function that recalls the biases, unless others were learned in the meantime.
-        """
-        arrays = self._bias, self._bias_frames, self._variance, self.variance
-        before = [array.copy() for array in arrays]
-        for array in arrays[:2]:
-            array[markers] = 0.0
-        for array in arrays[2:]:
-            array[markers] = self.config.noise.first_spread_most**2
+    def forget(self, markers: Int[np.ndarray, "K"]) -> None:
+        """Forget the biases of some markers: they are where the glove has them again, give or take."""
+        self._bias[markers], self._bias_frames[markers] = 0.0, 0.0
+        self._variance[markers] = self.variance[markers] = _FIRST_SPREAD_MOST**2
         self._shift_markers()
 
-        def recall() -> None:
-            for array, values in zip(arrays, before, strict=True):
-                array[:] = values
-            self._shift_markers()
+    def recall(self, biases: Biases) -> None:
+        """Take back what was known of the biases."""
+        self._bias[:], self._bias_frames[:], self._variance[:], self.variance[:] = biases
+        self._shift_markers()
 
-        return recall
-
-    def rms_without_bias(self, estimate: Estimate) -> float:
+    def rms_without_bias(self, estimate: HandEstimate) -> float:
         """RMS distance of the markers from their positions on the hand as it was given [m]."""
         return float(_rms_without_bias(estimate.residuals, estimate.predicted.rotations, self._bias))
 
-    def update(self, estimate: Estimate, settled: Bool[np.ndarray, "M"], time: float) -> None:
+    def update(self, estimate: HandEstimate, settled: Bool[np.ndarray, "M"], time: float) -> None:
         """Take over the pose of the next frame, and learn the biases of markers with settled labels.
 
         Args:
@@ -270,21 +295,21 @@ class HandState:
         qpos, span = estimate.qpos, time - self.time
         if span > 0.0:
             change = velocity_of(self.qpos, qpos, span) - self._velocity
-            self._velocity += self.config.motion.velocity_smoothing * change
+            self._velocity += _VELOCITY_SMOOTHING * change
         self._store(estimate, time)
         self.confirmed[self.digits[settled & (self.digits >= 0)]] = True
         _learn_bias(
             estimate.residuals,
             estimate.predicted.rotations,
             settled,
-            self.config.noise.averaging_frames,
+            _AVERAGING_FRAMES,
             self._bias_frames,
             self._bias,
             self._variance,
         )
         self._shift_markers()
 
-    def _store(self, estimate: Estimate, time: float) -> None:
+    def _store(self, estimate: HandEstimate, time: float) -> None:
         """Keep an estimate as the state at a time [s]."""
         self.qpos, self.time, self.positions = estimate.qpos, time, estimate.positions
         self.rms = estimate.rms
@@ -292,21 +317,33 @@ class HandState:
         present = np.isfinite(estimate.residuals[:, 0])
         missing = np.bincount(self.digits[~present & (self.digits >= 0)], minlength=len(DIGITS))
         hidden = self._velocity[6:].reshape(len(DIGITS), -1)
-        hidden[missing > 0] *= self.config.motion.hidden_digit_damping
+        hidden[missing > 0] *= _HIDDEN_DIGIT_DAMPING
         self._last_seen[present] = time
 
     def _shift_markers(self) -> None:
         """Shift the markers of `adapted` by their biases."""
-        noise = self.config.noise
         self._typical_bias = _shift_markers(
             self._bias_frames,
             self._bias,
             self._designed,
-            noise.least_spread,
-            noise.bias_variation,
+            _LEAST_SPREAD,
+            _BIAS_VARIATION,
             self._variance,
             self.adapted.positions,
         )
+
+
+class HandTrack(NamedTuple):
+    """A hand with a pose in the current frame."""
+
+    hand: int
+    """Index of the hand."""
+    state: HandState
+    """Its filter state."""
+    prediction: Prediction
+    """The pose before the frame's markers were used."""
+    estimate: HandEstimate
+    """The pose fitted to its labels so far."""
 
 
 @kernel
@@ -361,8 +398,8 @@ def _shift_markers(
         bias_frames: Frames that each bias was averaged over; zero where it is unknown.
         bias: Bias of each marker in the frame of its bone [m].
         designed: Position of each marker in that frame as the glove has it [m].
-        least_spread: See `NoiseConfig` [m].
-        variation: See `NoiseConfig.bias_variation`.
+        least_spread: Least standard deviation of a marker [m].
+        variation: Share of the typical bias by which a bias changes as the hand moves.
         variance: Variance of each marker [m^2], overwritten where it is below the least.
         positions: `HandArrays.positions`; the first of each marker is overwritten.
     """

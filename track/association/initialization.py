@@ -19,15 +19,35 @@ from scipy.cluster.hierarchy import fclusterdata
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
 from poses.shapes.library import LIBRARIES, gestures_of
+from track.association.assignment import match_log_odds, match_points, peak_log_odds
+from track.association.frame_state import targets_of
 from track.association.hand_state import HandState
-from track.association.label_consistency import targets_of
-from track.association.point_matching import match_log_odds, match_points, peak_log_odds
 from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseFit
 from train.hands.measures import longest_link
 from train.labelers.protocol import Labeler, Labeling
 
+MOST_POINTS: Final = 100
+"""Largest number of points of a group that may be a hand."""
+_LINK_DISTANCE: Final = 0.085  # [m] between neighboring markers of one hand, or more where its glove needs it
 _LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked
+_LEAST_SHARE: Final = 0.45  # of a hand's markers that must be labeled
+_FEWEST_POINTS: Final = 4  # labeled points of a hand; a pose needs as many
+_SPARE_POINTS: Final = (
+    6  # beyond a hand's markers from which on a group is cut in halves: two hands may touch
+)
+_CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
+_MOST_FITS: Final = 8  # labeled clouds that are fitted, the most confident first
+_REFINEMENTS: Final = 2  # rounds of assigning points to the markers of a fitted hand
+_SEARCH_FACTOR: Final = 4.0  # spread of the markers in these rounds over that of the fit
+_SEARCH_LEAST, _SEARCH_MOST = 0.003, 0.012  # [m] bounds of that spread
+_FREE_COORDINATES: Final = 20.0  # degrees of freedom that a pose takes from its points, in effect
+_LEAST_SPREAD: Final = 0.0003  # [m] that is estimated from a fit
+_LEAST_SCORE: Final = 50.0  # log-odds of a hand: about those of twelve points that are 5 mm off
+_CERTAIN_SCORE: Final = 10.0  # log-odds per marker after which no further cloud is tried
+_KNOWN_SPREAD_ATTEMPTS: Final = (
+    60  # in which a hand that was known must fit as well as before; 0.5 s at 120 Hz
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +70,7 @@ class HandInitializer:
     Args:
         states: The user's hands.
         labeler: Labels the points of a cloud of one hand; does not know left from right.
-        config: Settings of initialization, and the density of strays.
+        config: Largest RMS distance of a pose, and the density of strays.
     """
 
     def __init__(
@@ -61,13 +81,11 @@ class HandInitializer:
     ) -> None:
         self._states = states
         self._labeler = labeler
-        self._config = config.initialization
-        self._stray_density = config.association.stray_density
-        self._link_distance = max([self._config.link_distance, *(_link_distance(one.hand) for one in states)])
+        self._config = config
+        self._link_distance = max([_LINK_DISTANCE, *(_link_distance(one.hand) for one in states)])
         self._attempts = np.zeros(len(states), dtype=np.int64)
-        cuts = self._config.num_cuts
-        spread = np.arange(cuts) + 0.5
-        height, azimuth = 1.0 - spread / cuts, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
+        spread = np.arange(_CUTS) + 0.5
+        height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
@@ -105,9 +123,11 @@ class HandInitializer:
             spread: Known standard deviation around the markers in each direction [m]; estimated from the fit
                 when not given.
         """
-        freedom = max(3.0 * count - self._config.free_coordinates, 1.0)
-        estimated = max(rms * np.sqrt(count / freedom), self._config.least_spread)
-        peak = peak_log_odds(np.array([(estimated if spread is None else spread) ** 2]), self._stray_density)
+        freedom = max(3.0 * count - _FREE_COORDINATES, 1.0)
+        estimated = max(rms * np.sqrt(count / freedom), _LEAST_SPREAD)
+        peak = peak_log_odds(
+            np.array([(estimated if spread is None else spread) ** 2]), self._config.stray_density
+        )
         loss = 1.5 if spread is None else 0.5 * rms**2 / spread**2
         return count * float(peak[0] - loss)
 
@@ -118,13 +138,13 @@ class HandInitializer:
             return []
         cluster = fclusterdata(points, self._link_distance, criterion="distance", method="single")
         groups = [np.flatnonzero(cluster == number) for number in np.unique(cluster)]
-        groups = [group for group in groups if least <= len(group) <= self._config.most_points]
+        groups = [group for group in groups if least <= len(group) <= MOST_POINTS]
         return sorted(groups, key=len, reverse=True)
 
     def _least(self, index: int) -> int:
         """Least number of labeled points of a hand."""
-        share = self._config.least_share * self._states[index].num_markers
-        return max(self._config.fewest_points, int(np.ceil(share)))
+        share = _LEAST_SHARE * self._states[index].num_markers
+        return max(_FEWEST_POINTS, int(np.ceil(share)))
 
     def _best(
         self, points: NDArray[np.float64], group: NDArray[np.int64], hands: Sequence[int]
@@ -134,13 +154,13 @@ class HandInitializer:
         labelings = self._labeler.label_frames([points[cloud] for cloud in clouds])
         confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
         best: InitializedHand | None = None
-        for number in np.argsort(confidence)[::-1][: self._config.most_fits]:
+        for number in np.argsort(confidence)[::-1][:_MOST_FITS]:
             for index in hands:
                 hand = self._fit(index, points, group, clouds[number], labelings[number])
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
             if best is not None:
-                certain = self._config.certain_score * self._states[best.index].num_markers
+                certain = _CERTAIN_SCORE * self._states[best.index].num_markers
                 if best.score > certain:
                     break
         return best
@@ -150,7 +170,7 @@ class HandInitializer:
     ) -> list[NDArray[np.int64]]:
         """The group, and its halves along each direction if it has points of more than one hand."""
         clouds = [group]
-        if len(group) > markers + self._config.spare_points:
+        if len(group) > markers + _SPARE_POINTS:
             half = len(group) // 2
             for direction in self._directions:
                 order = group[np.argsort(points[group] @ direction)]
@@ -169,17 +189,15 @@ class HandInitializer:
         state, labels = self._states[index], np.full(len(points), -1)
         labels[cloud] = labeling.labels
         hand = self._trim(index, points, labels, None)
-        for _ in range(self._config.refinements):
+        for _ in range(_REFINEMENTS):
             if hand is None:
                 return None
             positions = state.solver.marker_positions(hand.fit.qpos[0])
             fitted = float(hand.fit.rms[0] / np.sqrt(3.0))
-            spread = np.clip(
-                self._config.search_factor * fitted, self._config.search_least, self._config.search_most
-            )
+            spread = np.clip(_SEARCH_FACTOR * fitted, _SEARCH_LEAST, _SEARCH_MOST)
             covariances = np.tile(spread**2 * np.eye(3), (state.num_markers, 1, 1))
             labels = np.full(len(points), -1)
-            log_odds = match_log_odds(points[group], positions, covariances, self._stray_density)
+            log_odds = match_log_odds(points[group], positions, covariances, self._config.stray_density)
             labels[group], _ = match_points(log_odds)
             hand = self._trim(index, points, labels, hand.fit)
         return hand
@@ -193,7 +211,7 @@ class HandInitializer:
             targets = targets_of(points, labels, state.num_markers)
             fit = state.solver.solve(targets[None], None if start is None else start.qpos)
             count, rms = int((labels >= 0).sum()), float(fit.rms[0])
-            known = self._attempts[index] < self._config.known_spread_attempts
+            known = self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS
             hand = InitializedHand(
                 index, fit, labels, self.score(count, rms, state.spread if known else None)
             )
@@ -205,9 +223,7 @@ class HandInitializer:
             labels = labels.copy()
             labels[labeled[squares.argmax()]] = -1
         accepted = (
-            best is not None
-            and best.fit.rms[0] <= self._config.most_rms
-            and best.score >= self._config.least_score
+            best is not None and best.fit.rms[0] <= self._config.most_rms and best.score >= _LEAST_SCORE
         )
         return best if accepted else None
 

@@ -1,143 +1,57 @@
-"""Tests of the labels that go along with IDs: exchanged ones, gating by the predicted pose, then by the fit.
-
-Labels are indices into the hand's layout; -1 is a point that is none of its markers.
-"""
+"""Tests of labels that go along with IDs: exchanged ones, gating by the predicted pose, then by the fit."""
 
 from __future__ import annotations
 
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
-from track.association.hand_state import Estimate, HandState, Prediction
-from track.config import GatingConfig
+from track.association.frame_state import FrameState, targets_of
+from track.association.hand_state import HandEstimate, HandState, HandTrack, Prediction
 
+_GATE: Final = (
+    16.0  # squared Mahalanobis distance beyond which a point is not fitted: four standard deviations
+)
+_PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a predicted marker beside its own spread
+_PREDICTION_FACTOR: Final = 2.0  # the same over what the other markers show in this frame
+_MOST_GATED: Final = 0.3  # share of a hand's labels dropped at once; with more the prediction is wrong
+EXCHANGE_DISTANCE: Final = 0.04
+"""Distance of two points within which their IDs may be exchanged [m]."""
+_EXCHANGE_MARGIN: Final = 8.0  # log-odds from which on two labels are exchanged; systems rarely exchange IDs
+_EXCHANGE_SPREAD: Final = 0.002  # [m] least standard deviation of the offset of two predicted markers
+_EXCHANGE_CONFIDENCE: Final = 0.5
+_FIT_SPREAD: Final = 0.0015  # [m] standard deviation of a fitted marker beside its own spread
+_RESTART_RMS: Final = 0.004  # [m] beyond which a fit is tried again from shapes instead of the prediction
 _MEDIAN_SQUARE: Final = 2.366  # median of the squared length of a standard normal vector
 
 
-def targets_of(
-    points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], count: int
-) -> Float[np.ndarray, "M 3"]:
-    """Labeled points in the layout's order [m], NaN where a marker has no point.
-
-    Args:
-        points: Points [m].
-        labels: Their labels.
-        count: Markers of the layout.
-    """
-    targets = np.full((count, 3), np.nan)
-    targets[labels[labels >= 0]] = points[labels >= 0]
-    return targets
-
-
-def gate_labels(
-    state: HandState,
-    points: Float[np.ndarray, "N 3"],
-    labels: Int[np.ndarray, "N"],
-    prediction: Prediction,
-    config: GatingConfig,
-) -> None:
-    """Drop labels whose points are outside the gate around their markers at the predicted pose.
-
-    The gate is as wide as the innovations of the hand's other markers in this frame are large. Where too many
-    labels are outside, the prediction is wrong, and all labels stay.
-
-    Args:
-        state: The hand.
-        points: The frame's points [m].
-        labels: Their labels, overwritten.
-        prediction: The hand's predicted pose.
-        config: The gate.
-    """
-    _gate(
-        points,
-        labels,
-        prediction.positions,
-        state.variance,
-        config.prediction_spread,
-        config.prediction_factor,
-        config.gate,
-        config.most_gated,
-    )
-
-
-@kernel
-def _gate(
-    points: NDArray[np.float64],
-    labels: NDArray[np.int64],
-    positions: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    spread: float,
-    factor: float,
-    gate: float,
-    most_gated: float,
-) -> None:
-    """Kernel of `gate_labels`.
-
-    Args:
-        points: The frame's points (P, 3) [m].
-        labels: Their labels (P,), overwritten.
-        positions: Predicted markers (M, 3) [m].
-        variance: Their variance (M,) [m^2].
-        spread: Least standard deviation beside it [m].
-        factor: The same as a multiple of what the hand's markers show.
-        gate: Squared Mahalanobis distance of the gate.
-        most_gated: Largest share of the labels to drop.
-    """
-    labeled = np.flatnonzero(labels >= 0)
-    if len(labeled) == 0:
-        return
-    squares = np.empty(len(labeled))
-    for row, point in enumerate(labeled):
-        squares[row] = ((points[point] - positions[labels[point]]) ** 2).sum()
-    shown = max(spread**2, factor**2 * np.median(squares) / _MEDIAN_SQUARE)
-    outside = squares > gate * (variance[labels[labeled]] + shown)
-    if outside.sum() <= most_gated * len(labeled):
-        labels[labeled[outside]] = -1
-
-
-def exchange_labels(
-    points: Float[np.ndarray, "N 3"],
-    assigned: Int[np.ndarray, "N"],
-    positions: Float[np.ndarray, "K 3"],
-    config: GatingConfig,
-) -> Int[np.ndarray, "E"]:
-    """Exchange the labels of two points where that explains both much better.
+def exchange_labels(frame: FrameState, positions: Float[np.ndarray, "K 3"]) -> FrameState:
+    """Exchange the labels of two points where that explains both much better: the system exchanged their IDs.
 
     A motion that the prediction misses moves both points alike and cancels in the comparison.
 
     Args:
-        points: The frame's points [m].
-        assigned: Marker of each point, -1 for none; overwritten.
-        positions: Predicted positions of the markers [m].
-        config: The margin.
-
-    Returns:
-        The points whose label has changed.
+        frame: The frame; a hand without a prediction has no labels.
+        positions: Predicted position of the marker of each label [m].
     """
-    return _exchange(
-        points,
-        assigned,
-        positions,
-        config.exchange_spread,
-        config.prediction_factor,
-        config.exchange_distance,
-        config.exchange_margin,
-    )
+    labels = frame.labels.copy()
+    points = _exchange(frame.points, labels, positions)
+    if len(points) == 0:
+        return frame
+    changed = np.zeros(len(labels), dtype=bool)
+    changed[points] = True
+    confidence = np.full(len(points), _EXCHANGE_CONFIDENCE)
+    return frame._replace(labels=labels).with_confidence(changed, confidence)
 
 
 @kernel
 def _exchange(
     points: NDArray[np.float64],
-    assigned: NDArray[np.int64],
+    labels: NDArray[np.int64],
     positions: NDArray[np.float64],
-    spread: float,
-    factor: float,
-    distance: float,
-    margin: float,
 ) -> NDArray[np.int64]:
     """Kernel of `exchange_labels`.
 
@@ -146,29 +60,25 @@ def _exchange(
 
     Args:
         points: The frame's points (P, 3) [m].
-        assigned: Marker of each point (P,), -1 for none; overwritten.
-        positions: Predicted markers (K, 3) [m].
-        spread: Least standard deviation of the offset of two markers [m].
-        factor: The same as a multiple of what the markers show.
-        distance: Largest distance of two points that are exchanged [m].
-        margin: Least gain (log-odds).
+        labels: Label of each point (P,), -1 for none; overwritten.
+        positions: Predicted position of the marker of each label (K, 3) [m].
 
     Returns:
         The points whose label has changed (E,).
     """
-    labeled = np.flatnonzero(assigned >= 0)
+    labeled = np.flatnonzero(labels >= 0)
     changed = np.empty(len(labeled), dtype=np.int64)
     count = 0
     if len(labeled) < 2:
         return changed[:0]
-    seen, markers = points[labeled], positions[assigned[labeled]]
+    seen, markers = points[labeled], positions[labels[labeled]]
     offsets = seen - markers
     middle = np.array([np.median(offsets[:, 0]), np.median(offsets[:, 1]), np.median(offsets[:, 2])])
     squares = ((offsets - middle) ** 2).sum(axis=1)
-    variance = max(spread**2, factor**2 * np.median(squares) / _MEDIAN_SQUARE)
+    variance = max(_EXCHANGE_SPREAD**2, _PREDICTION_FACTOR**2 * np.median(squares) / _MEDIAN_SQUARE)
     free = np.ones(len(labeled), dtype=np.bool_)
     while True:
-        most, one, other = margin, -1, -1
+        most, one, other = _EXCHANGE_MARGIN, -1, -1
         for i in range(len(labeled)):
             for j in range(i):
                 gain, square = 0.0, 0.0
@@ -176,50 +86,106 @@ def _exchange(
                     apart = seen[i, k] - seen[j, k]
                     gain -= apart * (markers[i, k] - markers[j, k]) / variance
                     square += apart * apart
-                if gain > most and square <= distance**2 and free[i] and free[j]:
+                if gain > most and square <= EXCHANGE_DISTANCE**2 and free[i] and free[j]:
                     most, one, other = gain, i, j
         if one < 0:
             return changed[:count]
         free[one] = free[other] = False
         first, second = labeled[one], labeled[other]
-        assigned[first], assigned[second] = assigned[second], assigned[first]
+        labels[first], labels[second] = labels[second], labels[first]
         changed[count], changed[count + 1] = first, second
         count += 2
 
 
+def gate_labels(frame: FrameState, hand: int, state: HandState, prediction: Prediction) -> FrameState:
+    """Drop labels whose points are outside the gate around their markers at the predicted pose.
+
+    The gate is as wide as the innovations of the hand's other markers in this frame are large. Where too many
+    labels are outside, the prediction is wrong, and all labels stay.
+
+    Args:
+        frame: The frame.
+        hand: Index of the hand.
+        state: The hand.
+        prediction: Its predicted pose.
+    """
+    markers = frame.markers(hand)
+    _gate(frame.points, markers, prediction.positions, state.variance)
+    return frame.with_markers(hand, markers)
+
+
+@kernel
+def _gate(
+    points: NDArray[np.float64],
+    markers: NDArray[np.int64],
+    positions: NDArray[np.float64],
+    variance: NDArray[np.float64],
+) -> None:
+    """Kernel of `gate_labels` for one hand.
+
+    Args:
+        points: The frame's points (P, 3) [m].
+        markers: The hand's marker that each of them is (P,), overwritten.
+        positions: Predicted markers (M, 3) [m].
+        variance: Their variance (M,) [m^2].
+    """
+    labeled = np.flatnonzero(markers >= 0)
+    if len(labeled) == 0:
+        return
+    squares = np.empty(len(labeled))
+    for row, point in enumerate(labeled):
+        squares[row] = ((points[point] - positions[markers[point]]) ** 2).sum()
+    shown = max(_PREDICTION_SPREAD**2, _PREDICTION_FACTOR**2 * np.median(squares) / _MEDIAN_SQUARE)
+    outside = squares > _GATE * (variance[markers[labeled]] + shown)
+    if outside.sum() <= _MOST_GATED * len(labeled):
+        markers[labeled[outside]] = -1
+
+
 def fit_labels(
-    state: HandState,
-    points: Float[np.ndarray, "N 3"],
-    labels: Int[np.ndarray, "N"],
-    prediction: Prediction,
-    config: GatingConfig,
-) -> Estimate:
+    frame: FrameState, hand: int, state: HandState, prediction: Prediction
+) -> tuple[FrameState, HandEstimate]:
     """Fit the pose to the labeled points.
 
     Labels that are inconsistent with the others are dropped, the worst first.
 
     Args:
+        frame: The frame.
+        hand: Index of the hand.
         state: The hand.
-        points: The frame's points [m].
-        labels: Their labels, overwritten.
-        prediction: The hand's predicted pose.
-        config: The gate.
+        prediction: Its predicted pose.
     """
-    start, restarted = prediction.qpos, False
+    points, markers = frame.points, frame.markers(hand)
+    start, restarted, dropped = prediction.qpos, False, False
     while True:
-        labeled = np.flatnonzero(labels >= 0)
-        targets = targets_of(points, labels, state.num_markers)
+        labeled = np.flatnonzero(markers >= 0)
+        targets = targets_of(points, markers, state.num_markers)
         estimate = state.fit(targets, start, prediction)
         if len(labeled) == 0:
-            return estimate
-        squares = ((points[labeled] - estimate.positions[labels[labeled]]) ** 2).sum(axis=1)
-        squares /= state.variance[labels[labeled]] + config.fit_spread**2
-        if squares.max() < config.gate:
-            return estimate
-        if estimate.rms > config.restart_rms and not restarted:
+            break
+        squares = ((points[labeled] - estimate.positions[markers[labeled]]) ** 2).sum(axis=1)
+        squares /= state.variance[markers[labeled]] + _FIT_SPREAD**2
+        if squares.max() < _GATE:
+            break
+        if estimate.rms > _RESTART_RMS and not restarted:
             restarted = True
             restart = state.solver.solve(targets[None])
             if restart.rms[0] < 0.5 * estimate.rms:
                 start = restart.qpos[0]
                 continue
-        labels[labeled[squares.argmax()]] = -1
+        markers[labeled[squares.argmax()]] = -1
+        dropped = True
+    return frame.with_markers(hand, markers) if dropped else frame, estimate
+
+
+def refit_labels(before: FrameState, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
+    """Fit the pose of a hand again if its labels have changed.
+
+    Args:
+        before: The frame with the labels that `track` was fitted to.
+        frame: The frame now.
+        track: The hand.
+    """
+    if (before.markers(track.hand) == frame.markers(track.hand)).all():
+        return frame, track
+    frame, estimate = fit_labels(frame, track.hand, track.state, track.prediction)
+    return frame, track._replace(estimate=estimate)

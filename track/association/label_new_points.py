@@ -2,157 +2,134 @@
 
 All assignments of a digit's candidates to its markers are tested on the digit
 (`track.association.digit_hypotheses`). Where digits share candidates, of one hand or of two that touch, the
-best joint assignment is taken (`track.association.joint_assignment`). Labels that are not settled yet can be
+best joint assignment is taken (`track.association.assignment`). Labels that are not settled yet can be
 reassigned.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Int
 from numpy.typing import NDArray
 
 from handsim.hand.topology import DIGITS
+from track.association.assignment import assign_jointly, match_log_odds, match_points
 from track.association.candidates import MAX_CANDIDATES, DigitCandidates, MarkerTable, find_candidates
 from track.association.digit_hypotheses import DigitHypotheses, empty_hypotheses, evaluate_digit
-from track.association.frame_state import FrameState
-from track.association.hand_state import Estimate, HandState, Prediction
-from track.association.joint_assignment import assign_jointly
-from track.association.point_matching import match_log_odds, match_points
+from track.association.frame_state import FrameState, Numbering
+from track.association.hand_state import HandState, HandTrack
+
+_NOWHERE: Final = 1e6  # [m] of the markers of a hand without a pose, which no point is near
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandTrack:
-    """A hand with a pose in the current frame."""
+class DigitTable(NamedTuple):
+    """The D digits of all hands, counted through the hands, with their labels."""
 
-    index: int
-    """Index of the hand."""
-    state: HandState
-    """Its filter state."""
-    prediction: Prediction
-    """The pose before the frame's markers were used."""
-    estimate: Estimate
-    """The pose fitted to the labels that IDs carried over."""
+    digits: Int[np.ndarray, "K"]
+    """Digit of each label, -1 for a palm's."""
+    labels: Int[np.ndarray, "D K"]
+    """Labels of each digit, -1 where there are fewer."""
+    markers: Int[np.ndarray, "D K"]
+    """The same in the order of the hand's layout."""
 
 
-def label_new_points(hands: Sequence[HandTrack], frame: FrameState) -> Float[np.ndarray, "P"]:
+def digit_table(states: Sequence[HandState], numbering: Numbering) -> DigitTable:
+    """The table of all hands."""
+    own = [np.where(one.digits >= 0, row * len(DIGITS) + one.digits, -1) for row, one in enumerate(states)]
+    digits = np.concatenate([np.zeros(0, dtype=np.int64), *own])
+    members = [np.flatnonzero(digits == digit) for digit in range(len(states) * len(DIGITS))]
+    labels = np.full((len(members), max(map(len, members), default=0)), -1)
+    for row, some in zip(labels, members, strict=True):
+        row[: len(some)] = some
+    owners = np.repeat(np.arange(len(states)), len(DIGITS))
+    markers = [numbering.markers(owner, row) for owner, row in zip(owners.tolist(), labels, strict=True)]
+    return DigitTable(digits, labels, np.array(markers).reshape(labels.shape))
+
+
+def label_new_points(frame: FrameState, tracks: Sequence[HandTrack], table: DigitTable) -> FrameState:
     """Label points without a label, and reassign labels that are not settled.
 
     Args:
-        hands: The hands that have a pose.
-        frame: The frame; its `labels` are overwritten.
-
-    Returns:
-        Confidence in each label that has changed; NaN for the others.
+        frame: The frame.
+        tracks: The hands that have a pose.
+        table: The digits of all hands.
     """
-    confidence = np.full(len(frame.points), np.nan)
-    if not hands:
-        return confidence
-    for hand in hands:
-        _label_palm(hand, frame, confidence)
-    table = _marker_table(hands, frame)
-    association = hands[0].state.config.association
-    candidates = find_candidates(frame.points, frame.evidence, table, len(hands) * len(DIGITS), association)
+    if not tracks:
+        return frame
+    for track in tracks:
+        frame = _label_palm(frame, track)
+    positions = np.full((len(table.digits), 3), _NOWHERE)
+    for track in tracks:
+        positions[frame.numbering.part(track.hand)] = track.estimate.positions
+    assigned = frame.labels.copy()
+    markers = MarkerTable(positions, table.digits, assigned)
+    candidates = find_candidates(frame.points, frame.evidence, markers, len(table.labels))
     if not candidates.counts.any():
-        return confidence
-    markers = _markers_of_digits(table.digits, len(candidates.counts))
-    hypotheses = empty_hypotheses(len(candidates.counts), MAX_CANDIDATES, markers.shape[1])
-    first = 0
-    for row, hand in enumerate(hands):
-        digits = slice(row * len(DIGITS), (row + 1) * len(DIGITS))
-        own = DigitCandidates(*(values[digits] for values in candidates))
-        rows = DigitHypotheses(*(values[digits] for values in hypotheses))
-        _evaluate_hand(hand, frame, own, markers[digits] - first, rows)
-        first += hand.state.num_markers
-    before, margins = table.assigned.copy(), np.full(len(frame.points), np.nan)
-    assign_jointly(candidates, hypotheses, markers, table.assigned, margins)
-    changed = before != table.assigned
-    confidence[changed] = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
-    _write_labels(hands, table.assigned, frame)
-    return confidence
+        return frame
+    hypotheses = empty_hypotheses(len(table.labels), MAX_CANDIDATES, table.labels.shape[1])
+    for track in tracks:
+        rows = _rows(track.hand)
+        own = DigitCandidates(*(values[rows] for values in candidates))
+        filled = DigitHypotheses(*(values[rows] for values in hypotheses))
+        _evaluate_hand(frame, track, own, table.markers[rows], filled)
+    margins = np.full(len(frame.points), np.nan)
+    assign_jointly(candidates, hypotheses, table.labels, assigned, margins)
+    changed = assigned != frame.labels
+    confidence = 1.0 / (1.0 + np.exp(-np.clip(margins[changed], 0.0, 30.0)))
+    return frame._replace(labels=assigned).with_confidence(changed, confidence)
 
 
-def _label_palm(
-    hand: HandTrack,
-    frame: FrameState,
-    confidence: NDArray[np.float64],
-) -> None:
-    """Match unlabeled points with the missing markers of a palm; labels and confidence are overwritten."""
-    labels = frame.labels[hand.index]
-    missing = hand.state.digits < 0
-    missing[labels[labels >= 0]] = False
-    if not missing.any():
-        return
-    palm, free = np.flatnonzero(missing), np.flatnonzero(frame.unlabeled)
-    if len(free) == 0:
-        return
+def _rows(hand: int) -> slice:
+    """The digits of a hand."""
+    return slice(hand * len(DIGITS), (hand + 1) * len(DIGITS))
+
+
+def _label_palm(frame: FrameState, track: HandTrack) -> FrameState:
+    """Match unlabeled points with the missing markers of a palm."""
+    markers, free = frame.markers(track.hand), np.flatnonzero(frame.unlabeled)
+    missing = track.state.digits < 0
+    missing[markers[markers >= 0]] = False
+    if not missing.any() or len(free) == 0:
+        return frame
+    palm = np.flatnonzero(missing)
     log_odds = match_log_odds(
         frame.points[free],
-        hand.estimate.positions[palm],
-        hand.estimate.covariances[palm],
-        hand.state.config.association.stray_density,
+        track.estimate.positions[palm],
+        track.estimate.covariances[palm],
+        track.state.config.stray_density,
     )
-    log_odds += hand.state.presence_log_odds(frame.first_seen[free])[:, palm]
-    matched, match_confidence = match_points(log_odds)
+    log_odds += track.state.presence_log_odds(frame.first_seen[free])[:, palm]
+    matched, confidence = match_points(log_odds)
     chosen = free[matched >= 0]
-    labels[chosen], confidence[chosen] = palm[matched[matched >= 0]], match_confidence[matched >= 0]
-
-
-def _marker_table(hands: Sequence[HandTrack], frame: FrameState) -> MarkerTable:
-    """The markers of all hands in a row."""
-    assigned, digits, first = np.full(len(frame.points), -1), [], 0
-    for row, hand in enumerate(hands):
-        labels, own = frame.labels[hand.index], hand.state.digits
-        assigned[labels >= 0] = first + labels[labels >= 0]
-        digits.append(np.where(own >= 0, row * len(DIGITS) + own, -1))
-        first += hand.state.num_markers
-    positions = np.concatenate([hand.estimate.positions for hand in hands])
-    return MarkerTable(positions, np.concatenate(digits), assigned)
-
-
-def _markers_of_digits(digits: NDArray[np.int64], num_digits: int) -> NDArray[np.int64]:
-    """Markers of each digit (D, K), -1 where there are fewer."""
-    members = [np.flatnonzero(digits == digit) for digit in range(num_digits)]
-    markers = np.full((num_digits, max(map(len, members))), -1)
-    for row, own in zip(markers, members, strict=True):
-        row[: len(own)] = own
-    return markers
+    markers[chosen] = palm[matched[matched >= 0]]
+    return frame.with_markers(track.hand, markers).with_confidence(chosen, confidence[matched >= 0])
 
 
 def _evaluate_hand(
-    hand: HandTrack,
     frame: FrameState,
+    track: HandTrack,
     candidates: DigitCandidates,
-    markers: NDArray[np.int64],
+    digit_markers: NDArray[np.int64],
     hypotheses: DigitHypotheses,
 ) -> None:
     """Evaluate the hypotheses of one hand's digits, which are filled."""
     if not candidates.counts.any():
         return
-    state, labels = hand.state, frame.labels[hand.index]
-    log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(labels >= 0)
-    log_odds[labeled, labels[labeled]] = frame.evidence[labeled]
-    confirmed, unconfirmed = state.digit_models(hand.prediction, hand.estimate)
+    state, markers = track.state, frame.markers(track.hand)
+    log_odds, labeled = state.presence_log_odds(frame.first_seen), np.flatnonzero(markers >= 0)
+    log_odds[labeled, markers[labeled]] = frame.evidence[labeled]
+    confirmed, unconfirmed = state.digit_models(track.prediction, track.estimate)
     for digit in np.flatnonzero(candidates.counts).tolist():
         evaluate_digit(
             state.adapted,
             confirmed if state.confirmed[digit] else unconfirmed,
             digit,
-            markers[digit, markers[digit] >= 0],
+            digit_markers[digit, digit_markers[digit] >= 0],
             frame.points,
             candidates.candidates[digit, : candidates.counts[digit]],
             log_odds,
             *(values[digit] for values in hypotheses),
         )
-
-
-def _write_labels(hands: Sequence[HandTrack], assigned: NDArray[np.int64], frame: FrameState) -> None:
-    """Write the markers of points, counted through the hands, to the frame's labels."""
-    first = 0
-    for hand in hands:
-        last = first + hand.state.num_markers
-        frame.labels[hand.index] = np.where((assigned >= first) & (assigned < last), assigned - first, -1)
-        first = last

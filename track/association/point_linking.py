@@ -1,13 +1,14 @@
-"""Numbers of points that last from frame to frame, also in streams whose own IDs do not.
+"""Points from frame to frame: numbers that last, also where the IDs of a stream do not, and what they carry.
 
-Some systems number the points of every frame anew. Then the points of the last frame are predicted, those
-with a label by the motion of their hand, and assigned to the points of the new frame; a hand that moves
-otherwise than predicted is aligned with its points that were found so far.
+Some systems number the points of every frame anew, or not at all. Then the points of the last frame are
+predicted, those with a label by the motion of their hand, and assigned to the points of the new frame; a hand
+that moves otherwise than predicted is aligned with its points that were found so far.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,21 +16,81 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from handsim.space.transforms import rigid_fit
-from track.config import LinkingConfig
+from track.association.frame_state import FrameState, Numbering
 
-Predicted = Mapping[int, tuple[int, NDArray[np.float64]]]
-"""Hand and predicted position (3,) [m] of numbered points."""
+_LASTING_SHARE: Final = (
+    0.5  # of the last frame's IDs that must be there again for the stream's IDs to be used
+)
+_DISTANCES: Final = (
+    0.04,
+    0.025,
+    0.015,
+)  # [m] of a point from its prediction before and after hands are aligned
+_FEWEST_ALIGNED: Final = 5  # points with which a hand is aligned
+_BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point without a label moves with it
+
+
+class PointHistory:
+    """What is known of the points of a stream from the frames before: label, evidence and age.
+
+    Args:
+        numbering: What labels mean.
+        silence: Time without a frame that labels do not outlive [s]; IDs may have changed by then.
+    """
+
+    def __init__(self, numbering: Numbering, silence: float) -> None:
+        self._numbering = numbering
+        self._silence = silence
+        self._linker = PointLinker(numbering.owners)
+        self._labels: dict[int, int] = {}  # of each number
+        self._evidence: dict[int, float] = {}  # for these labels (log-odds)
+        self._first_seen: dict[int, float] = {}  # [s] of each number
+        self._last_time = -np.inf  # [s] of the last frame
+
+    def carry(
+        self,
+        points: Float[np.ndarray, "P 3"],
+        ids: Int[np.ndarray, "P"],
+        time: float,
+        expected: Float[np.ndarray, "K 3"],
+    ) -> FrameState:
+        """The next frame with the labels and the evidence that its points carry over.
+
+        Args:
+            points: The points [m].
+            ids: The stream's IDs, -1 for none.
+            time: Time of the frame [s].
+            expected: Predicted position of the marker of each label [m]; NaN where there is none.
+        """
+        if time - self._last_time > self._silence:
+            self._labels = {}
+        self._last_time = time
+        numbers = self._linker.number(points, ids, self._labels, expected)
+        known = numbers.tolist()
+        self._first_seen = {number: self._first_seen.get(number, time) for number in known}
+        labels = np.array([self._labels.get(number, -1) for number in known], dtype=np.int64)
+        evidence = np.array([self._evidence[n] if n in self._labels else 0.0 for n in known])
+        confidence = 1.0 / (1.0 + np.exp(-evidence - 1.0))
+        first_seen = np.array(list(self._first_seen.values()))
+        return FrameState(points, numbers, labels, evidence, confidence, first_seen, time, self._numbering)
+
+    def keep(self, frame: FrameState) -> None:
+        """Keep what the next frame can use of this one."""
+        rows = np.flatnonzero(frame.labels >= 0)
+        numbers = frame.ids[rows].tolist()
+        self._labels = dict(zip(numbers, frame.labels[rows].tolist(), strict=True))
+        self._evidence = dict(zip(numbers, frame.evidence[rows].tolist(), strict=True))
 
 
 class PointLinker:
     """Numbers the points of a stream.
 
     Args:
-        config: Distances, and when the stream's own IDs are not used.
+        owners: Hand of each label.
     """
 
-    def __init__(self, config: LinkingConfig = LinkingConfig()) -> None:  # noqa: B008
-        self._config = config
+    def __init__(self, owners: Int[np.ndarray, "K"]) -> None:
+        self._owners = owners
         self._numbers: dict[int, int] = {}  # of the stream's IDs in the last frame
         self._last = np.zeros(0, dtype=np.int64)  # numbers (Q,) of the last frame's points
         self._points = np.zeros((0, 3))  # those points [m]
@@ -39,26 +100,26 @@ class PointLinker:
         self,
         points: Float[np.ndarray, "P 3"],
         ids: Int[np.ndarray, "P"],
-        labeled: Collection[int],
-        predict: Callable[[], Predicted],
+        labels: Mapping[int, int],
+        expected: Float[np.ndarray, "K 3"],
     ) -> Int[np.ndarray, "P"]:
         """Number the points of the next frame, as the stream does where most of its IDs last.
 
         Args:
             points: The points [m].
             ids: The stream's IDs, -1 for none.
-            labeled: Numbers of the points that had a label in the last frame. Where there are any, the IDs of
-                these count: ghosts have short lives.
-            predict: Predicts points of the last frame; called where IDs do not last.
+            labels: Label of the numbers that had one in the last frame. Where there are any, the IDs of these
+                count: ghosts have short lives.
+            expected: Predicted position of the marker of each label [m]; NaN where there is none.
 
         Returns:
             The number of each point; a point without an ID in a stream that has them gets a new one.
         """
         known = np.array([self._numbers.get(number, -1) for number in ids.tolist()], dtype=np.int64)
-        before = np.array(list(labeled), dtype=np.int64) if labeled else self._last
-        fewest = self._config.lasting_share * min(len(before), len(ids))
+        before = np.array(list(labels), dtype=np.int64) if labels else self._last
+        fewest = _LASTING_SHARE * min(len(before), len(ids))
         if np.isin(before, known).sum() < fewest:
-            known = self._link(points, predict())
+            known = self._link(points, labels, expected)
         new = np.flatnonzero(known < 0)
         known[new] = self._next + np.arange(len(new))
         self._next += len(new)
@@ -66,21 +127,24 @@ class PointLinker:
         self._last, self._points = known, points
         return known
 
-    def _link(self, points: NDArray[np.float64], predicted: Predicted) -> NDArray[np.int64]:
+    def _link(
+        self, points: NDArray[np.float64], labels: Mapping[int, int], expected: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
         """Numbers of the last frame's points for the points of this one, -1 where there is none."""
-        expected, hands = self._points.copy(), np.full(len(self._last), -1)
+        predicted, hands = self._points.copy(), np.full(len(self._last), -1)
         for row, number in enumerate(self._last.tolist()):
-            if number in predicted:
-                hands[row], expected[row] = predicted[number]
+            label = labels.get(number, -1)
+            if label >= 0 and np.isfinite(expected[label, 0]):
+                hands[row], predicted[row] = self._owners[label], expected[label]
         beside = self._beside(hands)
-        moved, found = expected.copy(), np.full(len(points), -1)
-        for distance in (self._config.first_distance, self._config.next_distance, self._config.last_distance):
+        moved, found = predicted.copy(), np.full(len(points), -1)
+        for distance in _DISTANCES:
             rows, columns = _assign(points, moved, distance)
             for hand in np.unique(hands[hands >= 0]):
                 own = hands[columns] == hand
-                if own.sum() >= self._config.fewest_aligned:
-                    rotation, shift = rigid_fit(expected[columns[own]], points[rows[own]])
-                    moved[hands == hand] = expected[hands == hand] @ rotation.T + shift
+                if own.sum() >= _FEWEST_ALIGNED:
+                    rotation, shift = rigid_fit(predicted[columns[own]], points[rows[own]])
+                    moved[hands == hand] = predicted[hands == hand] @ rotation.T + shift
                     rotation, shift = rigid_fit(self._points[columns[own]], points[rows[own]])
                     moved[beside == hand] = self._points[beside == hand] @ rotation.T + shift
         found[rows] = self._last[columns]
@@ -91,7 +155,7 @@ class PointLinker:
         beside, loose, held = np.full(len(hands), -1), np.flatnonzero(hands < 0), np.flatnonzero(hands >= 0)
         if len(loose) and len(held):
             distances = np.linalg.norm(self._points[loose, None] - self._points[held], axis=-1)
-            near = distances.min(axis=1) < self._config.beside_distance
+            near = distances.min(axis=1) < _BESIDE_DISTANCE
             beside[loose[near]] = hands[held[distances.argmin(axis=1)[near]]]
         return beside
 

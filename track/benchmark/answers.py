@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from gloves.fit import GloveFit
-from gloves.takes.tracked_take import keypoints_of
+from gloves.takes.take import keypoints_of
 from handsim.errors import FileError
 from handsim.files.arrays import read_npz
 from handsim.files.atomic import atomic_write

@@ -92,8 +92,8 @@ def make_capture(plan: Plan, out: Path, number: int) -> int:
     planned = plan.captures[number]
     take = simulate_capture(planned)
     capture, labels = _published_points(take)
-    hands = tuple(_rounded(hand.fit) for hand in take.hands)
-    joints, angles = poses_of(hands, np.stack([hand.qpos for hand in take.hands], axis=1))
+    hands = tuple(_rounded(hand) for hand in take.hands)
+    joints, angles = poses_of(hands, take.qpos)
     rounded = _round(joints, _POINT_DECIMALS), _round(angles, _ANGLE_DECIMALS)
     write_capture(out / capture_path(planned.name), capture)
     notes = "The true hands and gloves of this capture, as a perfect calibration finds them."

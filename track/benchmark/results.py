@@ -21,7 +21,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
 from gloves.captures.markers import UNLABELED
 from gloves.captures.motive_csv import MOTIVE_BEGIN
-from gloves.takes.tracked_take import load_tracked_take
+from gloves.takes.take import load_take
 from handsim.errors import HandSimError, choices
 from handsim.files.inputs import check_regular, read_bytes
 from track.benchmark.answers import (
@@ -199,7 +199,7 @@ def _label_of(column: str, label_names: tuple[str, ...]) -> int:
 
 def _of_tracked_take(path: Path, capture: Capture, label_names: tuple[str, ...]) -> Answers:
     """Labels and poses of a take of `handsim track`."""
-    take = load_tracked_take(path)
+    take = load_take(path)
     _check_frames(take.num_frames, capture)
     if take.points.shape != capture.positions.shape:
         raise BenchmarkError(

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.takes.tracked_take import MarkedBody
+from gloves.takes.take import RigidBody
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.space.objects import RigidObject
@@ -52,7 +52,7 @@ _FARTHEST: Final = 1e3  # [m] from the origin; points beyond are ignored
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RigidTemplate(MarkedBody):
+class RigidTemplate(RigidBody):
     """A rigid body whose markers determine its pose: the markers in its own frame.
 
     Raises:

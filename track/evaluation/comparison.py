@@ -23,7 +23,7 @@ from track.evaluation.take_evaluation import (
     seen_frame,
     true_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, cut_take, initialization_times, recovery_times
+from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times
 from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
 from train.labelers.protocol import Labeler
@@ -143,9 +143,9 @@ def measure_with_body(
     Raises:
         ArgumentError: The take has no body, or one with too few markers.
     """
-    if take.body is None:
+    if not take.bodies:
         raise ArgumentError(f"{capture}: the take has no body, expected one with three markers or more")
-    body = RigidTemplate.of(named_object(take.body.name))
+    body = RigidTemplate.of(named_object(take.bodies[0].name))
     nothing, measured = np.zeros(0), []
     for users, hands_of in USERS.items():
         report = _report(
@@ -159,7 +159,7 @@ def _report(
     take: Take, hands: Sequence[GloveFit], make: MakeTracker, done: Callable[[], None] | None
 ) -> TrackingReport:
     """Results of a tracker on a take, after a warm-up on its first frames."""
-    start = cut_take(take, 0, min(_WARM_UP, take.num_frames))
+    start = take.cut(0, min(_WARM_UP, take.num_frames))
     evaluate_tracker(start, hands, make(start, hands))
     return evaluate_tracker(take, hands, make(take, hands), done=done)
 

@@ -96,7 +96,7 @@ def seen_frame(take: Take, frame: int) -> SeenFrame:
 
 def true_users(take: Take) -> list[GloveFit]:
     """The hands of a take with their true shapes and gloves: the result of a perfect calibration."""
-    return [hand.fit for hand in take.hands]
+    return list(take.hands)
 
 
 def nominal_users(take: Take) -> list[GloveFit]:
@@ -106,7 +106,7 @@ def nominal_users(take: Take) -> list[GloveFit]:
         LayoutError: The take's glove is not found.
     """
     layout = load_layout(str(take.settings["glove"]))
-    return [nominal_fit(layout, nearest_size(hand.fit.shape.length), hand.side) for hand in take.hands]
+    return [nominal_fit(layout, nearest_size(hand.shape.length), hand.side) for hand in take.hands]
 
 
 def measured_users(take: Take, labeler: Labeler) -> list[GloveFit]:
@@ -165,8 +165,8 @@ def evaluate_tracker(
             done()
     missing = [(~np.isfinite(take.observed(label)[..., 0])).sum(axis=1) for label in take.hand_labels]
     errors = [
-        _pose_errors(user.model, pose, hand.fit.model, hand.qpos)
-        for user, pose, hand in zip(users, poses, take.hands, strict=True)
+        _pose_errors(user.model, poses[number], hand.model, take.qpos[:, number])
+        for number, (user, hand) in enumerate(zip(users, take.hands, strict=True))
     ]
     joints, angles = (np.stack(parts, axis=1) for parts in zip(*errors, strict=True))
     return TrackingReport(right, valid, np.stack(missing, axis=1), joints, angles, seconds)

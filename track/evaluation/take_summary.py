@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 
-from gloves.takes.tracked_take import LOST, STATUSES, TrackedTake
+from gloves.takes.take import LOST, STATUSES, Take
 from handsim.hand.topology import Side
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
@@ -16,14 +16,14 @@ _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points
 
 
-def summarize(take: TrackedTake) -> list[str]:
+def summarize(take: Take) -> list[str]:
     """One line per hand, one per body and one for the unlabeled points."""
     lines = []
     for number, side in enumerate(take.sides):
         status, rms = take.status[:, number], take.rms[:, number]
         line = f"{side} hand: {_status_shares(status)}"
         if np.isfinite(rms).any():
-            missing = take.filled[:, number].mean(axis=1)[status != LOST].mean()
+            missing = take.filled(side)[status != LOST].mean()
             line += f"; {_median_rms(rms)}, {100 * missing:.1f} % of markers filled in"
         else:
             line += "; it was never found; --hands selects the hands"
@@ -37,7 +37,7 @@ def summarize(take: TrackedTake) -> list[str]:
     return [*lines, f"{unlabeled} of {int(there.sum())} points are not markers"]
 
 
-def suspicions(take: TrackedTake) -> list[str]:
+def suspicions(take: Take) -> list[str]:
     """What is probably not as the user meant it, as one sentence each with its remedy."""
     found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
     there = np.isfinite(take.points[..., 0])
@@ -50,7 +50,7 @@ def suspicions(take: TrackedTake) -> list[str]:
     return found
 
 
-def _suspicions_of(take: TrackedTake, side: Side) -> list[str]:
+def _suspicions_of(take: Take, side: Side) -> list[str]:
     """What tells of a mistake about one hand."""
     hand = take.hand(side)
     shown = take.status[:, hand] != LOST
@@ -61,7 +61,7 @@ def _suspicions_of(take: TrackedTake, side: Side) -> list[str]:
             f"(--glove), or track the other hand alone{''.join(others)}"
         ]
     found = []
-    filled, rms = float(take.filled[shown, hand].mean()), float(np.nanmedian(take.rms[:, hand]))
+    filled, rms = float(take.filled(side)[shown].mean()), float(np.nanmedian(take.rms[:, hand]))
     if filled > _MOST_FILLED:
         found.append(
             f"{100 * filled:.1f} % of the {side} hand's markers were not seen and are filled in from its "

@@ -21,22 +21,6 @@ FEWEST_FRAMES: Final = _FRAMES_BEFORE + _FRAMES_HIDDEN + _MOST_FRAMES
 """Frames that a take needs for trials."""
 
 
-def cut_take(take: Take, first: int, last: int) -> Take:
-    """The frames of a take from `first` to before `last`.
-
-    Raises:
-        ArgumentError: There are no such frames.
-    """
-    if not 0 <= first < last <= take.num_frames:
-        raise ArgumentError(f"frames {first} to {last}, expected a part of 0 to {take.num_frames}")
-    part = slice(first, last)
-    hands = tuple(dataclasses.replace(hand, qpos=hand.qpos[part]) for hand in take.hands)
-    body = take.body and dataclasses.replace(take.body, T_world_body=take.body.T_world_body[part])
-    return dataclasses.replace(
-        take, points=take.points[part], ids=take.ids[part], labels=take.labels[part], hands=hands, body=body
-    )
-
-
 def hide_points(take: Take, first: int, frames: int) -> Take:
     """A take with all points of some frames hidden; later points have new IDs.
 
@@ -45,11 +29,13 @@ def hide_points(take: Take, first: int, frames: int) -> Take:
         first: First frame without points.
         frames: Number of frames without points.
     """
-    points, ids, labels = take.points.copy(), take.ids.copy(), take.labels.copy()
+    points, ids, labels, confidence = (
+        values.copy() for values in (take.points, take.ids, take.labels, take.confidence)
+    )
     hidden, after = slice(first, first + frames), ids[first + frames :]
-    points[hidden], ids[hidden], labels[hidden] = np.nan, -1, -1
+    points[hidden], ids[hidden], labels[hidden], confidence[hidden] = np.nan, -1, -1, np.nan
     after[after >= 0] += take.ids.max() + 1
-    return dataclasses.replace(take, points=points, ids=ids, labels=labels)
+    return dataclasses.replace(take, points=points, ids=ids, labels=labels, confidence=confidence)
 
 
 def initialization_times(
@@ -68,7 +54,7 @@ def initialization_times(
     """
     times = np.full(starts, np.nan)
     for number, first in enumerate(_random_starts(take, _MOST_FRAMES, starts, rng)):
-        part = cut_take(take, first, first + _MOST_FRAMES)
+        part = take.cut(first, first + _MOST_FRAMES)
         times[number] = _frames_until_right(part, make(part), 0)
     return times
 
@@ -86,7 +72,7 @@ def recovery_times(
     """
     times = np.full(trials, np.nan)
     for number, first in enumerate(_random_starts(take, FEWEST_FRAMES, trials, rng)):
-        part = hide_points(cut_take(take, first, first + FEWEST_FRAMES), _FRAMES_BEFORE, _FRAMES_HIDDEN)
+        part = hide_points(take.cut(first, first + FEWEST_FRAMES), _FRAMES_BEFORE, _FRAMES_HIDDEN)
         times[number] = _frames_until_right(part, make(part), _FRAMES_BEFORE + _FRAMES_HIDDEN)
     return times
 

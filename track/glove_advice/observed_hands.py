@@ -12,7 +12,6 @@ from jaxtyping import Float
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
 from handsim.errors import CaptureError
 from handsim.space.cameras import ROOM_CENTER, CameraRig
 from train.simulation.dataset_config import DatasetConfig
@@ -59,7 +58,7 @@ def observe_poses(
 
 
 def observe_motion(
-    take: Take | TrackedTake,
+    take: Take,
     layout: MarkerLayout,
     rig: CameraRig,
     num_frames: int,
@@ -79,17 +78,13 @@ def observe_motion(
         CaptureError: There is no frame in which all hands have a pose.
         LayoutError: A marker misses the skin.
     """
-    gloved = [(hand, hand.qpos) for hand in take.hands] if isinstance(take, Take) else [
-        (hand, take.qpos[:, number]) for number, hand in enumerate(take.hands)
-    ]  # fmt: skip
-    poses = np.stack([qpos for _, qpos in gloved], axis=1)
-    posed = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
+    posed = np.flatnonzero(np.isfinite(take.qpos).all(axis=(1, 2)))
     if not len(posed):
         raise CaptureError("there is no frame in which every hand of the take has a pose, expected one")
     chosen = posed[np.unique(np.linspace(0, len(posed) - 1, num_frames).astype(int))]
-    poses = poses[chosen]
+    poses = take.qpos[chosen]
     poses[..., :3] += ROOM_CENTER - poses[..., :3].mean(axis=(0, 1))
-    models = tuple(hand.model if isinstance(hand, GloveFit) else hand.fit.model for hand, _ in gloved)
+    models = tuple(hand.model for hand in take.hands)
     fits = tuple(attach(layout, model) for model in models)
     qpos = tuple(np.ascontiguousarray(poses[:, number]) for number in range(len(models)))
     return list(_observe(FrameScene(models, qpos), fits, rig, rng))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,21 +16,11 @@ from track.kinematics.starting_poses import RESTING, StartingShapes, initial_pos
 FEWEST_MARKERS: Final = 4
 """Least number of markers of a frame for a pose to be solved."""
 _EASING: Final = (1 / 64, 1 / 8, 1.0)  # factors of the robust scale, so that a start may be far off
-
-
-class SolverWeights(NamedTuple):
-    """A `SolverConfig` as the kernels take it."""
-
-    rest_precision: float
-    """Precision of a hinge around its resting angle [1/rad^2]."""
-    complete_digit_factor: float
-    """See `SolverConfig`."""
-    fewest_on_part: int
-    """See `SolverConfig`."""
-    good_rms: float
-    """See `SolverConfig` [m]."""
-    easing_steps: int
-    """See `SolverConfig`."""
+_EASING_STEPS: Final = 8  # at most at each widened scale
+_REST_PRECISION: Final = float(np.deg2rad(90.0)) ** -2  # [1/rad^2] of a hinge around its resting angle: weak
+_COMPLETE_DIGIT: Final = 1e-4  # factor of that precision for a digit that has all its markers
+_FEWEST_ON_PART: Final = 3  # markers that determine a digit's hinges, also when straight, or a palm's pose
+_GOOD_RMS: Final = 0.0005  # [m] limits and prior included, below which no further start is tried
 
 
 @kernel
@@ -43,7 +33,6 @@ def fit_frames(
     predicted: Float[np.ndarray, "P 20"],
     predicted_precision: Float[np.ndarray, "P 20"],
     wrist: Float[np.ndarray, "9"],
-    weights: SolverWeights,
     robust_scale: float,
     iterations: int,
     small_gain: float,
@@ -65,7 +54,6 @@ def fit_frames(
         predicted: Mean of the hinges [rad], one row per frame or none.
         predicted_precision: Their precision [1/rad^2].
         wrist: Predicted position [m] and orientation of the wrist, then the precisions of both.
-        weights: Weights and limits.
         robust_scale: See `levenberg_marquardt`.
         iterations: Steps at most from each start.
         small_gain: See `levenberg_marquardt`.
@@ -92,7 +80,6 @@ def fit_frames(
             predicted[frame:],
             predicted_precision[frame:],
             wrist,
-            weights,
             prior_mean,
             precision,
         )
@@ -112,7 +99,7 @@ def fit_frames(
             for part in _EASING:
                 if robust_scale == 0.0 and part < 1.0:
                     continue
-                most = iterations if part == 1.0 else min(iterations, weights.easing_steps)
+                most = iterations if part == 1.0 else min(iterations, _EASING_STEPS)
                 cost, tried = levenberg_marquardt(
                     hand, target, pose, prior_mean, precision, part * robust_scale, most, small_gain, work
                 )
@@ -120,7 +107,7 @@ def fit_frames(
             if cost < least:
                 least = cost
                 qpos[frame] = pose
-            if least < present * (weights.good_rms / MARKER_NOISE) ** 2:
+            if least < present * (_GOOD_RMS / MARKER_NOISE) ** 2:
                 break
         rms[frame] = _write_residuals(hand, target, qpos[frame], work, residuals[frame])
     return -1, qpos, rms, residuals, steps
@@ -156,7 +143,6 @@ def _set_prior(
     predicted: Float[np.ndarray, "P 20"],
     predicted_precision: Float[np.ndarray, "P 20"],
     wrist: Float[np.ndarray, "9"],
-    weights: SolverWeights,
     prior_mean: Float[np.ndarray, "27"],
     precision: Float[np.ndarray, "26"],
 ) -> None:
@@ -165,15 +151,15 @@ def _set_prior(
     The frame's rows of `predicted` and `predicted_precision` come first, if there are any.
     """
     prior_mean[:7] = wrist[:7]
-    incomplete = seen[-1] < max(on_part[-1], weights.fewest_on_part)
+    incomplete = seen[-1] < max(on_part[-1], _FEWEST_ON_PART)
     precision[NUM_JOINTS : NUM_JOINTS + 3] = wrist[7] if incomplete else 0.0
     precision[NUM_JOINTS + 3 :] = wrist[8] if incomplete else 0.0
     for hinge in range(NUM_JOINTS):
         digit = hinge // 4
-        complete = seen[digit] == on_part[digit] and seen[digit] >= weights.fewest_on_part
+        complete = seen[digit] == on_part[digit] and seen[digit] >= _FEWEST_ON_PART
         rest, weight = (
             RESTING[hinge],
-            weights.rest_precision * (weights.complete_digit_factor if complete else 1.0),
+            _REST_PRECISION * (_COMPLETE_DIGIT if complete else 1.0),
         )
         if len(predicted) > 0 and not complete:
             both = weight + predicted_precision[0, hinge]

@@ -8,7 +8,7 @@ Neighboring fingers bend together, so the covariance carries information from vi
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,8 +17,11 @@ from numpy.typing import NDArray
 from handsim.hand.topology import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from poses.shapes.library import LIBRARIES, gestures_of
-from track.config import MotionConfig
 from track.kinematics.small_systems import eliminate, invert_positive, solve_positive
+
+_JOINT_MEMORY: Final = 1.0  # [s] time constant of the process of the hinges; little is known of one after it
+_JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # least standard deviation of a predicted hinge
+_GESTURE_MARGIN: Final = float(np.deg2rad(6.0))  # added to the gestures' spread, for poses that none shows
 
 
 class JointPrior(NamedTuple):
@@ -47,16 +50,16 @@ def resting_angles() -> Float[np.ndarray, "20"]:
 
 
 @cache
-def resting_covariance(config: MotionConfig = MotionConfig()) -> Float[np.ndarray, "20 20"]:  # noqa: B008
+def resting_covariance() -> Float[np.ndarray, "20 20"]:
     """Covariance of the hinges over all gestures, and a margin for other poses [rad^2]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
-    covariance: NDArray[np.float64] = np.cov(gestures.T) + config.gesture_margin**2 * np.eye(NUM_JOINTS)
+    covariance: NDArray[np.float64] = np.cov(gestures.T) + _GESTURE_MARGIN**2 * np.eye(NUM_JOINTS)
     return covariance
 
 
-def resting_prior(config: MotionConfig = MotionConfig()) -> JointPrior:  # noqa: B008
+def resting_prior() -> JointPrior:
     """Prior of a hand without any history."""
-    covariance = resting_covariance(config)
+    covariance = resting_covariance()
     return JointPrior(resting_angles(), covariance, np.linalg.inv(covariance))
 
 
@@ -64,7 +67,6 @@ def predict_joints(
     angles: Float[np.ndarray, "20"],
     covariance: Float[np.ndarray, "20 20"],
     span: float,
-    config: MotionConfig = MotionConfig(),  # noqa: B008
 ) -> JointPrior:
     """Prior of the hinges some time after they were estimated.
 
@@ -72,11 +74,10 @@ def predict_joints(
         angles: Predicted angles [rad].
         covariance: Covariance of the estimate [rad^2].
         span: Time since the estimate [s].
-        config: Process model.
     """
     prior = JointPrior(angles, np.empty_like(covariance), np.empty_like(covariance))
-    kept = np.exp(-2.0 * max(span, 0.0) / config.joint_memory)
-    _predict_covariance(covariance, resting_covariance(config), kept, config.joint_spread, prior)
+    kept = np.exp(-2.0 * max(span, 0.0) / _JOINT_MEMORY)
+    _predict_covariance(covariance, resting_covariance(), kept, prior)
     return prior
 
 
@@ -85,7 +86,6 @@ def _predict_covariance(
     known: Float[np.ndarray, "20 20"],
     resting: Float[np.ndarray, "20 20"],
     kept: float,
-    least: float,
     prior: JointPrior,
 ) -> None:
     """Fill covariance and precision of a prior.
@@ -94,13 +94,12 @@ def _predict_covariance(
         known: Covariance of the estimate [rad^2].
         resting: Covariance of the resting distribution [rad^2].
         kept: Share of the first in the result, from 0 to 1.
-        least: Standard deviation that is added to every hinge [rad].
         prior: Filled, but for its angles.
     """
     for row in range(len(known)):
         for column in range(len(known)):
             prior.covariance[row, column] = kept * known[row, column] + (1.0 - kept) * resting[row, column]
-        prior.covariance[row, row] += least**2
+        prior.covariance[row, row] += _JOINT_SPREAD**2
     prior.precision[:] = prior.covariance
     invert_positive(prior.precision)
 

@@ -18,8 +18,7 @@ from gloves.fit import GloveFit
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.hand.topology import DIGITS, NUM_JOINTS, NUM_QPOS
-from track.config import SolverConfig
-from track.kinematics.frame_fits import FEWEST_MARKERS, SolverWeights, fit_frames
+from track.kinematics.frame_fits import FEWEST_MARKERS, fit_frames
 from track.kinematics.joint_prior import JointPrior
 from track.kinematics.levenberg_marquardt import MARKER_NOISE
 from track.kinematics.marker_kinematics import HandArrays, hand_arrays
@@ -31,7 +30,11 @@ from track.kinematics.marker_prediction import (
 )
 from track.kinematics.starting_poses import StartingShapes, starting_shapes
 
+_MOST_STEPS: Final = 30  # from each start
 _CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
+_ACCURATE: Final = (
+    3e-5 / MARKER_NOISE
+) ** 2  # of the cost, in real time: all markers together nearer by 30 um
 _NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # a pose, with precision zero
 
 
@@ -66,7 +69,6 @@ class PoseSolver:
         fit: The hand in its glove.
         outlier_distance: Scale [m] of a robust loss (Geman and McClure 1987), so that a wrong label does not
             bend the hand; it needs a good start. Plain least squares when not given.
-        config: Weights and limits.
 
     Raises:
         ArgumentError: `outlier_distance` is not positive.
@@ -77,7 +79,6 @@ class PoseSolver:
         fit: GloveFit,
         *,
         outlier_distance: float | None = None,
-        config: SolverConfig = SolverConfig(),  # noqa: B008 (frozen)
     ) -> None:
         if outlier_distance is not None and not outlier_distance > 0.0:
             raise ArgumentError(f"outlier_distance is {outlier_distance:g} m, expected a positive distance")
@@ -85,15 +86,6 @@ class PoseSolver:
         """The hand and its glove; a change of its marker positions takes effect in the next solution."""
         self._shapes: StartingShapes = starting_shapes(fit)
         self._robust_scale = 0.0 if outlier_distance is None else outlier_distance**-2
-        self._most_steps = config.most_steps
-        self._small_gain = (config.frame_accuracy / MARKER_NOISE) ** 2
-        self._weights = SolverWeights(
-            config.rest_spread**-2,
-            config.complete_digit_factor,
-            config.fewest_on_part,
-            config.good_rms,
-            config.easing_steps,
-        )
         parts = (*range(len(DIGITS)), -1)  # the palm last
         self._on_part = np.array([(self.hand.digits == number).sum() for number in parts])
 
@@ -112,7 +104,7 @@ class PoseSolver:
             initial: Poses to start from; a hand put together from a few shapes when not given, and where that
                 does not end within 0.5 mm RMS, each of those shapes, of which the best is kept.
             prior: Distribution of the hinges.
-            iterations: Steps at most from each start; as configured (30) when not given.
+            iterations: Steps at most from each start; 30 when not given.
 
         Raises:
             ArgumentError: `targets`, `initial` or `prior` do not fit the glove or each other, or a frame has
@@ -132,7 +124,7 @@ class PoseSolver:
                     f"initial has shape {starts.shape}, expected ({len(targets)}, {NUM_QPOS})"
                 )
         angles, precision = _rows(prior, len(targets))
-        steps = self._most_steps if iterations is None else iterations
+        steps = _MOST_STEPS if iterations is None else iterations
         wrong, fit = self._run(targets, starts, angles, precision, _NO_WRIST, steps, _CONVERGED)
         if wrong >= 0:
             present = int(np.isfinite(targets[wrong]).all(axis=-1).sum())
@@ -167,7 +159,7 @@ class PoseSolver:
         """
         wrist_prior = np.concatenate([wrist, np.array(wrist_spread) ** -2.0])
         precision, one = spread[None] ** -2.0, (target[None], start[None], angles[None])
-        return self._run(*one, precision, wrist_prior, self._most_steps, self._small_gain)[1]
+        return self._run(*one, precision, wrist_prior, _MOST_STEPS, _ACCURATE)[1]
 
     def _run(
         self,
@@ -189,7 +181,6 @@ class PoseSolver:
             angles,
             precision,
             wrist,
-            self._weights,
             self._robust_scale,
             iterations,
             small_gain,

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from gloves.takes.tracked_take import label_names
+from gloves.takes.take import label_names
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES, Side
 from track.bodies.rigid_body import RigidTemplate

@@ -13,8 +13,7 @@ from gloves.captures.formats import READABLE, read_capture
 from gloves.layout import list_layouts, load_layout
 from gloves.takes.corrections import corrections_path, told
 from gloves.takes.growing import is_growing
-from gloves.takes.motion import load_any_take
-from gloves.takes.take import Take
+from gloves.takes.take import load_take
 from handsim.errors import ArgumentError, FileError, HandSimWarning
 from handsim.files.atomic import read_toml
 from handsim.files.outputs import check_outputs
@@ -27,7 +26,7 @@ from track.viewer.recordings.captures import CaptureRecording
 from track.viewer.recordings.corrector import Corrector
 from track.viewer.recordings.datasets import DatasetRecording
 from track.viewer.recordings.recording import Recording
-from track.viewer.recordings.takes import TrackedRecording, TruthRecording
+from track.viewer.recordings.takes import TakeRecording
 from track.viewer.scene.frame_view import FrameView
 from track.viewer.scene.rig_view import show_rig, show_volume
 from track.viewer.scene.stage import set_stage
@@ -106,15 +105,13 @@ def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector 
     if path.suffix.lower() in READABLE:
         return CaptureRecording(read_capture(path), rig), None
     if path.suffix.lower() == ".npz" or is_growing(path):
-        take = load_any_take(path)
-        if isinstance(take, Take):
-            return TruthRecording(take, rig), None
-        if is_growing(path):
-            return TrackedRecording(take, rig), None
+        take = load_take(path)
+        if is_growing(path) or "tracker" not in take.settings:  # it grows, or is no tracker's to correct
+            return TakeRecording(take, rig), None
         corrector = Corrector(path, take)
         for sentence in told(corrections_path(path), corrector.unfitting):
             warnings.warn(sentence, HandSimWarning, stacklevel=2)
-        return TrackedRecording(corrector.take, rig), corrector
+        return TakeRecording(corrector.take, rig), corrector
     raise ArgumentError(f"{path}: a file of another kind, expected {ACCEPTED}")
 
 
@@ -176,7 +173,7 @@ def show_recording(server: ViserServer, recording: Recording, corrector: Correct
     view = FrameView(server, recording)
     panel.add_doubts(timeline.jump)
     editor: LabelEditor | None = None
-    if corrector is not None and isinstance(recording, TrackedRecording):
+    if corrector is not None and isinstance(recording, TakeRecording):
         editor = LabelEditor(server, recording, corrector, changed)
         view.on_pick = editor.pick
     panel.add_plots()

@@ -10,7 +10,7 @@ import numpy as np
 from gloves.takes.corrections import NO_MARKER
 from handsim.errors import CaptureError
 from track.viewer.recordings.corrector import Corrector, label_of
-from track.viewer.recordings.takes import TrackedRecording
+from track.viewer.recordings.takes import TakeRecording
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -35,7 +35,7 @@ class LabelEditor:
     def __init__(
         self,
         server: ViserServer,
-        recording: TrackedRecording,
+        recording: TakeRecording,
         corrector: Corrector,
         changed: Callable[[], None],
     ) -> None:

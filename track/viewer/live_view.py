@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gloves.takes.tracked_take import label_names
+from gloves.takes.take import label_names
 from handsim.hand.topology import NUM_QPOS
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import TrackedFrame
@@ -45,7 +45,7 @@ class LiveRecording(Recording):
             label_names(tracker.hands, tracker.bodies),
             most_points=_MOST_POINTS,
             radius=tracker.hands[0].layout.radius,
-            bodies=tuple(shown_body(body.name) for body in tracker.bodies),
+            bodies=tuple(shown_body(body) for body in tracker.bodies),
             rig=rig,
         )
 

@@ -105,7 +105,7 @@ def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
     count = _Count(labeler)
     for take in takes:
         for hand in range(len(take.hands)):
-            names = take.hands[hand].fit.layout.names
+            names = take.hands[hand].layout.names
             if names != labeler.marker_names:
                 raise CaptureError(
                     f"the take's glove has markers {', '.join(names)}, the labeler knows "

@@ -1,17 +1,71 @@
-"""The set labeler on one cloud in numpy: torch's time for so few points goes to its calls.
+"""The set labeler on one cloud, compiled: torch's time for so few points goes to its calls.
 
-Names of weights, and the operations in their order, are those of `train.labelers.set_network`.
+Operations in their order are those of `train.labelers.set_network`.
 """
 
 from __future__ import annotations
 
+from typing import Final, NamedTuple
+
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int32
 from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from train.labelers.set_network import SetLabeler
 
-_EPSILON = np.float32(1e-5)  # of torch's LayerNorm
+Floats = NDArray[np.float32]
+
+_EPSILON: Final = np.float32(1e-5)  # of torch's LayerNorm
+_NEAREST: Final = np.float32(1e-12)  # [m^2] added to squared distances
+_COUNT: Final = np.float32(20.0)  # points that sums over a cloud are measured by
+_MESSAGES: Final = np.float32(5.0)  # messages that sums over senders are measured by
+# exp(x) = 2^n exp(r) with r = x - n log(2), and exp(r) as a polynomial: exact to two units of the last place.
+_LIMIT: Final = np.float32(80.0)  # beyond it the logistic function is 0 or 1 in single precision
+_LOG2E: Final = np.float32(1.4426950408889634)
+_LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
+_HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+# Minimax coefficients of Cephes' expf (Moshier).
+_P5, _P4, _P3 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
+_P2, _P1 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1)
+
+
+class _Norm(NamedTuple):
+    """Layer norms of D rounds."""
+
+    weight: Float32[np.ndarray, "D W"]
+    bias: Float32[np.ndarray, "D W"]
+
+
+class _Linear(NamedTuple):
+    """Linear layers of D rounds, their weights transposed."""
+
+    weight: Float32[np.ndarray, "D I O"]
+    bias: Float32[np.ndarray, "D O"]
+
+
+class _Rounds(NamedTuple):
+    """The rounds of messages."""
+
+    norm: _Norm
+    ends: _Linear
+    distance_gate: Float32[np.ndarray, "D G K"]
+    values: _Linear
+    mix: _Linear
+    think_norm: _Norm
+    think: _Linear
+    think_again: _Linear
+
+
+class _Ends(NamedTuple):
+    """What comes before the rounds and after them; D is 1."""
+
+    embed: _Linear
+    embed_again: _Linear
+    norm: _Norm
+    to_scores: _Linear
+    to_occluded: _Linear
+    to_occluded_again: _Linear
 
 
 class CloudScorer:
@@ -23,13 +77,31 @@ class CloudScorer:
 
     def __init__(self, network: SetLabeler) -> None:
         config = network.config
-        self._gates = config.gates
-        self._centers = network.centers.numpy()[:, None, None]
         self._sharpness = np.float32(-0.5 * ((config.num_distances - 1) / config.reach) ** 2)
+        self._centers = network.centers.numpy()
         weights = {name: value.detach().numpy() for name, value in network.state_dict().items()}
-        self._embed = _Layers(weights, "embed.")
-        self._rounds = [_Layers(weights, f"rounds.{number}.") for number in range(config.depth)]
-        self._last = _Layers(weights, "")
+        rounds = [f"rounds.{number}." for number in range(config.depth)]
+        ends = _linear(weights, rounds, "ends")
+        gate_bias = np.stack([weights[f"{one}distance_gate.bias"] for one in rounds])
+        ends.bias[:, : config.gates] += gate_bias
+        self._rounds = _Rounds(
+            _norm(weights, rounds, "norm"),
+            ends,
+            np.ascontiguousarray(np.stack([weights[f"{one}distance_gate.weight"] for one in rounds])),
+            _linear(weights, rounds, "values"),
+            _linear(weights, rounds, "mix"),
+            _norm(weights, rounds, "think.0"),
+            _linear(weights, rounds, "think.1"),
+            _linear(weights, rounds, "think.3"),
+        )
+        self._ends = _Ends(
+            _linear(weights, [""], "embed.0"),
+            _linear(weights, [""], "embed.2"),
+            _norm(weights, [""], "norm"),
+            _linear(weights, [""], "to_scores"),
+            _linear(weights, [""], "to_occluded.0"),
+            _linear(weights, [""], "to_occluded.2"),
+        )
 
     def score(
         self, points: Float[np.ndarray, "N 3"]
@@ -39,98 +111,224 @@ class CloudScorer:
         Args:
             points: One point or more [m].
         """
-        count = len(points)
-        near = (points - points.mean(axis=0)).astype(np.float32)
-        offsets = near[:, None] - near
-        distances = np.sqrt(np.einsum("ijk,ijk->ij", offsets, offsets) + np.float32(1e-12))
-        bumps = np.square(distances - self._centers)
-        bumps *= self._sharpness
-        np.exp(bumps, out=bumps)  # (K, N, N)
-        profile = np.empty((count, len(bumps) + 1), dtype=np.float32)
-        profile[:, :-1], profile[:, -1] = bumps.sum(axis=2).T, count / 20.0
-        features = self._embed.linear("2", _silu(self._embed.linear("0", profile)))
-        flat = bumps.reshape(len(bumps), -1)
-        for layers in self._rounds:
-            features += self._message(layers, features, flat)
-            features += self._thought(layers, features)
-        features = self._last.norm("norm", features)
-        scores = self._last.linear("to_scores", features)
-        pooled = features.sum(axis=0) / np.float32(20.0)
-        occluded = self._last.linear("to_occluded.2", _silu(self._last.linear("to_occluded.0", pooled)))
-        labels = np.concatenate([scores[:, :-1].T, occluded[:, None]], axis=1)
-        return _log_softmax(scores), _log_softmax(labels)
-
-    def _message(
-        self, layers: _Layers, features: NDArray[np.float32], bumps: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        """What the points of features (N, W) tell each other; `bumps` (K, N * N)."""
-        count, gates = len(features), self._gates
-        normed = layers.norm("norm", features)
-        ends = layers.linear("ends", normed).T  # (2 G, N): receivers, then senders
-        gate: NDArray[np.float32] = (layers.weight("distance_gate") @ bumps).reshape(gates, count, count)
-        gate += (ends[:gates] + layers.bias("distance_gate")[:, None])[..., None]
-        gate += ends[gates:, None]
-        _sigmoid(gate)
-        values = layers.linear("values", normed).reshape(count, gates, -1).transpose(1, 0, 2)
-        received: NDArray[np.float32] = (gate @ values).transpose(1, 0, 2).reshape(count, -1)
-        received /= np.float32(5.0)
-        return layers.linear("mix", received)
-
-    def _thought(self, layers: _Layers, features: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What each point makes of its features (N, W)."""
-        hidden = layers.linear("think.1", layers.norm("think.0", features))
-        return layers.linear("think.3", _silu(hidden))
+        return _score(
+            np.ascontiguousarray(points, dtype=np.float64),
+            self._centers,
+            self._sharpness,
+            self._rounds,
+            self._ends,
+        )
 
 
-class _Layers:
-    """The linear layers and norms of a part of the network, by their names there."""
-
-    def __init__(self, weights: dict[str, NDArray[np.float32]], prefix: str) -> None:
-        own = {name.removeprefix(prefix): value for name, value in weights.items() if name.startswith(prefix)}
-        self._weights = {name: np.ascontiguousarray(value) for name, value in own.items()}
-        self._transposed = {name: np.ascontiguousarray(value.T) for name, value in own.items()}
-
-    def weight(self, name: str) -> NDArray[np.float32]:
-        """A layer's weights (outputs, inputs)."""
-        return self._weights[f"{name}.weight"]
-
-    def bias(self, name: str) -> NDArray[np.float32]:
-        """A layer's bias (outputs,)."""
-        return self._weights[f"{name}.bias"]
-
-    def linear(self, name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A linear layer of values (..., inputs)."""
-        result: NDArray[np.float32] = values @ self._transposed[f"{name}.weight"]
-        result += self.bias(name)
-        return result
-
-    def norm(self, name: str, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A layer norm of values (N, W)."""
-        centered: NDArray[np.float32] = values - values.mean(axis=1, keepdims=True)
-        variance = np.einsum("nw,nw->n", centered, centered)[:, None] / np.float32(values.shape[1])
-        centered *= self.weight(name) / np.sqrt(variance + _EPSILON)
-        centered += self.bias(name)
-        return centered
+def _linear(weights: dict[str, Floats], parts: list[str], name: str) -> _Linear:
+    """A linear layer of some parts of the network, by its name there."""
+    return _Linear(
+        np.stack([np.ascontiguousarray(weights[f"{part}{name}.weight"].T) for part in parts]),
+        np.stack([weights[f"{part}{name}.bias"] for part in parts]),
+    )
 
 
-def _sigmoid(values: NDArray[np.float32]) -> None:
-    """The logistic function in place; beyond 80 it is 0 or 1 in single precision."""
-    np.clip(values, -80.0, 80.0, out=values)
-    np.negative(values, out=values)
-    np.exp(values, out=values)
-    values += np.float32(1.0)
-    np.reciprocal(values, out=values)
+def _norm(weights: dict[str, Floats], parts: list[str], name: str) -> _Norm:
+    """A layer norm of some parts of the network, by its name there."""
+    weight, bias = (
+        np.stack([weights[f"{part}{name}.{kind}"] for part in parts]) for kind in ("weight", "bias")
+    )
+    return _Norm(weight, bias)
 
 
-def _silu(values: NDArray[np.float32]) -> NDArray[np.float32]:
+@kernel
+def _score(
+    points: Float[np.ndarray, "N 3"],
+    centers: Float32[np.ndarray, "K"],
+    sharpness: np.float32,
+    rounds: _Rounds,
+    ends: _Ends,
+) -> tuple[Floats, Floats]:
+    """Log-probabilities (N, M + 1) of points and (M, N + 1) of labels.
+
+    Args:
+        points: Points [m].
+        centers: Distances around which the bumps stand [m].
+        sharpness: Of the bumps, -0.5 over their squared width [1/m^2].
+        rounds: Weights of the rounds.
+        ends: Weights of the other layers.
+    """
+    count, width = len(points), ends.embed.weight.shape[2]
+    bits = np.empty(max(len(centers) * count * count, 2 * width * count), dtype=np.int32)
+    scale = bits.view(np.float32)
+    bumps = _bumps(points, centers, sharpness, bits, scale)
+    profile = np.empty((count, len(centers) + 1), dtype=np.float32)
+    for k in range(len(centers)):
+        for i in range(count):
+            total = _ZERO
+            for j in range(count):
+                total += bumps[k, i * count + j]
+            profile[i, k] = total
+    profile[:, -1] = np.float32(count) / _COUNT
+    hidden = _dense(profile, ends.embed, 0)
+    _silu(hidden.ravel(), bits, scale)
+    features = _dense(hidden, ends.embed_again, 0)
+    for one in range(len(rounds.distance_gate)):
+        _exchange(features, bumps, rounds, one, bits, scale)
+        hidden = _dense(_layer_norm(features, rounds.think_norm, one), rounds.think, one)
+        _silu(hidden.ravel(), bits, scale)
+        features += _dense(hidden, rounds.think_again, one)
+    features = _layer_norm(features, ends.norm, 0)
+    scores = _dense(features, ends.to_scores, 0)
+    pooled = np.zeros((1, width), dtype=np.float32)
+    for i in range(count):
+        pooled[0] += features[i]
+    pooled /= _COUNT
+    hidden = _dense(pooled, ends.to_occluded, 0)
+    _silu(hidden.ravel(), bits, scale)
+    occluded = _dense(hidden, ends.to_occluded_again, 0)
+    labels = np.empty((scores.shape[1] - 1, count + 1), dtype=np.float32)
+    labels[:, :-1], labels[:, -1] = scores[:, :-1].T, occluded[0]
+    _log_softmax(scores)
+    _log_softmax(labels)
+    return scores, labels
+
+
+@kernel
+def _bumps(
+    points: Float[np.ndarray, "N 3"],
+    centers: Float32[np.ndarray, "K"],
+    sharpness: np.float32,
+    bits: Int32[np.ndarray, "B"],
+    scale: Float32[np.ndarray, "B"],
+) -> Floats:
+    """How near the distance of each pair of points (K, N * N) is to each center, 0 to 1."""
+    count = len(points)
+    near = np.empty((count, 3), dtype=np.float32)
+    for axis in range(3):
+        near[:, axis] = points[:, axis] - points[:, axis].mean()
+    distances = np.empty(count * count, dtype=np.float32)
+    for i in range(count):
+        for j in range(count):
+            x, y, z = near[i, 0] - near[j, 0], near[i, 1] - near[j, 1], near[i, 2] - near[j, 2]
+            distances[i * count + j] = np.sqrt(x * x + y * y + z * z + _NEAREST)
+    bumps = np.empty((len(centers), count * count), dtype=np.float32)
+    for k in range(len(centers)):
+        for pair in range(count * count):
+            off = distances[pair] - centers[k]
+            bumps[k, pair] = off * off * sharpness
+    flat = bumps.ravel()
+    _split_exp(flat, bits, scale)
+    for index in range(len(flat)):
+        flat[index] *= scale[index]
+    return bumps
+
+
+@kernel
+def _exchange(
+    features: Float32[np.ndarray, "N W"],
+    bumps: Float32[np.ndarray, "K N*N"],
+    rounds: _Rounds,
+    one: int,
+    bits: Int32[np.ndarray, "B"],
+    scale: Float32[np.ndarray, "B"],
+) -> None:
+    """Add to features what the points tell one another in a round."""
+    count, width, num_gates = len(features), features.shape[1], rounds.distance_gate.shape[1]
+    normed = _layer_norm(features, rounds.norm, one)
+    ends = _dense(normed, rounds.ends, one)  # receivers, then senders
+    gate = np.dot(rounds.distance_gate[one], bumps)
+    for g in range(num_gates):
+        for i in range(count):
+            for j in range(count):
+                gate[g, i * count + j] += ends[i, g] + ends[j, num_gates + g]
+    _sigmoid(gate.ravel(), bits, scale)
+    values = _dense(normed, rounds.values, one)
+    received, per_gate = np.zeros((count, width), dtype=np.float32), width // num_gates
+    for g in range(num_gates):
+        first = g * per_gate
+        for i in range(count):
+            for j in range(count):
+                weight = gate[g, i * count + j]
+                for column in range(first, first + per_gate):
+                    received[i, column] += weight * values[j, column]
+    received /= _MESSAGES
+    features += _dense(received, rounds.mix, one)
+
+
+@kernel
+def _dense(values: Float32[np.ndarray, "N I"], layer: _Linear, one: int) -> Floats:
+    """A linear layer (N, O)."""
+    result: Floats = np.dot(values, layer.weight[one]).astype(np.float32)
+    for i in range(len(result)):
+        for j in range(result.shape[1]):
+            result[i, j] += layer.bias[one, j]
+    return result
+
+
+@kernel
+def _layer_norm(values: Float32[np.ndarray, "N W"], norm: _Norm, one: int) -> Floats:
+    """A layer norm (N, W)."""
+    count, width = values.shape
+    result = np.empty((count, width), dtype=np.float32)
+    for i in range(count):
+        mean, variance = _ZERO, _ZERO
+        for j in range(width):
+            mean += values[i, j]
+        mean /= np.float32(width)
+        for j in range(width):
+            variance += (values[i, j] - mean) * (values[i, j] - mean)
+        factor = _ONE / np.sqrt(variance / np.float32(width) + _EPSILON)
+        for j in range(width):
+            result[i, j] = (values[i, j] - mean) * factor * norm.weight[one, j] + norm.bias[one, j]
+    return result
+
+
+@kernel
+def _split_exp(
+    values: Float32[np.ndarray, "L"], bits: Int32[np.ndarray, "B"], scale: Float32[np.ndarray, "B"]
+) -> None:
+    """The exponential of values as a product: values in place, and a power of two in `scale`.
+
+    `scale` and `bits` are the same memory; values beyond 80 are cut off.
+    """
+    for index in range(len(values)):
+        x = values[index]
+        x = x if x < _LIMIT else _LIMIT
+        x = x if x > -_LIMIT else -_LIMIT
+        whole = np.floor(x * _LOG2E + _HALF)
+        r = x - whole * _LN2_HIGH - whole * _LN2_LOW
+        p = ((((_P5 * r + _P4) * r + _P3) * r + _P2) * r + _P1) * r + _HALF
+        values[index] = p * r * r + r + _ONE
+        bits[index] = (np.int32(whole) + np.int32(127)) << np.int32(23)
+
+
+@kernel
+def _sigmoid(
+    values: Float32[np.ndarray, "L"], bits: Int32[np.ndarray, "B"], scale: Float32[np.ndarray, "B"]
+) -> None:
+    """The logistic function in place."""
+    for index in range(len(values)):
+        values[index] = -values[index]
+    _split_exp(values, bits, scale)
+    for index in range(len(values)):
+        values[index] = _ONE / (_ONE + values[index] * scale[index])
+
+
+@kernel
+def _silu(
+    values: Float32[np.ndarray, "L"], bits: Int32[np.ndarray, "B"], scale: Float32[np.ndarray, "B"]
+) -> None:
+    """Values times their logistic function, in place."""
     gate = values.copy()
-    _sigmoid(gate)
-    gate *= values
-    return gate
+    _sigmoid(gate, bits, scale)
+    for index in range(len(values)):
+        values[index] *= gate[index]
 
 
-def _log_softmax(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Along the last axis."""
-    shifted: NDArray[np.float32] = values - values.max(axis=1, keepdims=True)
-    shifted -= np.log(np.exp(shifted).sum(axis=1, keepdims=True))
-    return shifted
+@kernel
+def _log_softmax(values: Float32[np.ndarray, "R C"]) -> None:
+    """Along the last axis, in place."""
+    for row in range(len(values)):
+        most = values[row].max()
+        total = _ZERO
+        for column in range(values.shape[1]):
+            total += np.exp(values[row, column] - most)
+        off = most + np.log(total)
+        for column in range(values.shape[1]):
+            values[row, column] -= off

@@ -10,11 +10,11 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from train.data.batches import Batch
-from train.labelers.batch_network import BatchNetwork
-from train.labelers.protocol import Labeling, label_by_scores, label_in_batches, pad_clouds
+from train.labelers.protocol import Labeling, check_clouds, check_output
 from train.labelers.set_inference import CloudScorer
 from train.labelers.set_network import SetLabeler, labeling_loss
 from train.matching.pose_prior import PosePrior
+from train.matching.verification import match_scores
 
 
 class TrainedSetLabeler:
@@ -28,8 +28,7 @@ class TrainedSetLabeler:
     def __init__(self, network: SetLabeler, marker_names: tuple[str, ...]) -> None:
         self.network = network.eval()
         self.marker_names = marker_names
-        self._batches = BatchNetwork(self.network)
-        self._scorer: CloudScorer | None = None  # made for the first cloud that comes alone
+        self._scorer = CloudScorer(self.network)
 
     @property
     def prior(self) -> PosePrior | None:
@@ -38,19 +37,14 @@ class TrainedSetLabeler:
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
-        return label_in_batches(frames, self._label)
+        return [self._label(cloud) for cloud in check_clouds(frames)]
 
-    @torch.inference_mode()
-    def _label(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
-        if len(clouds) == 1:
-            if self._scorer is None:
-                self._scorer = CloudScorer(self.network)
-            by_point, by_label = self._scorer.score(clouds[0])
-            return label_by_scores(clouds, by_point[None], by_label[None], self.network.prior)
-        points, present = pad_clouds(clouds)
-        scores = self._batches(torch.from_numpy(points), torch.from_numpy(present))
-        by_point, by_label = scores.points.cpu().numpy(), scores.labels.cpu().numpy()
-        return label_by_scores(clouds, by_point, by_label, self.network.prior)
+    def _label(self, cloud: NDArray[np.float64]) -> Labeling:
+        if not len(cloud):
+            return Labeling(np.zeros(0, dtype=np.int64), np.zeros(0))
+        by_point, by_label = self._scorer.score(cloud)
+        check_output(by_label)
+        return Labeling(*match_scores(cloud, by_point, by_label, self.network.prior))
 
 
 def set_loss(network: torch.nn.Module, batch: Batch, device: torch.device) -> torch.Tensor:

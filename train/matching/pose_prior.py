@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from handsim.errors import WeightsError
 from handsim.kernels.kernel import kernel
 
-_NEAREST: Final = 4  # components that count, of all those whose mean hand is compared with the points
+NEAREST: Final = 4
+"""Components that count, of all those whose mean hand is compared with the points."""
 _LEAST_POINTS: Final = 4  # fewer fit any hand
-_NEWTON_STEPS: Final = 12  # of a polynomial of fourth degree, from above its largest root
-_MIRROR: Final = np.array([-1.0, 1.0, 1.0])
+_NEWTON_STEPS: Final = 60  # most, of a polynomial of fourth degree, from above its largest root
+_ROUGH, _EXACT = 1e-9, 1e-14  # last step, relative to the bound above the root
 _MOST_COMPONENTS, _MOST_DIRECTIONS = 10_000, 100
+FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,9 +81,9 @@ class PosePrior:
         """
         if len(points) < _LEAST_POINTS:
             return -np.inf
-        nearest = self.nearest(points, labels, mirrored=mirrored, count=_NEAREST, among=among)
+        nearest = self.nearest(points, labels, mirrored=mirrored, count=NEAREST, among=among)
         tables = self.means, self.directions, self.spreads, self.log_weights
-        return float(_log_density(_seen(points, mirrored), labels, nearest, *tables))
+        return float(_log_density(seen_as_right(points, mirrored), labels, nearest, *tables))
 
     def nearest(
         self,
@@ -102,7 +104,8 @@ class PosePrior:
             among: The components to choose from; all when not given.
         """
         chosen = np.arange(len(self.means)) if among is None else among
-        errors = _misses(_seen(points, mirrored), labels, chosen, self.means)
+        table = means_by_marker(self.means, chosen)
+        errors = procrustes_errors(seen_as_right(points, mirrored), labels, table)
         return chosen[np.argsort(errors)[:count]]
 
     def tensors(self) -> dict[str, NDArray[np.generic]]:
@@ -122,77 +125,155 @@ class PosePrior:
         return cls(**{name: np.asarray(table, dtype=np.float32) for name, table in tensors.items()})
 
 
-def _seen(points: NDArray[np.float64], mirrored: bool) -> NDArray[np.float64]:
-    """Centered points (N, 3) of what is a right hand then."""
-    centered: NDArray[np.float64] = points - points.mean(axis=0)
-    return centered * _MIRROR if mirrored else centered
+@kernel
+def seen_as_right(points: Float[np.ndarray, "N 3"], mirrored: bool) -> FloatArray:
+    """Centered points (N, 3) [m] of what is a right hand then."""
+    centered = points.copy()
+    for axis in range(3):
+        centered[:, axis] -= points[:, axis].mean()
+    if mirrored:
+        centered[:, 0] *= -1.0
+    return centered
 
 
 @kernel
-def _misses(
-    cloud: NDArray[np.float64],
-    labels: NDArray[np.int64],
-    chosen: NDArray[np.int64],
-    means: NDArray[np.float32],
-) -> NDArray[np.float64]:
-    """Squared distances (C,) of centered points (N, 3) to mean hands (K, M, 3) turned onto them [m^2]."""
-    errors = np.empty(len(chosen))
+def means_by_marker(means: Float32[np.ndarray, "K M 3"], chosen: Int[np.ndarray, "C"]) -> FloatArray:
+    """Mean hands (M, 3, C) of some components, the components next to one another in memory [m]."""
+    table = np.empty((means.shape[1], 3, len(chosen)))
     for number in range(len(chosen)):
-        product, size = _product(cloud, labels, means[chosen[number]])
-        errors[number] = size - 2.0 * _largest_root(_quaternion_matrix(product), 0.5 * size)
+        for marker in range(means.shape[1]):
+            for axis in range(3):
+                table[marker, axis, number] = means[chosen[number], marker, axis]
+    return table
+
+
+@kernel
+def procrustes_errors(
+    cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], table: Float[np.ndarray, "M 3 C"]
+) -> FloatArray:
+    """Squared distances (C,) of centered points to mean hands that are moved and turned onto them [m^2]."""
+    count, size = table.shape[2], 0.0
+    product, center, squares = np.zeros((9, count)), np.zeros((3, count)), np.zeros(count)
+    for number in range(len(cloud)):
+        x, y, z = cloud[number, 0], cloud[number, 1], cloud[number, 2]
+        size += x * x + y * y + z * z
+        for axis in range(3):
+            mean = table[labels[number], axis]
+            for one in range(count):
+                product[axis, one] += x * mean[one]
+                product[3 + axis, one] += y * mean[one]
+                product[6 + axis, one] += z * mean[one]
+                center[axis, one] += mean[one]
+                squares[one] += mean[one] * mean[one]
+    errors = np.empty(count)
+    for one in range(count):
+        off = center[0, one] ** 2 + center[1, one] ** 2 + center[2, one] ** 2
+        both = size + squares[one] - off / len(cloud)
+        errors[one] = both - 2.0 * _largest_root(product[:, one], 0.5 * both, _ROUGH)
     return errors
 
 
 @kernel
+def _largest_root(product: Float[np.ndarray, "9"], above: float, tolerance: float) -> float:
+    """Largest eigenvalue of Horn's matrix of a sum of outer products, from a bound above it (Theobald 2005).
+
+    Its characteristic polynomial is x^4 + c2 x^2 + c1 x + c0.
+    """
+    a, b, c, d, e, f, g, h, i = product
+    xx, yy, zz = a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i
+    xy, xz, yz = a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i
+    total = xx + yy + zz
+    c2 = -2.0 * total
+    c1 = -8.0 * (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
+    c0 = 2.0 * (xx * xx + yy * yy + zz * zz + 2.0 * (xy * xy + xz * xz + yz * yz)) - total * total
+    root = above
+    for _ in range(_NEWTON_STEPS):
+        value = ((root * root + c2) * root + c1) * root + c0
+        slope = (4.0 * root * root + 2.0 * c2) * root + c1
+        if slope <= 0.0:
+            break
+        step = value / slope
+        root -= step
+        if abs(step) <= tolerance * above:
+            break
+    return root
+
+
+@kernel
 def _log_density(
-    cloud: NDArray[np.float64],
-    labels: NDArray[np.int64],
-    chosen: NDArray[np.int64],
-    means: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    spreads: NDArray[np.float32],
-    log_weights: NDArray[np.float32],
+    cloud: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    chosen: Int[np.ndarray, "C"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
 ) -> float:
-    """Of centered points (N, 3) by some components (C,); tables as in `PosePrior`."""
+    """Of centered points by some components; tables as in `PosePrior`."""
     total = -np.inf
     for component in chosen:
-        residual = _residual(cloud, labels, means[component])
-        log = log_weights[component] + _log_normal(
-            residual, labels, directions[component], float(spreads[component])
-        )
+        spread = float(spreads[component])
+        lower = factor_of(labels, directions[component], spread)
+        residual = residual_of(cloud, labels, means[component])
+        log = log_weights[component] + log_normal(residual, labels, directions[component], lower, spread)
         high = max(total, log)
         total = high + np.log(np.exp(total - high) + np.exp(log - high))
     return total
 
 
 @kernel
-def _center(labels: NDArray[np.int64], mean: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Center (3,) of some markers of a mean hand (M, 3)."""
-    center = np.zeros(3)
-    for label in labels:
+def factor_of(
+    labels: Int[np.ndarray, "N"], directions: Float32[np.ndarray, "M 3 R"], spread: float
+) -> FloatArray:
+    """Lower Cholesky factor (R, R) of D^T D + spread^2 I, D being the directions of some markers [m]."""
+    rank = directions.shape[2]
+    rows = np.empty((3 * len(labels), rank))
+    for number in range(len(labels)):
         for axis in range(3):
-            center[axis] += mean[label, axis]
-    return center / len(labels)
+            for direction in range(rank):
+                rows[3 * number + axis, direction] = directions[labels[number], axis, direction]
+    inner = rows.T @ rows
+    for direction in range(rank):
+        inner[direction, direction] += spread * spread
+    lower: FloatArray = np.linalg.cholesky(inner).astype(np.float64)
+    return lower
 
 
 @kernel
-def _product(
-    cloud: NDArray[np.float64], labels: NDArray[np.int64], mean: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], float]:
-    """Sum of the outer products (3, 3) of centered points (N, 3) and markers, and of both's squares."""
-    center, product, size = _center(labels, mean), np.zeros((3, 3)), 0.0
+def residual_of(
+    cloud: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], mean: Float32[np.ndarray, "M 3"]
+) -> FloatArray:
+    """Centered points (N, 3), turned onto the markers of a mean hand, minus these [m]."""
+    center, product, bound = np.zeros(3), np.zeros((3, 3)), 0.0
     for number in range(len(cloud)):
-        for second in range(3):
-            there = mean[labels[number], second] - center[second]
-            size += there * there + cloud[number, second] * cloud[number, second]
+        for axis in range(3):
+            there = mean[labels[number], axis]
+            center[axis] += there / len(cloud)
+            bound += 0.5 * (there * there + cloud[number, axis] * cloud[number, axis])
             for first in range(3):
-                product[first, second] += cloud[number, first] * there
-    return product, size
+                product[first, axis] += cloud[number, first] * there
+    root = _largest_root(product.ravel(), bound, _EXACT)
+    w, x, y, z = _largest_eigenvector(_quaternion_matrix(product), root)
+    rotation = np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+    residual = np.empty_like(cloud)
+    for number in range(len(cloud)):
+        for axis in range(3):
+            turned = 0.0
+            for first in range(3):
+                turned += rotation[axis, first] * cloud[number, first]
+            residual[number, axis] = turned - mean[labels[number], axis] + center[axis]
+    return residual
 
 
 @kernel
-def _quaternion_matrix(p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Horn's matrix (4, 4) of a sum of outer products (3, 3): its first eigenvector is the best rotation."""
+def _quaternion_matrix(p: Float[np.ndarray, "3 3"]) -> FloatArray:
+    """Horn's matrix (4, 4) of a sum of outer products: its first eigenvector is the best rotation."""
     k = np.empty((4, 4))
     k[0, 0] = p[0, 0] + p[1, 1] + p[2, 2]
     k[1, 1] = p[0, 0] - p[1, 1] - p[2, 2]
@@ -208,72 +289,71 @@ def _quaternion_matrix(p: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @kernel
-def _largest_root(k: NDArray[np.float64], above: float) -> float:
-    """Largest eigenvalue of Horn's matrix, from a bound above it (Theobald 2005).
+def _largest_eigenvector(k: Float[np.ndarray, "4 4"], root: float) -> FloatArray:
+    """Unit eigenvector (4,) of the largest eigenvalue of Horn's matrix.
 
-    Its trace is zero, so the characteristic polynomial is x^4 + c2 x^2 + c1 x + c0.
+    The adjugate of k - root is a multiple of the outer product of the eigenvector with itself; its row with
+    the greatest diagonal element is the most exact one.
     """
-    square = k @ k
-    c2 = -0.5 * np.trace(square)
-    c1 = -np.trace(square @ k) / 3.0
-    c0 = np.linalg.det(k)
-    root = above
-    for _ in range(_NEWTON_STEPS):
-        value = ((root * root + c2) * root + c1) * root + c0
-        slope = (4.0 * root * root + 2.0 * c2) * root + c1
-        if slope <= 0.0:
-            break
-        step = value / slope
-        root -= step
-        if abs(step) <= 1e-9 * above:
-            break
-    return root
+    shifted = k.copy()
+    for axis in range(4):
+        shifted[axis, axis] -= root
+    best, most = 0, -1.0
+    for axis in range(4):
+        size = abs(_cofactor(shifted, axis, axis))
+        if size > most:
+            best, most = axis, size
+    vector = np.empty(4)
+    for axis in range(4):
+        vector[axis] = _cofactor(shifted, best, axis)
+    length = np.sqrt((vector * vector).sum())
+    if not length > 0.0:  # two eigenvalues are equal: each mixture of their eigenvectors is as good
+        vector, length = np.linalg.eigh(k)[1][:, 3], 1.0
+    unit: FloatArray = vector / length
+    return unit
 
 
 @kernel
-def _residual(
-    cloud: NDArray[np.float64], labels: NDArray[np.int64], mean: NDArray[np.float32]
-) -> NDArray[np.float64]:
-    """Centered points (N, 3), turned onto a mean hand, minus its markers."""
-    w, x, y, z = np.linalg.eigh(_quaternion_matrix(_product(cloud, labels, mean)[0]))[1][:, 3]
-    rotation = np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
+def _cofactor(m: Float[np.ndarray, "4 4"], row: int, column: int) -> float:
+    """Cofactor of an element of a matrix."""
+    a, b, c = (row + 1) % 4, (row + 2) % 4, (row + 3) % 4
+    d, e, f = (column + 1) % 4, (column + 2) % 4, (column + 3) % 4
+    minor: float = (
+        m[a, d] * (m[b, e] * m[c, f] - m[b, f] * m[c, e])
+        - m[a, e] * (m[b, d] * m[c, f] - m[b, f] * m[c, d])
+        + m[a, f] * (m[b, d] * m[c, e] - m[b, e] * m[c, d])
     )
-    center = _center(labels, mean)
-    residual: NDArray[np.float64] = cloud @ rotation.T
-    for number in range(len(cloud)):
-        for axis in range(3):
-            residual[number, axis] -= mean[labels[number], axis] - center[axis]
-    return residual
+    return minor if (row + column) % 2 == 0 else -minor
 
 
 @kernel
-def _log_normal(
-    residual: NDArray[np.float64], labels: NDArray[np.int64], directions: NDArray[np.float32], spread: float
+def log_normal(
+    residual: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    directions: Float32[np.ndarray, "M 3 R"],
+    lower: Float[np.ndarray, "R R"],
+    spread: float,
 ) -> float:
-    """Log-density of residuals (N, 3) whose covariance is D D^T + spread^2 I, D being rows of directions.
+    """Log-density of residuals [m] whose covariance is D D^T + spread^2 I, D being rows of directions.
 
-    The matrix of the directions (R, R) stands for that of the residuals (Woodbury's identity).
+    The matrix of the directions (R, R), of which `lower` is the Cholesky factor, stands for that of the
+    residuals (Woodbury's identity).
     """
-    count, rank = 3 * len(residual), directions.shape[2]
-    rows = np.empty((count, rank))
-    for number in range(len(residual)):
+    count, rank = 3 * len(labels), directions.shape[2]
+    along, distance = np.zeros(rank), 0.0
+    for number in range(len(labels)):
         for axis in range(3):
+            value = residual[number, axis]
+            distance += value * value
             for direction in range(rank):
-                rows[3 * number + axis, direction] = directions[labels[number], axis, direction]
-    flat = residual.ravel()
-    inner = rows.T @ rows
-    for direction in range(rank):
-        inner[direction, direction] += spread * spread
-    lower = np.linalg.cholesky(inner)
-    along = np.linalg.solve(lower, rows.T @ flat)
-    distance = (flat @ flat - along @ along) / (spread * spread)
+                along[direction] += directions[labels[number], axis, direction] * value
     log_determinant = 2.0 * (count - rank) * np.log(spread)
     for direction in range(rank):
+        for earlier in range(direction):
+            along[direction] -= lower[direction, earlier] * along[earlier]
+        along[direction] /= lower[direction, direction]
+        distance -= along[direction] * along[direction]
         log_determinant += 2.0 * np.log(lower[direction, direction])
+    distance /= spread * spread
     log: float = -0.5 * (distance + log_determinant + count * np.log(2.0 * np.pi))
     return log

@@ -6,26 +6,36 @@ label's place or a chain of labels shifted by one can be the likeliest labeling 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
+from handsim.kernels.kernel import kernel
 from train.matching.assignment import (
     IMPOSSIBLE,
+    assign,
     assignment_costs,
     match_probabilities,
     pair_probabilities,
-    solve_assignment,
 )
-from train.matching.pose_prior import PosePrior
+from train.matching.pose_prior import (
+    NEAREST,
+    PosePrior,
+    factor_of,
+    log_normal,
+    means_by_marker,
+    procrustes_errors,
+    residual_of,
+    seen_as_right,
+)
 
 _SURE: Final = 0.95  # a pair of this probability is not taken back
 _MOST_UNSURE: Final = 8  # pairs that are taken back, one at a time; the least sure
 _ROUNDS: Final = 3  # how many pairs are taken back in turn
 _WIDTH: Final = 3  # labelings of a round that the next one starts from
+_MOST: Final = 1 + _MOST_UNSURE * (1 + (_ROUNDS - 1) * _WIDTH)  # labelings
 _FARTHEST: Final = 14.0  # cost of a labeling above that of the likeliest [nats, twice]
 _WEIGHT: Final = 2.0  # of the prior's density against the scores, chosen on held-out simulated frames
 _GHOST: Final = 4.0  # log-density of a ghost, uniform around the hand [1/m^3]
@@ -33,17 +43,6 @@ _NEAR: Final = 80  # components that count for the labelings around the likelies
 _TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
 _LEAST: Final = 4  # labeled points of a hand
 _LEAST_DENSITY: Final = 2.5  # of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Candidate:
-    """A labeling, what it scores, and the pairs that were taken back for it."""
-
-    score: float
-    density: float
-    """Log-density of the labeled points, for each coordinate."""
-    labels: NDArray[np.int64]
-    without: tuple[tuple[int, int], ...] = ()
 
 
 def match_scores(
@@ -77,90 +76,214 @@ def match_scores(
         or len(points) > 2 * num_labels  # more than a hand: somebody has to divide them first
     ):
         return labels, confidence
-    return _verify(points, probabilities, labels, prior)
+    tables = prior.means, prior.directions, prior.spreads, prior.log_weights
+    return _verify(np.ascontiguousarray(points, dtype=np.float64), probabilities, *tables)
 
 
+@kernel
 def _verify(
     points: Float[np.ndarray, "N 3"],
     probabilities: Float[np.ndarray, "N+1 M+1"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The best of the labelings (N,) around the likeliest one, and the probability (N,) of each label.
+
+    Args:
+        points: Points [m].
+        probabilities: Of pairs, see `pair_probabilities`.
+        means: This and the following tables are those of `PosePrior`.
+        directions: See `PosePrior`.
+        spreads: See `PosePrior`.
+        log_weights: See `PosePrior`.
+    """
+    costs, reject = assignment_costs(probabilities)
+    least, labels = assign(costs, reject)
+    near, mirrored = _near_components(points, labels, means, directions, spreads, log_weights)
+    table = means_by_marker(means, near)
+    found = np.empty((_MOST, len(points)), dtype=np.int64)
+    scores, densities = np.empty(_MOST), np.empty(_MOST)
+    taken = np.full((_MOST, _ROUNDS), -1)  # points whose pairs were taken back for a labeling
+    columns = np.full((_MOST, _ROUNDS), -1)  # and their labels then
+    # Cholesky factors by component and by the set of markers, which most labelings share.
+    sets, stored = np.empty((_MOST, len(means[0])), dtype=np.bool_), np.full((_MOST, len(near)), -1)
+    rank = directions.shape[3]
+    factors, counts = np.empty((NEAREST * _MOST, rank, rank)), np.zeros(2, np.int64)
+    front, num_front, num_found = np.zeros(_MOST, dtype=np.int64), 1, 0
+    for step in range(_ROUNDS + 1):
+        first = num_found
+        for parent in front[: min(num_front, _WIDTH)]:
+            unsure = _least_sure(probabilities, found[parent]) if step else np.zeros(1, np.int64)
+            for point in unsure:
+                cost, fresh = least, labels
+                if step:
+                    taken[num_found], columns[num_found] = taken[parent], columns[parent]
+                    taken[num_found, step - 1], columns[num_found, step - 1] = point, found[parent, point]
+                    cost, fresh = _assign_without(costs, reject, taken[num_found], columns[num_found], step)
+                    if cost > least + _FARTHEST or _index_of(fresh, found, num_found) >= 0:
+                        continue
+                known = np.flatnonzero(fresh >= 0)
+                density = -np.inf
+                if len(known) >= _LEAST:
+                    cloud, known_labels = seen_as_right(points[known], mirrored), fresh[known]
+                    density = _log_density(
+                        cloud, known_labels, near, table, means, directions, spreads, log_weights,
+                        sets, stored, factors, counts,
+                    )  # fmt: skip
+                found[num_found] = fresh
+                scores[num_found] = _WEIGHT * (density + _GHOST * (len(fresh) - len(known))) - cost
+                densities[num_found] = density / max(1, 3 * len(known))
+                num_found += 1
+        num_front = num_found - first
+        front[:num_front] = first + np.argsort(-scores[first:num_found], kind="mergesort")
+    return _elected(found[:num_found], scores[:num_found], densities[:num_found], probabilities)
+
+
+@kernel
+def _log_density(
+    cloud: Float[np.ndarray, "N 3"],
     labels: Int[np.ndarray, "N"],
-    prior: PosePrior,
-) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """The best of the labelings around the likeliest one, and the probability of each of its labels."""
-    table = assignment_costs(probabilities)
-    cost, _ = solve_assignment(table)
-    known = labels >= 0
-    near, _, mirrored = max(
-        (_nearest_components(points[known], labels[known], prior, mirrored) for mirrored in (False, True)),
-        key=lambda side: side[1],
-    )
+    near: Int[np.ndarray, "C"],
+    table: Float[np.ndarray, "M 3 C"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
+    sets: Bool[np.ndarray, "L M"],
+    stored: Int[np.ndarray, "L C"],
+    factors: Float[np.ndarray, "F R R"],
+    counts: Int[np.ndarray, "2"],
+) -> float:
+    """Log-density of centered, labeled points [m] by those of some components that are nearest to them.
 
-    def scored(cost: float, labels: NDArray[np.int64], without: tuple[tuple[int, int], ...]) -> _Candidate:
-        known = labels >= 0
-        density = prior.log_density(points[known], labels[known], mirrored=mirrored, among=near)
-        count = int(known.sum())
-        score = _WEIGHT * (density + _GHOST * (len(labels) - count)) - cost
-        return _Candidate(score, density / max(1, 3 * count), labels, without)
-
-    found = {labels.tobytes(): scored(cost, labels, ())}
-    front = list(found.values())
-    for _ in range(_ROUNDS):
-        fresh = []
-        for candidate in front[:_WIDTH]:
-            for without in _taken_back(candidate, probabilities):
-                worth, other = solve_assignment(_without(table, without))
-                if worth <= cost + _FARTHEST and other.tobytes() not in found:
-                    found[other.tobytes()] = scored(worth, other, without)
-                    fresh.append(found[other.tobytes()])
-        front = sorted(fresh, key=lambda one: -one.score)
-    return _elected(list(found.values()), probabilities)
-
-
-def _nearest_components(
-    points: Float[np.ndarray, "N 3"], labels: Int[np.ndarray, "N"], prior: PosePrior, mirrored: bool
-) -> tuple[Int[np.ndarray, "C"], float, bool]:
-    """The components that are near to the points of a hand of one side, and their density."""
-    near = prior.nearest(points, labels, mirrored=mirrored, count=_NEAR)
-    return near, prior.log_density(points, labels, mirrored=mirrored, among=near), mirrored
+    The last four arrays keep factors from labeling to labeling: the sets of markers, the number of each set's
+    and component's factor or -1, the factors, and how many sets and factors there are.
+    """
+    marked = np.zeros(sets.shape[1], dtype=np.bool_)
+    marked[labels] = True
+    group = _index_of(marked, sets, counts[0])
+    if group < 0:
+        group = counts[0]
+        sets[group] = marked
+        counts[0] += 1
+    density = -np.inf
+    for number in np.argsort(procrustes_errors(cloud, labels, table))[:NEAREST]:
+        component, spread = near[number], float(spreads[near[number]])
+        if stored[group, number] < 0:
+            stored[group, number] = counts[1]
+            factors[counts[1]] = factor_of(labels, directions[component], spread)
+            counts[1] += 1
+        lower = factors[stored[group, number]]
+        residual = residual_of(cloud, labels, means[component])
+        log = log_weights[component] + log_normal(residual, labels, directions[component], lower, spread)
+        high = max(density, log)
+        density = high + np.log(np.exp(density - high) + np.exp(log - high))
+    return density
 
 
-def _taken_back(
-    candidate: _Candidate, probabilities: Float[np.ndarray, "N+1 M+1"]
-) -> list[tuple[tuple[int, int], ...]]:
-    """Sets of pairs of a point and a column of the table: those taken back so far and one more."""
-    labels, num_labels = candidate.labels, probabilities.shape[1] - 1
-    confidence = probabilities[np.arange(len(labels)), labels]
-    unsure = [point for point in np.argsort(confidence)[:_MOST_UNSURE] if confidence[point] < _SURE]
-    columns = np.where(labels >= 0, labels, num_labels + np.arange(len(labels)))
-    return [(*candidate.without, (int(point), int(columns[point]))) for point in unsure]
+@kernel
+def _near_components(
+    points: Float[np.ndarray, "N 3"],
+    labels: Int[np.ndarray, "N"],
+    means: Float32[np.ndarray, "K M 3"],
+    directions: Float32[np.ndarray, "K M 3 R"],
+    spreads: Float32[np.ndarray, "K"],
+    log_weights: Float32[np.ndarray, "K"],
+) -> tuple[NDArray[np.int64], bool]:
+    """The components (C,) near to labeled points as those of the likelier side, and whether it is left."""
+    known = np.flatnonzero(labels >= 0)
+    known_labels, table = labels[known], means_by_marker(means, np.arange(len(means)))
+    best, near, left = -np.inf, np.empty(0, dtype=np.int64), False
+    for mirrored in (False, True):
+        cloud = seen_as_right(points[known], mirrored)
+        chosen = np.argsort(procrustes_errors(cloud, known_labels, table))[:_NEAR]
+        density = -np.inf
+        for component in chosen[:NEAREST]:
+            spread = float(spreads[component])
+            lower = factor_of(known_labels, directions[component], spread)
+            residual = residual_of(cloud, known_labels, means[component])
+            log = log_weights[component] + log_normal(
+                residual, known_labels, directions[component], lower, spread
+            )
+            high = max(density, log)
+            density = high + np.log(np.exp(density - high) + np.exp(log - high))
+        if density > best or not len(near):
+            best, near, left = density, chosen, mirrored
+    return near, left
 
 
-def _without(
-    table: Float[np.ndarray, "N M+N"], pairs: tuple[tuple[int, int], ...]
-) -> Float[np.ndarray, "N M+N"]:
-    """The table of costs without some pairs."""
-    rest = table.copy()
-    for point, column in pairs:
-        rest[point, column] = IMPOSSIBLE
-    return rest
+@kernel
+def _least_sure(
+    probabilities: Float[np.ndarray, "N+1 M+1"], labels: Int[np.ndarray, "N"]
+) -> NDArray[np.int64]:
+    """The points of a labeling that may be taken back, the least sure first."""
+    confidence = np.empty(len(labels))
+    for point in range(len(labels)):
+        confidence[point] = probabilities[point, labels[point]]
+    order = np.argsort(confidence)[:_MOST_UNSURE]
+    return order[confidence[order] < _SURE]
 
 
+@kernel
+def _assign_without(
+    costs: Float[np.ndarray, "N M"],
+    reject: Float[np.ndarray, "N"],
+    points: Int[np.ndarray, "3"],
+    labels: Int[np.ndarray, "3"],
+    count: int,
+) -> tuple[float, NDArray[np.int64]]:
+    """The labeling of least cost without some pairs of a point and a label, or of a point and no label."""
+    rest, without = costs.copy(), reject.copy()
+    for number in range(count):
+        if labels[number] >= 0:
+            rest[points[number], labels[number]] = IMPOSSIBLE
+        else:
+            without[points[number]] = IMPOSSIBLE
+    return assign(rest, without)
+
+
+@kernel
+def _index_of(row: NDArray[np.generic], rows: NDArray[np.generic], count: int) -> int:
+    """Which of the first rows of a table (R, W) is equal to a row (W,); -1 if none."""
+    for number in range(count):
+        same = True
+        for column in range(len(row)):
+            if rows[number, column] != row[column]:
+                same = False
+                break
+        if same:
+            return number
+    return -1
+
+
+@kernel
 def _elected(
-    candidates: list[_Candidate], probabilities: Float[np.ndarray, "N+1 M+1"]
-) -> tuple[Int[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """The best labeling, and the confidence of each of its labels.
+    found: Int[np.ndarray, "L N"],
+    scores: Float[np.ndarray, "L"],
+    densities: Float[np.ndarray, "L"],
+    probabilities: Float[np.ndarray, "N+1 M+1"],
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The best labeling (N,), and the confidence (N,) of each of its labels.
 
     That is the geometric mean of the network's own and the share of the labelings that agree, by their odds;
     the network's own where all agree. Points that are no hand in any labeling are labeled as the
     network has it.
     """
-    scores = np.array([one.score for one in candidates])
-    best = candidates[int(scores.argmax())]
-    if best.density < _LEAST_DENSITY:
-        best, candidates, scores = candidates[0], candidates[:1], scores[:1]
-    labels = best.labels
-    odds = np.exp(_TEMPERATURE * (scores - scores.max()))
-    agree = np.array([one.labels == labels for one in candidates])
-    share = (odds / odds.sum()) @ agree
-    own = probabilities[np.arange(len(labels)), labels]
-    return labels, np.where(agree.all(axis=0), own, np.sqrt(own * share))
+    best, count = int(np.argmax(scores)), len(found)
+    if densities[best] < _LEAST_DENSITY:
+        best, count = 0, 1
+    odds = np.exp(_TEMPERATURE * (scores[:count] - scores[:count].max()))
+    odds /= odds.sum()
+    labels, confidence = found[best].copy(), np.empty(found.shape[1])
+    for point in range(found.shape[1]):
+        share, all_agree = 0.0, True
+        for number in range(count):
+            if found[number, point] == labels[point]:
+                share += odds[number]
+            else:
+                all_agree = False
+        own = probabilities[point, labels[point]]
+        confidence[point] = own if all_agree else np.sqrt(own * share)
+    return labels, confidence

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from gloves.fit import GlovedHand, GloveFit, attach
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from gloves.takes.tracked_take import TrackedTake
 from handsim.errors import CaptureError, PoseError
 from handsim.hand.motion import BodyMotion
 from handsim.space.cameras import ROOM_CENTER
-from handsim.space.objects import named_object, object_names
+from handsim.space.transforms import pose_matrices
 from train.rig_advice.rig_faults import HALF_SIDE
 from train.simulation.motion import MovingObject, SceneMotion
 from train.simulation.real_like import sample_real_like_scene
@@ -95,9 +94,7 @@ def moved(scene: SceneMotion, offsets: Float[np.ndarray, "T 3"]) -> SceneMotion:
     return dataclasses.replace(scene, hands=tuple(hands), moving_object=held)
 
 
-def work_of_take(
-    take: Take | TrackedTake, layout: MarkerLayout | None, num_frames: int
-) -> dict[str, list[SceneMotion]]:
+def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> dict[str, list[SceneMotion]]:
     """The hands of a take where they were, in stretches in which every hand has a pose.
 
     Args:
@@ -109,19 +106,14 @@ def work_of_take(
         CaptureError: There is no such stretch.
         LayoutError: The glove does not fit.
     """
-    if isinstance(take, Take):
-        fits, poses = [hand.fit for hand in take.hands], [hand.qpos for hand in take.hands]
-    else:
-        fits, poses = list(take.hands), [take.qpos[:, number] for number in range(len(take.hands))]
-    if layout is not None:
-        fits = [attach(layout, fit.model) for fit in fits]
-    whole = np.isfinite(np.stack(poses)).all(axis=(0, 2))
+    fits = [hand if layout is None else attach(layout, hand.model) for hand in take.hands]
+    whole = np.isfinite(take.qpos).all(axis=(1, 2))
     scenes, left = [], num_frames
     for stretch in _stretches(whole):
         part = slice(stretch.start, min(stretch.stop, stretch.start + left))
         if part.stop - part.start >= _FEWEST:
             left -= part.stop - part.start
-            scenes.append(_scene(take, fits, poses, part))
+            scenes.append(_scene(take, fits, part))
     if not scenes:
         raise CaptureError(
             f"the take has no {_FEWEST} frames in a row in which every hand has a pose, expected some"
@@ -129,16 +121,15 @@ def work_of_take(
     return {"the take": scenes}
 
 
-def _scene(
-    take: Take | TrackedTake, fits: list[GloveFit], poses: list[NDArray[np.float64]], part: slice
-) -> SceneMotion:
+def _scene(take: Take, fits: list[GloveFit], part: slice) -> SceneMotion:
     hands = tuple(
-        GlovedHand(fit, np.ascontiguousarray(qpos[part])) for fit, qpos in zip(fits, poses, strict=True)
+        GlovedHand(fit, np.ascontiguousarray(take.qpos[part, number])) for number, fit in enumerate(fits)
     )
     held = None
-    if isinstance(take, Take) and take.body is not None and take.body.name in object_names():
-        motion = BodyMotion(take.body.T_world_body[part], take.rate)
-        held = MovingObject(named_object(take.body.name), motion)
+    for number, body in enumerate(take.bodies):
+        thing, poses = body.shape, take.body_poses[part, number]
+        if held is None and thing is not None and np.isfinite(poses).all():
+            held = MovingObject(thing, BodyMotion(pose_matrices(poses), take.rate))
     return SceneMotion(hands, held, take.rate)
 
 

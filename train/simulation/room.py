@@ -9,8 +9,9 @@ from jaxtyping import Float, Int
 
 from gloves.optics.identities import number_runs, pack_columns
 from gloves.optics.reconstruction import Reconstruction, reconstruct
-from gloves.takes.take import HeldBody, Take
+from gloves.takes.take import RigidBody, Take
 from handsim.space.cameras import CameraRig
+from handsim.space.transforms import transform_poses
 from train.simulation.light_sources import LightSources, sample_light_sources
 from train.simulation.motion import SceneMotion
 from train.simulation.room_settings import RoomConfig
@@ -78,14 +79,19 @@ def pack_take(
     points[frame, column] = positions[frame, source]
     ids[frame, column] = number_runs(present)[frame, source]
     truth[frame, column] = labels[frame, source]
-    return Take(scene.rate, points, ids, truth, scene.hands, _held_body(scene), settings)
-
-
-def _held_body(scene: SceneMotion) -> HeldBody | None:
-    if scene.moving_object is None:
-        return None
-    rigid_object = scene.moving_object.rigid_object
-    return HeldBody(rigid_object.name, rigid_object.marker_names, scene.moving_object.motion.T_world_body)
+    held = scene.moving_object
+    thing = None if held is None else held.rigid_object
+    return Take.of_truth(
+        [hand.fit for hand in scene.hands],
+        np.stack([hand.qpos for hand in scene.hands], axis=1),
+        points,
+        ids,
+        truth,
+        rate=scene.rate,
+        bodies=() if thing is None else (RigidBody(thing.name, thing.marker_names, thing.markers),),
+        body_poses=None if held is None else transform_poses(held.motion.T_world_body)[:, None],
+        settings=settings,
+    )
 
 
 def label_false_points(

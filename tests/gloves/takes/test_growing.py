@@ -21,10 +21,10 @@ from gloves.takes.growing import (
 from handsim.errors import CaptureError
 
 COLUMNS = (
-    Column("times", "<f8", ()),
-    Column("nothing", "<f8", (0, 7)),
-    Column("points", "<f8", (3,), np.nan),
-    Column("ids", "<i4", (), -1),
+    Column("times", "<f8", ("T",)),
+    Column("nothing", "<f8", ("T", 0, 7)),
+    Column("points", "<f8", ("T", "N", 3), np.nan),
+    Column("ids", "<i4", ("T", "N"), -1),
 )
 FIXED = {"places": np.arange(12.0).reshape(4, 3), "none": np.zeros((0, 3))}
 
@@ -162,7 +162,7 @@ def test_headers_that_lie_take_no_memory(rng, tmp_path):
     path = tmp_path / "x.part"
     record(path, rng, [2] * 4)
     content = path.read_bytes()
-    huge = content.replace(b'"shape": [3]', b'"shape": [99999999]')
+    huge = content.replace(b'"shape": ["T", "N", 3]', b'"shape": ["T", "N", 99999999]')
     assert len(huge) > len(content)
     for damaged in (
         b"handsim recording 1\n" + b"\xff\xff\xff\x7f" + bytes(100),

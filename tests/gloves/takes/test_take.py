@@ -1,4 +1,4 @@
-"""Takes on disk: whole and exact when read again, one sentence when they are not, and never unpickled."""
+"""Takes: what fits together and what follows; files are exact, refused in a sentence, and never unpickled."""
 
 from __future__ import annotations
 
@@ -10,31 +10,66 @@ import zipfile
 import numpy as np
 import pytest
 
-from gloves.fit import GlovedHand, attach, nominal_fit
+from gloves.fit import attach, nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.take import SCHEMA, SUFFIX, HeldBody, Take, load_take
-from handsim.errors import CaptureError
-from handsim.hand.model import HandModel
+from gloves.takes.archives import SCHEMA
+from gloves.takes.columns import FRAMES as COLUMNS_OF_FRAMES
+from gloves.takes.take import INITIALIZED, LOST, STATUSES, SUFFIX, TRACKED, RigidBody, Take, load_take
+from handsim.errors import ArgumentError, CaptureError
+from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 
-FRAMES, COLUMNS = 7, 45
+FRAMES, COLUMNS, MARKERS = 9, 47, 19
+PEN = RigidBody("pen", ("Pen1", "Pen2", "Pen3"), 0.05 * np.eye(3))
+DAMAGED = "not a take, or a damaged one"
 
 
 @pytest.fixture
 def take(rng) -> Take:
+    """A tracked take of two hands and a pen; column c has label c - 6, the first columns ghosts."""
+    hands = []
+    for side in ("left", "right"):
+        shape = sample_shape(side=side, rng=rng)
+        hands.append(attach(load_layout("dense19"), HandModel(shape)))
+    status = rng.integers(len(STATUSES), size=(FRAMES, 2)).astype(np.int8)
+    status[[0, 4]], status[5] = TRACKED, LOST
+    qpos = rng.normal(size=(FRAMES, 2, 27))
+    qpos[..., 3:7] /= np.linalg.norm(qpos[..., 3:7], axis=-1, keepdims=True)
+    qpos[status == LOST] = np.nan
     points = rng.normal(size=(FRAMES, COLUMNS, 3))
-    labels = np.tile(np.arange(COLUMNS) - 1, (FRAMES, 1))
-    ids = np.tile(np.arange(COLUMNS), (FRAMES, 1))
+    labels = np.tile(np.maximum(np.arange(COLUMNS) - 6, -1), (FRAMES, 1))
+    for number in range(2):  # a lost hand has no labels
+        labels[(status[:, [number]] == LOST) & (labels // MARKERS == number) & (labels >= 0)] = -1
     gone = rng.random((FRAMES, COLUMNS)) < 0.2
-    points[gone], labels[gone], ids[gone] = np.nan, -1, -1
-    layout = load_layout("dense19")
-    model = HandModel(sample_shape(side="right", rng=rng))
-    hands = (
-        GlovedHand(attach(layout, model), rng.normal(size=(FRAMES, 27))),
-        GlovedHand(nominal_fit(layout, "XS", "left"), rng.normal(size=(FRAMES, 27))),
+    points[gone], labels[gone] = np.nan, -1
+    body_status = rng.integers(len(STATUSES), size=(FRAMES, 1)).astype(np.int8)
+    return Take(
+        rate=120.0,
+        times=np.cumsum(rng.uniform(0.005, 0.02, size=FRAMES)),
+        hands=tuple(hands),
+        qpos=qpos,
+        status=status,
+        rms=np.where(status == TRACKED, 1e-3 * rng.random((FRAMES, 2)), np.nan),
+        points=points,
+        ids=np.where(gone, -1, rng.integers(100_000, size=gone.shape)),
+        labels=labels,
+        confidence=np.where(gone, np.nan, rng.random(gone.shape)),
+        bodies=(PEN,),
+        body_poses=np.where((body_status == LOST)[..., None], np.nan, rng.normal(size=(FRAMES, 1, 7))),
+        body_status=body_status,
+        body_rms=rng.random((FRAMES, 1)),
+        settings={"glove": "dense19"},
     )
-    body = HeldBody("wand", tuple("abcdef"), np.tile(np.eye(4), (FRAMES, 1, 1)))
-    return Take(120.0, points, ids, labels, hands, body, {"seed": 3, "room": {"optics": {"noise": 0.1}}})
+
+
+@pytest.fixture
+def truth(take, rng) -> Take:
+    """The truth of a simulated take of a hand with a glove of its own, and a smaller one."""
+    hands = (nominal_fit(load_layout("sparse13"), "XS", "left"), take.hands[1])
+    qpos = np.stack([join_qpos(0.3 * rng.random((FRAMES, 20))) for _ in range(2)], axis=1)
+    labels = np.where(take.labels < 32, take.labels, -1)
+    return Take.of_truth(hands, qpos, take.points, take.ids, labels, rate=90.0, settings={"seed": 3})
 
 
 def altered(path, **arrays) -> None:
@@ -51,40 +86,6 @@ def header_of(path) -> dict:
         return json.loads(str(stored["header"]))
 
 
-def test_what_is_saved_is_what_is_read(take, tmp_path):
-    one = np.where(take.labels < 19, take.labels, -1)
-    alone = dataclasses.replace(take, body=None, hands=take.hands[:1], labels=one)
-    for number, original in enumerate((take, alone)):
-        path = tmp_path / f"{number}{SUFFIX}"
-        original.save(path)
-        again = load_take(path)
-        for name in ("points", "ids", "labels"):
-            np.testing.assert_array_equal(getattr(again, name), getattr(original, name))
-        assert (again.rate, again.settings, again.num_frames) == (120.0, original.settings, FRAMES)
-        assert len(again.hands) == len(original.hands)
-        for ours, theirs in zip(original.hands, again.hands, strict=True):
-            assert ours.layout == theirs.layout
-            np.testing.assert_array_equal(ours.qpos, theirs.qpos)
-            for field in dataclasses.fields(ours.shape):
-                np.testing.assert_array_equal(
-                    getattr(ours.shape, field.name), getattr(theirs.shape, field.name)
-                )
-        if original.body is None:
-            assert again.body is None
-        else:
-            assert (again.body.name, again.body.marker_names) == ("wand", tuple("abcdef"))
-            np.testing.assert_array_equal(again.body.T_world_body, original.body.T_world_body)
-        assert [path.name for path in tmp_path.glob(".*")] == []
-
-
-def test_labels_count_through_the_hands(take):
-    assert take.hand_labels == (range(0, 19), range(19, 38))
-    for label in (*take.hand_labels, range(38, 44)):
-        observed = take.observed(label)
-        for marker, name in enumerate(label):  # the fixture has label c - 1 in column c
-            np.testing.assert_array_equal(observed[:, marker], take.points[:, name + 1])
-
-
 def assert_refused(path, *words: str) -> None:
     with pytest.raises(CaptureError) as caught:
         load_take(path)
@@ -92,6 +93,169 @@ def assert_refused(path, *words: str) -> None:
     assert sentence.startswith(f"{path}: ") and "\n" not in sentence
     for word in words:
         assert word in sentence
+
+
+def test_what_is_saved_is_what_is_read(take, truth, tmp_path):
+    streamed = dataclasses.replace(take, numbers=np.arange(FRAMES) + 5)
+    for number, original in enumerate((take, truth, take.without_body(), streamed)):
+        path = tmp_path / f"{number}.npz"
+        original.save(path)
+        again = load_take(path)
+        assert (again.rate, again.settings) == (original.rate, original.settings)
+        for field in dataclasses.fields(Take):
+            ours, theirs = getattr(original, field.name), getattr(again, field.name)
+            if isinstance(ours, np.ndarray):
+                assert ours.dtype == theirs.dtype
+                np.testing.assert_array_equal(ours, theirs)
+        assert (again.numbers is None) == (original.numbers is None)
+        for ours, theirs in zip(original.hands, again.hands, strict=True):
+            assert ours.layout == theirs.layout
+            for one, two in ((ours.shape, theirs.shape), (ours.attachment, theirs.attachment)):
+                for field in dataclasses.fields(one):
+                    if field.name != "layout":
+                        np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name))
+        assert [(body.name, body.marker_names) for body in again.bodies] == [
+            (body.name, body.marker_names) for body in original.bodies
+        ]
+        for body in again.bodies:
+            np.testing.assert_array_equal(body.positions, PEN.positions)
+        assert [path.name for path in tmp_path.glob(".*")] == []
+
+
+def test_arrays_become_those_of_the_table(take):
+    lists = {column.name: getattr(take, column.name).tolist() for column in COLUMNS_OF_FRAMES}
+    again = dataclasses.replace(take, **lists)
+    for column in COLUMNS_OF_FRAMES:
+        assert getattr(again, column.name).dtype == column.dtype
+        np.testing.assert_array_equal(getattr(again, column.name), getattr(take, column.name))
+
+
+def test_a_truth_is_tracked_and_sure(truth):
+    assert (truth.status == TRACKED).all() and np.isnan(truth.rms).all()
+    assert (truth.confidence[np.isfinite(truth.points[..., 0])] == 1.0).all()
+    np.testing.assert_allclose(truth.times, np.arange(FRAMES) / 90.0)
+    assert truth.hand_labels == (range(13), range(13, 32))
+    left = truth.hands[0].markers(truth.qpos[:, 0])[0]
+    filled = truth.filled("left")
+    np.testing.assert_allclose(truth.markers("left")[filled], left[filled], atol=1e-12)
+
+
+def test_poses_alone_are_a_take(take, rng):
+    qpos = join_qpos(rng.random((4, 20)))[:, None]
+    qpos[2] = np.nan
+    mine = Take.of_poses(take.hands[:1], qpos, rate=30.0, bodies=[PEN])
+    assert mine.status[:, 0].tolist() == [TRACKED, TRACKED, LOST, TRACKED]
+    assert mine.points.shape == (4, 0, 3) and (mine.body_status == LOST).all()
+    with pytest.raises(ArgumentError, match="rate is 0 Hz"):
+        Take.of_poses(take.hands[:1], qpos, rate=0.0)
+    with pytest.raises(ArgumentError, match=r"qpos has shape \(4, 1, 27\), expected \(4, 2, 27\)"):
+        Take.of_poses(take.hands, qpos, rate=30.0)
+
+
+def test_labels_count_through_hands_and_bodies(take):
+    names = take.label_names
+    assert (names[0], names[MARKERS], names[-1]) == ("left:ThumbCMC", "right:ThumbCMC", "pen:Pen3")
+    assert len(names) == 2 * MARKERS + 3
+    for of, labels in (("left", range(19)), ("right", range(19, 38)), ("pen", range(38, 41))):
+        observed = take.observed(of)
+        np.testing.assert_array_equal(observed, take.observed(labels))
+        for marker, label in enumerate(labels):  # the fixture has label c - 6 in column c
+            seen = take.labels[:, label + 6] == label
+            np.testing.assert_array_equal(observed[seen, marker], take.points[seen, label + 6])
+            assert np.isnan(observed[~seen, marker]).all()
+    with pytest.raises(ArgumentError, match="unknown hand or body 'middle'"):
+        take.observed("middle")
+
+
+def test_what_was_seen_is_told_from_what_is_filled_in(take):
+    for number, side in enumerate(take.sides):
+        seen, filled, markers = take.observed(side), take.filled(side), take.markers(side)
+        there = take.status[:, number] != LOST
+        np.testing.assert_array_equal(filled, np.isnan(seen[..., 0]) & there[:, None])
+        np.testing.assert_array_equal(markers[np.isfinite(seen)], seen[np.isfinite(seen)])
+        expected = take.hands[number].markers(take.qpos[there, number])[0]
+        np.testing.assert_allclose(markers[there][filled[there]], expected[filled[there]], atol=1e-12)
+        assert np.isnan(markers[~there]).all()
+
+
+def test_filled_markers_are_shifted_as_the_glove_has_slipped(take, rng):
+    worn, frames = take.hands[0], 60
+    qpos = join_qpos(0.5 * rng.random((frames, 20)), position=rng.normal(size=(frames, 3)))
+    bones = worn.model.forward_kinematics(qpos)[:, worn.attachment.main_bones, :3, :3]
+    slipped = rng.normal(scale=0.004, size=(MARKERS, 3))
+    points = worn.markers(qpos)[0] - np.einsum("tmij,mj->tmi", bones, slipped)
+    labels, ids = np.tile(np.arange(MARKERS), (frames, 1)), np.zeros((frames, MARKERS), dtype=int)
+    labels[50:, 3] = -1
+    truth = Take.of_truth([worn], qpos[:, None], points, ids, labels, rate=60.0)
+    assert not truth.marker_bias("left").any(), "of true poses nothing is learned"
+    fitted = dataclasses.replace(truth, rms=np.full((frames, 1), 1e-3))
+    np.testing.assert_allclose(fitted.marker_bias("left"), slipped, atol=1e-9)
+    np.testing.assert_allclose(fitted.markers("left"), points, atol=1e-9)
+    few = fitted.cut(0, 20)
+    assert not few.marker_bias("left").any() and few.num_frames == 20
+
+
+def test_motion_keeps_poses_and_goes_straight_where_there_is_none(take):
+    motion = take.motion("left")
+    assert motion.qpos.shape == (FRAMES, 27) and motion.rate == take.rate
+    there = take.status[:, 0] != LOST
+    np.testing.assert_array_equal(motion.qpos[there], take.qpos[there, 0])
+    np.testing.assert_allclose(np.linalg.norm(motion.qpos[:, 3:7], axis=1), 1.0, atol=1e-12)
+    before, after = np.flatnonzero(there & (np.arange(FRAMES) < 5))[-1], np.flatnonzero(there[5:])
+    if len(after):
+        ends = np.array([before, 5 + after[0]])
+        share = (take.times[5] - take.times[ends[0]]) / np.ptp(take.times[ends])
+        low, high = take.qpos[ends, 0]
+        np.testing.assert_allclose(motion.qpos[5, :3], low[:3] + share * (high - low)[:3])
+    alone = dataclasses.replace(
+        take,
+        qpos=np.where(np.arange(FRAMES)[:, None, None] == 4, take.qpos, np.nan),
+        status=np.where(np.arange(FRAMES)[:, None] == 4, take.status, LOST),
+    )
+    np.testing.assert_array_equal(alone.motion("right").qpos, np.tile(take.qpos[4, 1], (FRAMES, 1)))
+    never = dataclasses.replace(take, qpos=np.full_like(take.qpos, np.nan), status=np.zeros_like(take.status))
+    with pytest.raises(ArgumentError, match="left hand has no pose"):
+        never.motion("left")
+
+
+def test_parts_keep_their_times_and_numbers(take):
+    part = dataclasses.replace(take, numbers=np.arange(FRAMES)).cut(2, 5)
+    assert part.numbers.tolist() == [2, 3, 4] and part.num_frames == 3
+    for column in COLUMNS_OF_FRAMES:
+        np.testing.assert_array_equal(getattr(part, column.name), getattr(take, column.name)[2:5])
+    for first, last in ((-1, 3), (3, 3), (0, FRAMES + 1)):
+        with pytest.raises(ArgumentError, match="expected a part"):
+            take.cut(first, last)
+
+
+def test_what_does_not_fit_together_is_no_take(take):
+    for change in (
+        {"rate": 0.0},
+        {"times": take.times[::-1]},
+        {"times": take.times[:-1]},
+        {"hands": take.hands[:1]},
+        {"hands": take.hands[:1] * 2},
+        {"status": take.status + 4},
+        {"status": np.full_like(take.status, TRACKED)},
+        {"labels": take.labels + 20},
+        {"labels": take.labels.astype(float)},
+        {"ids": take.ids.astype(np.int64) + (1 << 32)},
+        {"confidence": take.confidence[:, 1:]},
+        {"bodies": ()},
+        {"numbers": np.arange(FRAMES - 1)},
+        {"confidence": np.where(take.confidence > 0.5, 1.5, take.confidence)},
+        {"rms": -take.rms},
+        {"points": np.where(take.points > 0.0, np.inf, take.points)},
+        {"points": take.points[0]},
+        {"body_poses": -np.inf * np.abs(take.body_poses)},
+    ):
+        with pytest.raises(ArgumentError, match="not a take: "):
+            dataclasses.replace(take, **change)
+
+
+def test_names_of_bodies_are_text():
+    with pytest.raises(ArgumentError, match="a name is no text"):
+        RigidBody("pen", ("Pen1", 5, "Pen3"), PEN.positions)
 
 
 def test_foreign_files_are_refused_in_a_sentence(tmp_path):
@@ -121,8 +285,13 @@ def test_foreign_files_are_refused_in_a_sentence(tmp_path):
 def test_another_schema_is_named(take, tmp_path):
     path = tmp_path / f"take{SUFFIX}"
     take.save(path)
-    altered(path, header=np.array(json.dumps(header_of(path) | {"schema": SCHEMA + 1})))
-    assert_refused(path, f"schema {SCHEMA + 1}", f"expected {SCHEMA}")
+    header = header_of(path)
+    altered(path, header=np.array(json.dumps(header | {"schema": SCHEMA + 1})))
+    assert_refused(path, f"a take of schema {SCHEMA + 1}, expected a take of schema {SCHEMA}")
+    altered(path, header=np.array(json.dumps(header | {"kind": "tracked take", "schema": 2})))
+    assert_refused(path, f"a tracked take of schema 2, expected a take of schema {SCHEMA}", "track it again")
+    altered(path, header=np.array(json.dumps(header | {"kind": "picture"})))
+    assert_refused(path, "a picture, expected a take")
 
 
 def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
@@ -131,7 +300,7 @@ def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
     whole = path.read_bytes()
     for place in rng.integers(len(whole) - 1, size=60):  # cut
         path.write_bytes(whole[:place])
-        assert_refused(path, "not a take, or a damaged one")
+        assert_refused(path, DAMAGED)
     refused = 0
     for place in rng.integers(len(whole), size=150):  # one byte wrong: some bytes of a zip mean nothing
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
@@ -146,30 +315,43 @@ def test_damage_is_told_wherever_it_is(take, tmp_path, rng):
 
 
 def test_arrays_that_do_not_fit_together_are_refused(take, tmp_path):
-    path = tmp_path / f"take{SUFFIX}"
-    take.save(path)
-    whole = path.read_bytes()
-    header = header_of(path)
-    wrong = {
-        "points": np.zeros((FRAMES, COLUMNS, 2)),
-        "ids": np.zeros((FRAMES, COLUMNS - 1), dtype=np.int32),
-        "labels": np.full((FRAMES, COLUMNS), 44, dtype=np.int16),
-        "hands": None,
-        "qpos": np.zeros((2, FRAMES - 1, 27)),
-        "T_world_body": np.zeros((0, 4, 4)),
-        "header": np.array(json.dumps(header | {"layouts": header["layouts"][:1]})),
-    }
-    for name, array in wrong.items():
+    path = tmp_path / "take.npz"
+    dataclasses.replace(take, numbers=np.arange(FRAMES)).save(path)
+    whole, header = path.read_bytes(), header_of(path)
+    with np.load(path) as stored:
+        names = set(stored.files) - {"numbers"}
+        wrong = {
+            "points": np.zeros((FRAMES, COLUMNS, 2)),
+            "ids": stored["ids"][:, 1:],
+            "qpos": stored["qpos"][1:],
+            "keypoints": stored["keypoints"][:, :, 1:],
+            "labels": np.full((FRAMES, COLUMNS), 44, dtype=np.int16),
+            "confidence": stored["confidence"].astype("f4"),
+            "numbers": np.arange(FRAMES, dtype=float),
+            "hands": np.zeros(2),
+            "attachment_bone_indices": stored["attachment_bone_indices"] + 16,
+            "attachment_points": stored["attachment_points"].astype("f4"),
+            "attachment_normals": stored["attachment_normals"][1:],
+            "body_markers": stored["body_markers"][1:],
+            "header": np.array(json.dumps(header | {"layouts": header["layouts"][:1]})),
+        }
+    for name, array in (*wrong.items(), *dict.fromkeys(names).items()):
         path.write_bytes(whole)
         altered(path, **{name: array})
-        assert_refused(path, "not a take, or a damaged one")
-    for change in ({"rate": "fast"}, {"rate": -1.0}, {"layouts": [{"name": "x"}] * 2}, {"layouts": None}):
+        assert_refused(path, DAMAGED)
+    for change in (
+        {"rate": "fast"},
+        {"rate": -1.0},
+        {"layouts": [{"name": "x"}] * 2},
+        {"layouts": None},
+        {"statuses": []},
+    ):
         path.write_bytes(whole)
         altered(path, header=np.array(json.dumps(header | change)))
-        assert_refused(path, "not a take, or a damaged one")
-    for text in ("[]", "3", "{", '{"schema": 1}'):
+        assert_refused(path, DAMAGED)
+    for text in ("[]", "3", "{", '{"kind": "take"}', f'{{"schema": {SCHEMA}}}'):
         altered(path, header=np.array(text))
-        assert_refused(path, "not a take, or a damaged one")
+        assert_refused(path, DAMAGED)
 
 
 class Trap:
@@ -188,8 +370,23 @@ def test_nothing_is_ever_unpickled(take, tmp_path):
     for name in ("header", "points", "qpos", "more"):
         with path.open("wb") as file:
             np.savez(file, **arrays | {name: np.array([Trap()], dtype=object)})
-        assert_refused(path, "not a take, or a damaged one")
+        assert_refused(path, DAMAGED)
         assert "test_take_sprung" not in sys.modules
     with np.load(path, allow_pickle=True) as stored:  # the trap works
         _ = stored["more"]
     assert sys.modules.pop("test_take_sprung")
+
+
+def test_files_hold_the_joint_positions(take, tmp_path):
+    take.save(tmp_path / "take.npz")
+    with np.load(tmp_path / "take.npz") as stored:
+        header, keypoints = json.loads(str(stored["header"])), stored["keypoints"]
+    assert header["schema"] == SCHEMA and tuple(header["keypoint_names"]) == KEYPOINT_NAMES
+    assert keypoints.shape == (FRAMES, 2, 21, 3)
+    np.testing.assert_array_equal(keypoints, take.keypoints())
+    for index, hand in enumerate(take.hands):
+        there = take.status[:, index] != LOST
+        expected = hand_keypoints(hand.model, take.qpos[there, index])
+        np.testing.assert_allclose(keypoints[there, index], expected)
+        assert np.isnan(keypoints[~there, index]).all()
+    assert INITIALIZED == STATUSES.index("found")

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from gloves.attachment import attach_markers, wear
-from gloves.fit import GlovedHand, GloveFit, attach
+from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout
 from gloves.takes.take import Take, load_take
 from handsim.cli.main import main
@@ -78,11 +78,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = HandModel(sample_shape(rng=rng))
     fit = GloveFit(model, wear(layout, model, along=0.002, around=0.05, rng=rng))
     save_user(folder / "user.json", [fit, fit.with_side("left")])
-    nothing = np.zeros((3, 0), dtype=np.int32)
-    hand = GlovedHand(
-        attach(layout, HandModel(sample_shape(side="left", rng=rng))), join_qpos(np.zeros((3, 20)))
-    )
-    Take(120.0, np.zeros((3, 0, 3)), nothing, nothing, (hand,), None, {}).save(folder / "one.truth.npz")
+    hand = attach(layout, HandModel(sample_shape(side="left", rng=rng)))
+    Take.of_poses([hand], join_qpos(np.zeros((3, 20)))[:, None], rate=120.0).save(folder / "one.truth.npz")
     return folder
 
 

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from gloves.takes.take import load_take
-from gloves.takes.tracked_take import load_tracked_take
 from handsim.cli.main import main
 from track.streams.natnet_server import LOOPBACK
 from track.streams.point_stream import open_stream
@@ -65,7 +64,7 @@ def test_a_capture_is_tracked_as_a_stream(capture, ending, tmp_path, replay):
     assert main(["track", "--live", url, "--size", "M", "--seconds", "0.3", "--out", str(out)]) == 0
     process.terminate()  # it may have played the last frame already
     process.communicate(timeout=20)
-    take, truth = load_tracked_take(out), load_take(capture.with_name("take.truth.npz"))
+    take, truth = load_take(out), load_take(capture.with_name("take.truth.npz"))
     for numbers, points in zip(take.numbers, take.points, strict=True):
         true = truth.points[numbers]
         seen = true[np.isfinite(true[:, 0])]

@@ -25,8 +25,7 @@ from gloves.layout import load_layout
 from gloves.takes.archives import CutOffWarning
 from gloves.takes.corrections import NO_MARKER
 from gloves.takes.growing import GrownArchive
-from gloves.takes.take import load_take
-from gloves.takes.tracked_take import LOST, load_tracked_take
+from gloves.takes.take import LOST, load_take
 from handsim.cli.main import main
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
@@ -75,7 +74,7 @@ def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     assert np.median(errors.positions) < 0.5 * np.median(start.positions)
     assert main(["track", str(folder / "user.c3d"), "--shape", str(folder / "user.json"), "--out",
                  str(folder / "take.npz")]) == 0  # fmt: skip
-    take = load_tracked_take(folder / "take.npz")
+    take = load_take(folder / "take.npz")
     assert take.sides == ("right",) and take.settings["user"] == "user.json"
     assert np.nanmedian(take.rms) < 0.0005
     np.testing.assert_array_equal(take.hands[0].attachment.points, found.attachment.points)
@@ -105,7 +104,7 @@ def test_a_capture_becomes_a_take_and_is_told_of(capture, tmp_path, capsys):
     assert lines[1].startswith("right hand: tracked 98.3 %, found 1.7 %, coasting 0.0 %, lost 0.0 %; median")
     assert lines[2].startswith("left hand: ") and " mm, " in lines[2]
     assert lines[3].endswith("points are not markers") and lines[4].endswith(" ms per frame")
-    take, truth = load_tracked_take(out), load_take(capture.with_suffix(".truth.npz"))
+    take, truth = load_take(out), load_take(capture.with_suffix(".truth.npz"))
     assert take.sides == ("right", "left")
     assert take.settings["capture"] == "take.c3d" and take.settings["user"] == "L"
     json.dumps(take.settings)
@@ -123,13 +122,13 @@ def test_corrections_come_back_with_a_new_tracking(capture, tmp_path, capsys):
     out, labeled = tmp_path / "tracked.npz", tmp_path / "labeled.trc"
     arguments = ["track", str(capture), "--out", str(out), "--size", "L"]
     assert main(arguments) == 0
-    first = load_tracked_take(out)
+    first = load_take(out)
     corrector = Corrector(out, first)
     (column,) = np.flatnonzero(first.labels[30] == 5)
     number = first.ids[30, column]
     corrector.add(30, column, (20, 40), NO_MARKER)
     corrector.save()
-    saved = load_tracked_take(out)
+    saved = load_take(out)
     about = (first.ids == number) & np.isin(np.arange(FRAMES), np.arange(20, 41))[:, None]
     assert (saved.labels[about] == -1).all() and (first.labels[about] == 5).all()
     capsys.readouterr()
@@ -139,7 +138,7 @@ def test_corrections_come_back_with_a_new_tracking(capture, tmp_path, capsys):
         f"{beside}: 1 correction applied, {about.sum()} labels in {about.sum()} frames"
         in capsys.readouterr().out
     )
-    again = load_tracked_take(out)
+    again = load_take(out)
     np.testing.assert_array_equal(again.labels, saved.labels)
     np.testing.assert_allclose(again.qpos, saved.qpos, atol=1e-9)
     assert again.settings["corrections"] == saved.settings["corrections"] != []
@@ -149,7 +148,7 @@ def test_corrections_come_back_with_a_new_tracking(capture, tmp_path, capsys):
     beside.write_text(re.sub("place_mm = .*", "place_mm = [5000, 0, 0]", beside.read_text()))
     assert main(arguments) == 0
     assert "the correction to none in frames 20 to 40 no longer fits" in capsys.readouterr().err
-    np.testing.assert_array_equal(load_tracked_take(out).labels, first.labels)
+    np.testing.assert_array_equal(load_take(out).labels, first.labels)
 
 
 def test_corrections_that_cannot_be_meant_are_told_before_the_work(capture, tmp_path, capsys):
@@ -170,8 +169,8 @@ def test_the_size_of_the_hands_is_measured(capture, tmp_path, capsys):
     assert main(["track", str(capture), "--out", str(out)]) == 0
     said = capsys.readouterr().out.splitlines()[0]
     length, breadth = (int(word) for word in said.removeprefix("size of the hands: ")[:-3].split(" x "))
-    truth, take = load_take(capture.with_suffix(".truth.npz")), load_tracked_take(out)
-    assert length == pytest.approx(1e3 * truth.hands[0].fit.shape.length, abs=12)
+    truth, take = load_take(capture.with_suffix(".truth.npz")), load_take(out)
+    assert length == pytest.approx(1e3 * truth.hands[0].shape.length, abs=12)
     assert 0.4 < breadth / length < 0.5
     assert take.settings["user"] == f"auto, {length} x {breadth} mm"
     assert np.nanmedian(take.rms) < 0.005
@@ -211,7 +210,7 @@ def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
         "mug: tracked 0.0 %, found 0.0 %, coasting 0.0 %, lost 100.0 %; it was never found: are these its "
         "markers?"
     )
-    take, first = load_tracked_take(out), truth.hand_labels[-1].stop
+    take, first = load_take(out), truth.hand_labels[-1].stop
     assert [body.name for body in take.bodies] == ["controller", "mug"]
     np.testing.assert_allclose(take.bodies[0].positions, named_object("controller").markers, atol=1e-12)
     mine = truth.labels >= first
@@ -243,14 +242,14 @@ def test_a_body_is_followed_through_a_stream(capture, tmp_path, capsys):
     with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
         asked = ["--live", server.url, "--seconds", "0.2", "--body", "controller", "--out", str(out)]
         assert main(["track", *asked]) == 0
-    assert (load_tracked_take(out).body_status != LOST).all()
+    assert (load_take(out).body_status != LOST).all()
     assert "controller: tracked" in capsys.readouterr().out
 
 
 def test_the_same_command_writes_the_same_bytes(capture, tmp_path):
     for name in ("one.npz", "two.npz"):
         assert main(["track", str(capture), "--out", str(tmp_path / name), "--hands", "right"]) == 0
-    take = load_tracked_take(tmp_path / "one.npz")
+    take = load_take(tmp_path / "one.npz")
     assert take.sides == ("right",) and (take.status != LOST).all()
     assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
 
@@ -259,7 +258,7 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys):
     out = tmp_path / "live.npz"
     with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
         assert main(["track", "--live", server.url, "--seconds", "0.3", "--out", str(out)]) == 0
-    take = load_tracked_take(out)
+    take = load_take(out)
     assert take.num_frames == 37 and take.rate == pytest.approx(120.0, rel=1e-3)
     assert take.settings["capture"] == server.url
     assert set(take.settings["stream"].values()) == {0}
@@ -289,7 +288,7 @@ def test_an_interrupt_writes_what_there_is(number, capture, tmp_path):
         thread.start()
         assert main(["track", "--live", server.url, "--out", str(out)]) == 0
         thread.join()
-    assert 2 <= load_tracked_take(out).num_frames <= FRAMES
+    assert 2 <= load_take(out).num_frames <= FRAMES
     assert signal.getsignal(number) is before and os.listdir(tmp_path) == ["live.npz"]
 
 
@@ -313,7 +312,7 @@ def test_a_kill_leaves_all_but_the_last_second(capture, tmp_path):
         process.wait()
     assert os.listdir(tmp_path) == ["live.npz.part"]
     with pytest.warns(CutOffWarning):
-        numbers = load_tracked_take(part).numbers
+        numbers = load_take(part).numbers
     assert (numbers[0], len(numbers)) == (0, numbers[-1] + 1) and len(numbers) > sent - 120
 
 
@@ -341,7 +340,7 @@ def test_hands_are_sent_as_they_are_tracked(capture, tmp_path, capsys):
         with contextlib.suppress(BlockingIOError):
             while True:
                 heard.append(json.loads(one.recv(1 << 16)))
-    take = load_tracked_take(out)
+    take = load_take(out)
     header, frames = heard[0], [one for one in heard if one["type"] == "frame"]
     assert header["type"] == "header" and header["sides"] == ["right", "left"]
     assert [one["number"] for one in frames] == list(range(FRAMES))

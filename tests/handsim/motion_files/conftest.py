@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gloves.fit import attach
+from gloves.layout import load_layout
+from gloves.takes.take import RigidBody, Take
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand, MovingThing
-from handsim.space.objects import named_object
-from handsim.space.transforms import pose_matrices
 
 FRAMES = 13
 
 
 @pytest.fixture
-def motion(rng: np.random.Generator) -> HandsInMotion:
+def motion(rng: np.random.Generator) -> Take:
     """Two hands and a pen at 60 Hz that turn through all directions; the left hand and the pen have gaps."""
-    hands = []
+    hands, poses = [], []
     for side in ("right", "left"):
         model = HandModel(sample_shape(side=side, rng=rng))
         ranges = model.skeleton.ranges
@@ -30,9 +30,16 @@ def motion(rng: np.random.Generator) -> HandsInMotion:
         qpos = join_qpos(angles, position=rng.normal(size=(FRAMES, 3)), quaternion=quaternions)
         if side == "left":
             qpos[[0, 1, 5, 6]] = np.nan
-        hands.append(MovingHand(model, qpos))
+        hands.append(attach(load_layout("dense19"), model))
+        poses.append(qpos)
     rows = np.concatenate([rng.normal(size=(FRAMES, 3)), rng.normal(size=(FRAMES, 4))], axis=1)
     rows[7:9] = np.nan
-    pen = MovingThing("pen", named_object("pen"), pose_matrices(rows))
-    unknown = MovingThing("my wand", None, pose_matrices(rows[::-1]))
-    return HandsInMotion(60.0, 100.0 + np.arange(FRAMES) / 60.0, tuple(hands), (pen, unknown))
+    rows[:, 3:] /= np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    return Take.of_poses(
+        hands,
+        np.stack(poses, axis=1),
+        rate=60.0,
+        times=100.0 + np.arange(FRAMES) / 60.0,
+        bodies=[RigidBody(name, (), np.empty((0, 3))) for name in ("pen", "my wand")],
+        body_poses=np.stack([rows, rows[::-1]], axis=1),
+    )

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.topology import BONE_NAMES, DIGITS
 from handsim.motion_files.bvh import write_bvh
+from handsim.motion_files.motion import posed_bodies, posed_hands
 
 BACK = 0.01 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """The file's centimeters with y up to our meters with z up."""
@@ -58,10 +59,10 @@ def test_joints_are_where_ours_are(motion, tmp_path):
     write_bvh(tmp_path / "hands.bvh", motion)
     positions, rate, _, _ = read_bvh(tmp_path / "hands.bvh")
     assert abs(rate - 60.0) < 1e-5
-    for hand in motion.hands:
+    for hand in posed_hands(motion):
         bones, tips = (
-            hand.model.forward_kinematics(hand.held_qpos),
-            hand_keypoints(hand.model, hand.held_qpos),
+            hand.model.forward_kinematics(hand.qpos),
+            hand_keypoints(hand.model, hand.qpos),
         )
         for number, bone in enumerate(BONE_NAMES):
             np.testing.assert_allclose(positions[f"{hand.side}_{bone}"], bones[:, number, :3, 3], atol=1e-7)
@@ -80,10 +81,10 @@ def test_a_hand_without_a_pose_keeps_the_last_one(motion, tmp_path):
 def test_things_are_where_ours_are(motion, tmp_path):
     write_bvh(tmp_path / "hands.bvh", motion)
     positions, _, rotations, _ = read_bvh(tmp_path / "hands.bvh")
-    for thing, name in zip(motion.things, ("pen", "my_wand"), strict=True):
-        np.testing.assert_allclose(positions[name], thing.held_poses[:, :3, 3], atol=1e-7)
+    for thing, name in zip(posed_bodies(motion), ("pen", "my_wand"), strict=True):
+        np.testing.assert_allclose(positions[name], thing.T_world_body[:, :3, 3], atol=1e-7)
         turn = 100.0 * BACK.T
-        expected = turn @ thing.held_poses[:, :3, :3] @ turn.T
+        expected = turn @ thing.T_world_body[:, :3, :3] @ turn.T
         np.testing.assert_allclose(rotations[name].as_matrix(), expected, atol=1e-7)
 
 
@@ -94,7 +95,7 @@ def test_zero_rotations_are_the_flat_hand(motion, tmp_path):
     columns = head.count("rotation") + head.count("position")
     path.write_text(head + "MOTION\nFrames: 1\nFrame Time: 1\n" + "0 " * columns + "\n")
     positions = read_bvh(path)[0]
-    for hand in motion.hands:
+    for hand in posed_hands(motion):
         rest = hand.model.rest_transforms
         for number, bone in enumerate(BONE_NAMES):
             np.testing.assert_allclose(positions[f"{hand.side}_{bone}"][0], rest[number, :3, 3], atol=1e-7)
@@ -102,5 +103,5 @@ def test_zero_rotations_are_the_flat_hand(motion, tmp_path):
 
 def test_angles_do_not_jump(motion, tmp_path):
     """No channel turns by more than half a turn between frames, also where it passes 180 degrees."""
-    write_bvh(tmp_path / "hands.bvh", motion.resampled(960.0))
+    write_bvh(tmp_path / "hands.bvh", motion.poses_alone(960.0))
     assert np.abs(np.diff(read_bvh(tmp_path / "hands.bvh")[3], axis=0)).max() < 180.0 + 1e-6

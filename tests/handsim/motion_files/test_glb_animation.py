@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import struct
 
@@ -11,9 +10,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation, Slerp
 
+from gloves.fit import attach
+from gloves.layout import load_layout
+from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
 from handsim.motion_files.glb_animation import write_glb
-from handsim.motion_files.hands_in_motion import HandsInMotion, MovingHand
+from handsim.motion_files.motion import posed_bodies, posed_hands, seconds_of
 
 TYPES = {5121: "<u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -108,31 +110,31 @@ def glb(motion, tmp_path):
 
 
 def test_skins_move_as_ours(glb, motion):
-    for hand in motion.hands:
+    for hand in posed_hands(motion):
         for frame in np.flatnonzero(hand.present):
-            found, _, _ = glb.skinned(f"{hand.side}_hand", motion.seconds[frame])
+            found, _, _ = glb.skinned(f"{hand.side}_hand", seconds_of(motion)[frame])
             expected = hand.model.skin(hand.qpos[frame : frame + 1])[0] @ UP.T
             np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
 def test_a_hand_without_a_pose_is_a_point(glb, motion):
-    left = motion.hands[1]
+    left = list(posed_hands(motion))[1]
     for frame in np.flatnonzero(~left.present):
-        found, _, _ = glb.skinned("left_hand", motion.seconds[frame])
+        found, _, _ = glb.skinned("left_hand", seconds_of(motion)[frame])
         assert np.ptp(found, axis=0).max() < 1e-6
-    assert np.ptp(glb.skinned("right_hand", motion.seconds[5])[0], axis=0).max() > 0.1
+    assert np.ptp(glb.skinned("right_hand", seconds_of(motion)[5])[0], axis=0).max() > 0.1
 
 
 def test_things_move_as_ours(glb, motion):
-    for thing in motion.things:
+    for thing in posed_bodies(motion):
         for frame in range(motion.num_frames):
-            pose = glb.worlds(motion.seconds[frame])[glb.named(thing.name)]
+            pose = glb.worlds(seconds_of(motion)[frame])[glb.named(thing.name)]
             expected = (
-                np.zeros((3, 3)) if not thing.present[frame] else UP @ thing.T_world_thing[frame, :3, :3]
+                np.zeros((3, 3)) if not thing.present[frame] else UP @ thing.T_world_body[frame, :3, :3]
             )
             np.testing.assert_allclose(pose[:3, :3], expected, atol=5e-6)
             if thing.present[frame]:
-                np.testing.assert_allclose(pose[:3, 3], UP @ thing.T_world_thing[frame, :3, 3], atol=5e-6)
+                np.testing.assert_allclose(pose[:3, 3], UP @ thing.T_world_body[frame, :3, 3], atol=5e-6)
     assert (
         "mesh" in glb.json["nodes"][glb.named("pen")]
         and "mesh" not in glb.json["nodes"][glb.named("my wand")]
@@ -140,7 +142,7 @@ def test_things_move_as_ours(glb, motion):
 
 
 def test_faces_look_outwards_once_and_normals_are_of_length_one(glb, motion):
-    for hand in motion.hands:
+    for hand in posed_hands(motion):
         _, parts, indices = glb.skinned(f"{hand.side}_hand", 0.0)
         mesh = trimesh.Trimesh(parts["POSITION"], indices.reshape(-1, 3), process=False)
         assert mesh.is_watertight and mesh.volume > 0
@@ -161,17 +163,17 @@ def test_keys_turn_the_short_way(glb):
 
 def test_a_single_frame_is_a_pose_without_an_animation(tmp_path):
     model = HandModel.named("S", side="left")
-    write_glb(
-        tmp_path / "one.glb",
-        HandsInMotion(1.0, np.zeros(1), (MovingHand(model, join_qpos(np.zeros((1, 20)))),)),
-    )
+    flat = join_qpos(np.zeros((1, 20)))[:, None]
+    take = Take.of_poses([attach(load_layout("dense19"), model)], flat, rate=1.0)
+    write_glb(tmp_path / "one.glb", take)
     glb = Glb(tmp_path / "one.glb")
     assert "animations" not in glb.json
     np.testing.assert_allclose(glb.skinned("left_hand", 0.0)[0], model.surface.vertices @ UP.T, atol=1e-6)
 
 
 def test_a_take_with_y_up_keeps_its_axes(motion, tmp_path):
-    write_glb(tmp_path / "y.glb", dataclasses.replace(motion, up="y"))
+    write_glb(tmp_path / "y.glb", motion, up="y")
     found, _, _ = Glb(tmp_path / "y.glb").skinned("right_hand", 0.0)
-    np.testing.assert_allclose(found, motion.hands[0].model.skin(motion.hands[0].qpos[:1])[0], atol=2e-6)
+    right = next(posed_hands(motion))
+    np.testing.assert_allclose(found, right.model.skin(right.qpos[:1])[0], atol=2e-6)
     assert trimesh.load(tmp_path / "y.glb").geometry  # another reader opens it

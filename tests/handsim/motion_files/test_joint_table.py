@@ -8,6 +8,7 @@ import pytest
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES
 from handsim.motion_files.joint_table import write_joint_csv, write_joint_parquet
+from handsim.motion_files.motion import posed_hands
 
 
 def rows_of(path):
@@ -34,7 +35,7 @@ def test_a_row_per_frame_and_hand_holds_the_pose(motion, tmp_path, name):
     rows = rows_of(tmp_path / name)(motion)
     assert len(rows) == 2 * motion.num_frames
     for number, row in enumerate(rows):
-        frame, hand = number // 2, motion.hands[number % 2]
+        frame, hand = number // 2, list(posed_hands(motion))[number % 2]
         assert (int(row["frame"]), row["hand"]) == (frame, hand.side)
         assert float(row["time_s"]) == pytest.approx(motion.times[frame], abs=1e-6)
         if not hand.present[frame]:

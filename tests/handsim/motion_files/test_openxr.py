@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS
+from handsim.motion_files.motion import posed_hands
 from handsim.motion_files.openxr import JOINTS, joint_poses, joint_radii, write_openxr
 from handsim.space.transforms import MIRROR
 
@@ -111,7 +112,7 @@ def test_file(motion, tmp_path):
     up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     for frame, stored in enumerate(content["frames"]):
         assert stored["time"] == motion.times[frame]
-        for hand in motion.hands:
+        for hand in posed_hands(motion):
             rows = stored["hands"][hand.side]
             assert (rows is not None) == hand.present[frame]
             if rows is not None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimError
+from handsim.motion_files.motion import posed_bodies, posed_hands
 from handsim.motion_files.usd import write_usd
 
 
@@ -22,13 +23,13 @@ def stage(request, motion, tmp_path):
 def test_usd_skins_the_hands_as_we_do(stage, motion):
     from pxr import Usd, UsdGeom, UsdSkel
 
-    for hand in motion.hands:
+    for hand in posed_hands(motion):
         cache = UsdSkel.Cache()
         cache.Populate(UsdSkel.Root(stage.GetPrimAtPath(f"/hands/{hand.side}")), Usd.PrimDefaultPredicate)
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/hands/{hand.side}/skin"))
         skinning = cache.GetSkinningQuery(mesh.GetPrim())
         skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath(f"/hands/{hand.side}/skeleton")))
-        expected = hand.model.skin(hand.held_qpos)
+        expected = hand.model.skin(hand.qpos)
         for frame in range(motion.num_frames):
             points = mesh.GetPointsAttr().Get()
             assert skinning.ComputeSkinnedPoints(skeleton.ComputeSkinningTransforms(frame), points, frame)
@@ -42,11 +43,11 @@ def test_things_units_and_axes(stage, motion):
 
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetTimeCodesPerSecond() == 60.0 and stage.GetEndTimeCode() == pytest.approx(12.0)
-    for thing, name in zip(motion.things, ("pen", "my_wand"), strict=True):
+    for thing, name in zip(posed_bodies(motion), ("pen", "my_wand"), strict=True):
         prim = UsdGeom.Xformable(stage.GetPrimAtPath(f"/hands/things/{name}"))
         for frame in range(motion.num_frames):
             found = np.array(prim.ComputeLocalToWorldTransform(frame)).T
-            np.testing.assert_allclose(found, thing.held_poses[frame], atol=1e-6)
+            np.testing.assert_allclose(found, thing.T_world_body[frame], atol=1e-6)
             assert (prim.ComputeVisibility(frame) != UsdGeom.Tokens.invisible) == thing.present[frame]
     assert stage.GetPrimAtPath("/hands/things/pen/mesh") and not stage.GetPrimAtPath(
         "/hands/things/my_wand/mesh"

@@ -7,19 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.takes.tracked_take import LOST, TrackedTake
+from gloves.takes.take import LOST, Take
 from handsim.errors import ArgumentError, HandSimWarning, RigError
 from handsim.space.camera import pinhole
 from handsim.space.cameras import look_at
 from handsim.space.transforms import quaternion_matrix
 from render.cameras.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, check_hands_in_view, hand_centers
-from render.subject import as_tracked, subject_of_poses
+from render.subject import subject_of_poses
 from train.simulation.takes import TakeConfig, simulate_take
 
 
 @pytest.fixture(scope="module")
-def take() -> TrackedTake:
-    return as_tracked(simulate_take(TakeConfig(kind="hand-controller", num_frames=60)))
+def take() -> Take:
+    return simulate_take(TakeConfig(kind="hand-controller", num_frames=60))
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)

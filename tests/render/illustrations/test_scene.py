@@ -69,7 +69,7 @@ def test_a_hand_needs_one_pose(model: HandModel) -> None:
         PosedHand(model, join_qpos(np.zeros((2, 20))))
 
 
-SIZE = (160, 120)
+SMALL = (160, 120)
 UP = np.array([1.0, 0.0, 0.0])
 
 
@@ -96,12 +96,12 @@ def test_depth_of_a_sphere() -> None:
     center, radius = np.array([0.3, -0.2, 1.0]), 0.05
     place = np.array([0.1, 0.3, 0.6])
     view = View(look_at(place, center + np.array([0.01, 0.02, -0.03])), np.deg2rad(12.0))
-    depth = render_depth(HandScene(view, balls=(Balls(center[None], radius),)), SIZE)
+    depth = render_depth(HandScene(view, balls=(Balls(center[None], radius),)), SMALL)
     assert depth.shape == (120, 160)
     assert depth.dtype == np.float32
     rows, columns = np.mgrid[0:120:7, 0:160:7]
     pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    rays = pixel_rays(view, pixels, SIZE)
+    rays = pixel_rays(view, pixels, SMALL)
     # |place + d ray - center| = radius, the nearer d
     a, b = (rays**2).sum(1), rays @ (place - center)
     root = b**2 - a * (((place - center) ** 2).sum() - radius**2)
@@ -119,11 +119,11 @@ def test_depth_of_a_hand_is_what_rays_meet(side: str, rng: np.random.Generator) 
         gesture("pinch_index")[None], position=np.array([0.1, 0.2, 1.0]), quaternion=rng.standard_normal(4)
     )[0]
     hand = PosedHand(model, qpos)
-    view = view_along(np.array([0.3, 1.0, -0.4]), np.array([0.0, 0.0, 1.0]), hand.vertices(), SIZE)
-    depth = render_depth(HandScene(view, (hand,)), SIZE)
-    pixels = rng.integers(0, SIZE, size=(150, 2))
+    view = view_along(np.array([0.3, 1.0, -0.4]), np.array([0.0, 0.0, 1.0]), hand.vertices(), SMALL)
+    depth = render_depth(HandScene(view, (hand,)), SMALL)
+    pixels = rng.integers(0, SMALL, size=(150, 2))
     triangles = hand.vertices()[model.surface.faces]
-    truth = cast(view.T_world_camera[:3, 3], pixel_rays(view, pixels, SIZE), triangles)
+    truth = cast(view.T_world_camera[:3, 3], pixel_rays(view, pixels, SMALL), triangles)
     drawn = depth[pixels[:, 1], pixels[:, 0]]
     assert 20 < (truth > 0).sum() < 140
     assert (np.abs(drawn - truth) < 2e-4).mean() > 0.97  # a pixel on an edge may go either way
@@ -167,17 +167,17 @@ def test_missing_points_are_not_drawn() -> None:
     view = View(np.eye(4), 1.0)
     centers = np.array([[np.nan] * 3, [0.0, 0.0, 1.0]])
     colors = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    picture = render_rgb(HandScene(view, balls=(Balls(centers, 0.1, colors),)), SIZE)
+    picture = render_rgb(HandScene(view, balls=(Balls(centers, 0.1, colors),)), SMALL)
     red, _, blue = picture[60, 80].astype(int)
     assert blue > red + 50
     nothing = HandScene(view, balls=(Balls(centers[:1], 0.1),))
-    assert not render_depth(nothing, SIZE).any()
-    assert (render_rgb(nothing, SIZE) == picture[0, 0]).all()
+    assert not render_depth(nothing, SMALL).any()
+    assert (render_rgb(nothing, SMALL) == picture[0, 0]).all()
 
 
 def test_what_stands_before_a_point() -> None:
     view = View(np.eye(4), 1.0)
-    depth = render_depth(HandScene(view, balls=(Balls(np.array([[0.0, 0.0, 1.0]]), 0.1),)), SIZE)
+    depth = render_depth(HandScene(view, balls=(Balls(np.array([[0.0, 0.0, 1.0]]), 0.1),)), SMALL)
     points = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 0.95], [0.0, 0.0, 2.0], [0.3, 0.0, 2.0], [9.0, 0.0, 1.0]])
     assert unoccluded(depth, view, points, slack=0.11).tolist() == [True, True, False, True, False]
 

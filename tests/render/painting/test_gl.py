@@ -82,14 +82,14 @@ def test_a_failing_check_means_no_hardware(error: Exception, monkeypatch: pytest
         raise error
 
     monkeypatch.setattr(gl, "_some_hardware_device", fail)
-    assert opengl_has_gl.__wrapped__() is False
+    assert gl.opengl_has_hardware.__wrapped__() is False
 
 
 def test_a_device_without_a_working_driver_is_not_hardware(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gl, "_some_hardware_device", lambda: True)
     monkeypatch.setenv("PYOPENGL_PLATFORM", "egl")
     monkeypatch.setenv("EGL_DEVICE_ID", "4711")
-    assert opengl_has_gl.__wrapped__() is False
+    assert gl.opengl_has_hardware.__wrapped__() is False
 
 
 def test_the_check_loads_no_gl() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from track.association.candidates import MAX_CANDIDATES, MarkerTable, find_candidates
-from track.config import AssociationConfig
 
 # Two digits of three markers each and a palm of one; the digits lie 30 mm apart.
 PLACES = np.array(
@@ -21,7 +20,6 @@ def candidates_of(points, assigned, evidence=12.0):
         evidences,
         MarkerTable(PLACES, PARTS, np.array(assigned)),
         2,
-        AssociationConfig(),
     )
 
 

@@ -12,9 +12,9 @@ from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
 from poses.shapes.validity import resting_angles, sample_valid_angles
+from track.association.assignment import peak_log_odds
 from track.association.digit_hypotheses import DigitModel, digit_ranges, empty_hypotheses, evaluate_digit
-from track.association.point_matching import peak_log_odds
-from track.config import AssociationConfig
+from track.config import TrackerConfig
 from track.kinematics.joint_prior import digit_prior, predict_joints, resting_covariance
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_solver import PoseSolver
@@ -22,7 +22,7 @@ from track.kinematics.pose_solver import PoseSolver
 INDEX = 1
 MARKERS = np.array([4, 5, 6])
 SPREAD = 0.001
-ASSOCIATION = AssociationConfig()
+STRAYS = TrackerConfig.stray_density
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +44,9 @@ def digit_model(solver, qpos, missing):
         prior,
         seen,
         variance,
-        peak_log_odds(variance, ASSOCIATION.stray_density),
+        peak_log_odds(variance, STRAYS),
         np.zeros(19),
         digit_ranges(solver.hand),
-        ASSOCIATION.length_tolerance,
-        ASSOCIATION.pruning_margin,
-        ASSOCIATION.start_distance,
     )
 
 

@@ -11,12 +11,33 @@ from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
 from poses.motion.motions import sample_motion
+from track.association.frame_state import FrameState, Numbering, targets_of
 from track.association.hand_state import HandState, Prediction
-from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, targets_of
-from track.config import GatingConfig
+from track.association.label_consistency import EXCHANGE_DISTANCE, exchange_labels, fit_labels, gate_labels
 
 RATE = 120.0
-GATING = GatingConfig()
+
+
+def frame_of(points: np.ndarray, labels: np.ndarray) -> FrameState:
+    count = len(points)
+    ones, numbers = np.ones(count), np.arange(count)
+    return FrameState(points, numbers, labels, 4.0 * ones, ones, 0.0 * ones, 0.0, Numbering([19]))
+
+
+def gated(state, points, labels, prediction) -> np.ndarray:
+    return gate_labels(frame_of(points, labels), 0, state, prediction).labels
+
+
+def fitted(state, points, labels, prediction):
+    frame, estimate = fit_labels(frame_of(points, labels), 0, state, prediction)
+    return frame.labels, estimate
+
+
+def exchanged(points, labels, positions) -> tuple[list[int], np.ndarray]:
+    """The points whose label is new, and all labels."""
+    frame = exchange_labels(frame_of(points, labels), positions)
+    np.testing.assert_array_equal(frame.evidence == 0.0, frame.labels != labels)
+    return np.flatnonzero(frame.labels != labels).tolist(), frame.labels
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +81,8 @@ def test_targets_are_points_in_the_layouts_order():
 def test_right_labels_stay_and_give_the_pose(hand, motion, markers, frames):
     state, prediction = followed(hand, motion, markers, frames)
     labels = np.arange(19)
-    gate_labels(state, markers[frames], labels, prediction, GATING)
-    estimate = fit_labels(state, markers[frames], labels, prediction, GATING)
+    labels = gated(state, markers[frames], labels, prediction)
+    labels, estimate = fitted(state, markers[frames], labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     assert estimate.rms < 1e-4
     np.testing.assert_allclose(estimate.positions, markers[frames], atol=1e-3)
@@ -74,7 +95,7 @@ def test_a_label_far_from_its_predicted_marker_is_dropped(hand, motion, markers,
     way = np.random.default_rng(seed).normal(size=3)
     points, labels = markers[frames].copy(), np.arange(19)
     points[wrong] += off * way / np.linalg.norm(way)
-    gate_labels(state, points, labels, prediction, GATING)
+    labels = gated(state, points, labels, prediction)
     assert np.flatnonzero(labels < 0).tolist() == [wrong]
     assert np.flatnonzero(labels != np.arange(19)).tolist() == [wrong]
 
@@ -83,9 +104,9 @@ def test_a_hand_that_is_elsewhere_keeps_its_labels(hand, motion, markers):
     """Then the prediction is wrong."""
     state, prediction = followed(hand, motion, markers, 20)
     labels, points = np.arange(19), markers[20] + [0.05, 0.0, 0.0]
-    gate_labels(state, points, labels, prediction, GATING)
+    labels = gated(state, points, labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
-    estimate = fit_labels(state, points, labels, prediction, GATING)
+    labels, estimate = fitted(state, points, labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     np.testing.assert_allclose(estimate.positions, points, atol=1e-3)
 
@@ -95,7 +116,7 @@ def test_few_labels_may_be_dropped_at_once(hand, motion, markers):
     for many, gone in ((5, 5), (6, 0)):  # of 19 labels, at most 30 %
         labels, points = np.arange(19), markers[20].copy()
         points[:many] += [0.0, 0.0, 0.06]
-        gate_labels(state, points, labels, prediction, GATING)
+        labels = gated(state, points, labels, prediction)
         assert (labels < 0).sum() == gone
 
 
@@ -105,10 +126,10 @@ def test_the_gate_is_as_wide_as_the_whole_hand_is_off(hand, motion, markers):
     points = markers[20] + [0.012, 0.0, 0.0]
     points[[4, 5, 6]] += [0.02, 0.0, 0.0]  # and a finger with it
     labels = np.arange(19)
-    gate_labels(state, points, labels, prediction, GATING)
+    labels = gated(state, points, labels, prediction)
     np.testing.assert_array_equal(labels, np.arange(19))
     points[6] += [0.15, 0.0, 0.0]
-    gate_labels(state, points, labels, prediction, GATING)
+    labels = gated(state, points, labels, prediction)
     assert np.flatnonzero(labels < 0).tolist() == [6]
 
 
@@ -120,21 +141,19 @@ def test_exchanged_labels_are_exchanged_back_also_while_the_hand_speeds_up(
     _, prediction = followed(hand, motion, markers, 20)
     points = markers[20] + [0.0, moved, 0.0]
     assigned = np.arange(19)
-    assert exchange_labels(points, assigned, prediction.positions, GATING).size == 0
-    near = np.linalg.norm(points[pair[0]] - points[pair[1]]) < GATING.exchange_distance
+    assert exchanged(points, assigned, prediction.positions)[0] == []
+    near = np.linalg.norm(points[pair[0]] - points[pair[1]]) < EXCHANGE_DISTANCE
     assigned[list(pair)] = pair[::-1]
-    changed = exchange_labels(points, assigned, prediction.positions, GATING)
-    assert sorted(changed) == (list(pair) if near else [])
+    changed, labels = exchanged(points, assigned, prediction.positions)
+    assert changed == (list(pair) if near else [])
     if near:
-        np.testing.assert_array_equal(assigned, np.arange(19))
+        np.testing.assert_array_equal(labels, np.arange(19))
 
 
 def test_exchanges_need_two_labels(hand, motion, markers):
     _, prediction = followed(hand, motion, markers, 20)
     for assigned in (np.full(19, -1), np.where(np.arange(19) == 3, 3, -1)):
-        before = assigned.copy()
-        assert exchange_labels(markers[20], assigned, prediction.positions, GATING).size == 0
-        np.testing.assert_array_equal(assigned, before)
+        assert exchanged(markers[20], assigned, prediction.positions)[0] == []
 
 
 def planted(points: np.ndarray, wrong: int, off: float, seed: int) -> np.ndarray:
@@ -150,7 +169,7 @@ def test_a_planted_wrong_label_is_dropped_and_the_right_ones_stay(hand, motion, 
     """On the palm and at the knuckles, where no bent finger explains it."""
     state, prediction = followed(hand, motion, markers, 20)
     labels = np.arange(19)
-    estimate = fit_labels(state, planted(markers[20], wrong, off, seed), labels, prediction, GATING)
+    labels, estimate = fitted(state, planted(markers[20], wrong, off, seed), labels, prediction)
     assert np.flatnonzero(labels < 0).tolist() == [wrong]
     np.testing.assert_allclose(estimate.positions, markers[20], atol=0.004)
 
@@ -161,13 +180,8 @@ def test_a_wrong_label_on_a_finger_seldom_drops_others(hand, motion, markers):
     found = []
     for number, wrong in enumerate([*range(1, 16)] * 20):
         labels = np.arange(19)
-        fit_labels(
-            state,
-            planted(markers[20], wrong, (0.03, 0.05, 0.09)[number % 3], number),
-            labels,
-            prediction,
-            GATING,
-        )
+        points = planted(markers[20], wrong, (0.03, 0.05, 0.09)[number % 3], number)
+        labels, _ = fitted(state, points, labels, prediction)
         found.append(np.flatnonzero(labels < 0).tolist() == [wrong])
     assert np.mean(found) >= 0.95
 
@@ -177,7 +191,7 @@ def test_of_two_swapped_labels_both_are_dropped(hand, motion, markers, pair):
     state, prediction = followed(hand, motion, markers, 20)
     labels = np.arange(19)
     labels[list(pair)] = pair[::-1]
-    estimate = fit_labels(state, markers[20], labels, prediction, GATING)
+    labels, estimate = fitted(state, markers[20], labels, prediction)
     assert set(np.flatnonzero(labels < 0)) == set(pair)
     np.testing.assert_allclose(estimate.positions, markers[20], atol=0.004)
 
@@ -185,7 +199,7 @@ def test_of_two_swapped_labels_both_are_dropped(hand, motion, markers, pair):
 def test_without_labels_the_pose_is_the_predicted_one(hand, motion, markers):
     state, prediction = followed(hand, motion, markers, 20)
     labels = np.full(19, -1)
-    estimate = fit_labels(state, markers[20], labels, prediction, GATING)
+    labels, estimate = fitted(state, markers[20], labels, prediction)
     assert np.isnan(estimate.rms) and (labels == -1).all()
     np.testing.assert_array_equal(estimate.qpos, prediction.qpos)
-    gate_labels(state, np.zeros((0, 3)), np.zeros(0, dtype=int), prediction, GATING)
+    assert gated(state, np.zeros((0, 3)), np.zeros(0, dtype=int), prediction).shape == (0,)

@@ -9,9 +9,8 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
 from poses.shapes.validity import resting_angles
-from track.association.frame_state import FrameState
-from track.association.hand_state import HandState
-from track.association.label_new_points import HandTrack
+from track.association.frame_state import FrameState, Numbering, targets_of
+from track.association.hand_state import HandState, HandTrack
 from track.association.labeler_review import LabelerReview
 from track.config import TrackerConfig
 from train.labelers.protocol import Labeling
@@ -58,18 +57,17 @@ def followed(off: np.ndarray | float = 0.0) -> HandState:
 def frame_of(points, labels, time, *, ids=None, first_seen=0.0) -> FrameState:
     count = len(points)
     numbers = np.arange(count) if ids is None else ids
-    seen = np.full(count, first_seen)
-    return FrameState(points, numbers, labels[None].copy(), np.zeros(count), np.ones(count), seen, time)
+    seen, numbering = np.full(count, first_seen), Numbering([19])
+    return FrameState(points, numbers, labels, np.zeros(count), np.ones(count), seen, time, numbering)
 
 
 def reviewed(review: LabelerReview, state: HandState, frame: FrameState):
-    """The result of a review, and the estimate it started from."""
+    """The frame and the hand after a review; None where both stay as they are."""
     prediction = state.predict(frame.time)
-    targets = np.full((19, 3), np.nan)
-    labels = frame.labels[0]
-    targets[labels[labels >= 0]] = frame.points[labels >= 0]
-    estimate = state.fit(targets, prediction.qpos, prediction)
-    return review.review(HandTrack(0, state, prediction, estimate), estimate, frame)
+    targets = targets_of(frame.points, frame.labels, 19)
+    hand = HandTrack(0, state, prediction, state.fit(targets, prediction.qpos, prediction))
+    after = review.review(frame, hand)
+    return None if after[0] is frame and after[1] is hand else after
 
 
 def test_exchanged_labels_are_found_and_right_ones_stay(state):
@@ -80,20 +78,19 @@ def test_exchanged_labels_are_found_and_right_ones_stay(state):
     assert labeler.times == 1
     wrong = np.arange(19)
     wrong[[TIP, OTHER_TIP]] = OTHER_TIP, TIP
-    found = reviewed(review, state, frame_of(points, wrong, 1.0))
-    np.testing.assert_array_equal(found.labels, np.arange(19))
-    np.testing.assert_allclose(found.estimate.positions, points, atol=0.002)
-    assert found.confidence.min() > 0.5
+    frame, hand = reviewed(review, state, frame_of(points, wrong, 1.0))
+    np.testing.assert_array_equal(frame.labels, np.arange(19))
+    np.testing.assert_allclose(hand.estimate.positions, points, atol=0.002)
+    assert 0.5 < frame.confidence[[TIP, OTHER_TIP]].max() < 1.0 and frame.confidence[KNUCKLE] == 1.0
 
 
 def test_a_marker_that_waits_gets_its_label_and_a_ghost_does_not(state):
     points = state.solver.marker_positions(state.qpos)
     labels = np.arange(19)
     labels[TIP] = -1
-    found = reviewed(
-        LabelerReview(CountingLabeler(), 1, TrackerConfig()), state, frame_of(points, labels, 0.5)
-    )
-    np.testing.assert_array_equal(found.labels, np.arange(19))
+    review = LabelerReview(CountingLabeler(), 1, TrackerConfig())
+    frame, _ = reviewed(review, state, frame_of(points, labels, 0.5))
+    np.testing.assert_array_equal(frame.labels, np.arange(19))
     ghost = points.copy()
     ghost[TIP] += [0.0, 0.0, 0.03]
     again = LabelerReview(CountingLabeler(), 1, TrackerConfig())
@@ -155,18 +152,19 @@ def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age):
     if age == 0.0:
         assert found is None
     else:
-        np.testing.assert_array_equal(found.labels, np.arange(19))
+        np.testing.assert_array_equal(found[0].labels, np.arange(19))
 
 
 def test_biases_are_forgotten_and_recalled():
     state, designed = followed(np.array([0.0, 0.01, 0.01])), HandState(followed().hand).adapted.positions
     biased, variance = state.adapted.positions.copy(), state.variance.copy()
-    recall = state.forget(np.array([KNUCKLE]))
+    biases = state.biases
+    state.forget(np.array([KNUCKLE]))
     np.testing.assert_array_equal(state.adapted.positions[KNUCKLE], designed[KNUCKLE])
     others = np.delete(np.arange(19), KNUCKLE)
     np.testing.assert_array_equal(state.adapted.positions[others], biased[others])
     assert state.variance[KNUCKLE] > variance[KNUCKLE]
-    recall()
+    state.recall(biases)
     np.testing.assert_array_equal(state.adapted.positions, biased)
     np.testing.assert_array_equal(state.variance, variance)
     assert np.linalg.norm(biased[KNUCKLE, 0] - designed[KNUCKLE, 0]) > 0.003

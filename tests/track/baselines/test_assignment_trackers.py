@@ -12,7 +12,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.baselines.assignment_trackers import GATE, NEAR, HungarianTracker, NearestNeighborTracker
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
-from track.evaluation.trials import cut_take, hide_points
+from track.evaluation.trials import hide_points
 from track.tracked_frame import Status
 from train.simulation.takes import TakeConfig, simulate_take
 
@@ -106,7 +106,7 @@ def test_a_new_point_is_the_nearest_lost_marker(shift, named, take, users):
 
 
 def test_lost_markers_are_looked_for_where_they_were_going(users, take):
-    first = cut_take(take, 0, 1)
+    first = take.cut(0, 1)
     speed = np.array([1.2, 0.0, 0.0])  # [m/s]: 10 mm a frame
 
     def at(number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -129,7 +129,7 @@ def test_the_assignment_asks_for_no_ids(take, users):
     nameless = dataclasses.replace(take, ids=np.full_like(take.ids, -1))
     frames = [
         evaluate_tracker(part, users, HungarianTracker(users, seen_frame(take, 0).labels)).right
-        for part in (cut_take(take, 0, 60), cut_take(nameless, 0, 60))
+        for part in (take.cut(0, 60), nameless.cut(0, 60))
     ]
     np.testing.assert_array_equal(*frames)
 

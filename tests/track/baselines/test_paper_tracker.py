@@ -13,7 +13,7 @@ from gloves.takes.take import Take
 from handsim.hand.topology import JOINT_NAMES
 from track.baselines.paper_tracker import GATE, PaperTracker
 from track.evaluation.take_evaluation import evaluate_tracker, seen_frame, true_users
-from track.evaluation.trials import cut_take, hide_points
+from track.evaluation.trials import hide_points
 from track.tracked_frame import Status, TrackedFrame
 from train.labelers.protocol import Labeling
 from train.labelers.storage import load_labeler
@@ -51,10 +51,10 @@ def users(take) -> list[GloveFit]:
 def still(take) -> Take:
     """A frame of which every marker is seen, standing still."""
     frame = int(np.flatnonzero(take.markers_present().all(axis=1))[0])
-    part = cut_take(take, frame, frame + 1)
-    hands = tuple(dataclasses.replace(hand, qpos=np.tile(hand.qpos, (40, 1))) for hand in part.hands)
-    points, ids, labels = (np.repeat(array, 40, axis=0) for array in (part.points, part.ids, part.labels))
-    return dataclasses.replace(part, points=points, ids=ids, labels=labels, hands=hands)
+    part = take.cut(frame, frame + 1)
+    arrays = (part.qpos, part.points, part.ids, part.labels)
+    qpos, points, ids, labels = (np.repeat(array, 40, axis=0) for array in arrays)
+    return Take.of_truth(part.hands, qpos, points, ids, labels, rate=part.rate)
 
 
 def run(tracker: PaperTracker, take: Take) -> list[TrackedFrame]:
@@ -150,7 +150,7 @@ def test_markers_that_come_back_elsewhere_are_for_the_labeler(silent, users, sti
     tracker = settled(users, labeler, still)
     labeler.silent = silent
     seen = seen_frame(still, 0)
-    bent = still.hands[0].qpos[:1].copy()
+    bent = still.qpos[:1, 0].copy()
     bent[0, 7 + JOINT_NAMES.index("index_MCP_flexion")] += 0.6
     model, glove = users[0].model, users[0].attachment
     places = glove.centers(model, model.forward_kinematics(bent))[0]

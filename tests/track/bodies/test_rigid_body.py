@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
-from handsim.space.transforms import quaternion_matrix, random_quaternions
+from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
 from track.bodies.body_pose import predict_pose, transform_markers, velocity_between
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate
 from track.tracked_frame import Status
@@ -73,7 +73,7 @@ def test_every_frame_of_a_twin_is_right():
         assert frame.status == (Status.TRACKED if number else Status.INITIALIZED)
         np.testing.assert_array_equal(frame.labels, labels)
         assert frame.rms < 0.0015
-        errors.append(apart(frame.T_world_body, take.body.T_world_body[number]))
+        errors.append(apart(frame.T_world_body, pose_matrices(take.body_poses[number])[0]))
     away, turned = np.array(errors).T
     assert np.median(away) < 0.0005 and away.max() < 0.005
     assert np.median(turned) < 0.3 and turned.max() < 3.0

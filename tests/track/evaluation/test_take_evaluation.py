@@ -49,7 +49,7 @@ class Knowing:
                 np.full((19, 3), np.nan),
                 np.arange(0),
             )
-            for hand in self.take.hands
+            for hand in self.take.moving_hands()
         )
         frame = TrackedFrame(time, hands, seen.labels.copy(), np.ones(len(points)))
         self.frame += 1

@@ -9,8 +9,7 @@ import pytest
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import LOST, TrackedTake
+from gloves.takes.take import LOST, Take
 from handsim.cli.main import main
 from track.capture_tracking import track_capture
 from track.evaluation.take_summary import suspicions
@@ -27,8 +26,8 @@ def truth() -> Take:
 
 
 @pytest.fixture(scope="module")
-def tracked(truth) -> TrackedTake:
-    tracker = Tracker([hand.fit for hand in truth.hands], load_labeler("dense19"))
+def tracked(truth) -> Take:
+    tracker = Tracker(list(truth.hands), load_labeler("dense19"))
     return track_capture(truth.capture(), tracker)
 
 
@@ -37,10 +36,9 @@ def test_a_good_take_tells_nothing(tracked):
 
 
 def test_a_hand_that_is_not_there(tracked):
-    status, qpos, markers = tracked.status.copy(), tracked.qpos.copy(), tracked.markers.copy()
-    rms, filled = tracked.rms.copy(), tracked.filled.copy()
-    status[:, 0], qpos[:, 0], markers[:, 0], rms[:, 0], filled[:, 0] = LOST, np.nan, np.nan, np.nan, False
-    take = dataclasses.replace(tracked, status=status, qpos=qpos, markers=markers, rms=rms, filled=filled)
+    status, qpos, rms = tracked.status.copy(), tracked.qpos.copy(), tracked.rms.copy()
+    status[:, 0], qpos[:, 0], rms[:, 0] = LOST, np.nan, np.nan
+    take = dataclasses.replace(tracked, status=status, qpos=qpos, rms=rms)
     side, other = tracked.sides
     assert suspicions(take) == [
         f"the {side} hand was seen in 0.0 % of the frames; name the glove worn (--glove), or track the other "
@@ -49,9 +47,11 @@ def test_a_hand_that_is_not_there(tracked):
 
 
 def test_markers_that_were_not_seen_and_markers_off_the_pose(tracked):
-    filled, rms = tracked.filled.copy(), tracked.rms.copy()
-    filled[:, 0, :10], rms[:, 1] = True, 0.0061
-    told = suspicions(dataclasses.replace(tracked, filled=filled, rms=rms))
+    rms, first = tracked.rms.copy(), (tracked.labels >= 0) & (tracked.labels < 10)
+    rms[:, 1] = 0.0061
+    labels, points = tracked.labels.copy(), tracked.points.copy()
+    labels[first], points[first] = -1, np.nan
+    told = suspicions(dataclasses.replace(tracked, labels=labels, points=points, rms=rms))
     assert [sentence.split(";")[0] for sentence in told] == [
         f"52.6 % of the {tracked.sides[0]} hand's markers were not seen and are filled in from its pose",
         f"the {tracked.sides[1]} hand's markers are 6.1 mm off its pose",

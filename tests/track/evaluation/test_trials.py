@@ -10,7 +10,6 @@ from handsim.errors import ArgumentError
 from track.evaluation.take_evaluation import seen_frame, true_users
 from track.evaluation.trials import (
     FEWEST_FRAMES,
-    cut_take,
     hide_points,
     initialization_times,
     recovery_times,
@@ -43,14 +42,13 @@ class Late:
 
 
 def test_a_cut_take_is_a_part_of_it(take):
-    part = cut_take(take, 10, 40)
+    part = take.cut(10, 40)
     assert part.num_frames == 30
     np.testing.assert_array_equal(part.points, take.points[10:40])
-    np.testing.assert_array_equal(part.hands[1].qpos, take.hands[1].qpos[10:40])
-    assert part.body is not None and take.body is not None
-    np.testing.assert_array_equal(part.body.T_world_body, take.body.T_world_body[10:40])
+    np.testing.assert_array_equal(part.qpos, take.qpos[10:40])
+    np.testing.assert_array_equal(part.body_poses, take.body_poses[10:40])
     with pytest.raises(ArgumentError, match="frames 10 to 999, expected a part of 0 to 320"):
-        cut_take(take, 10, 999)
+        take.cut(10, 999)
 
 
 def test_what_comes_back_from_the_dark_has_other_ids(take):
@@ -95,4 +93,4 @@ def test_our_tracker_is_soon_right(take, rng):
 
 def test_a_short_take_is_told(take, rng):
     with pytest.raises(ArgumentError, match="the take has 50 frames, expected at least 120"):
-        initialization_times(cut_take(take, 0, 50), lambda part: Late(part, 0), 1, rng=rng)
+        initialization_times(take.cut(0, 50), lambda part: Late(part, 0), 1, rng=rng)

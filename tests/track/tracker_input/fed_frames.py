@@ -83,7 +83,7 @@ def joint_errors(
 ) -> np.ndarray:
     """Mean distance (T, H) of a hand's joints from the truth [m] where the tracker is sure, NaN elsewhere."""
     off = np.full((len(tracked), 2), np.nan)
-    for number, hand in enumerate(take.hands):
+    for number, hand in enumerate(take.moving_hands()):
         model = HandModel(hand.shape)
         sure = [n for n, one in enumerate(tracked) if one.hands[number].status in SURE]
         if not sure:

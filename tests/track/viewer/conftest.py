@@ -15,10 +15,9 @@ import zstandard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from gloves.fit import GlovedHand, nominal_fit
+from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from gloves.takes.take import HeldBody, Take
-from gloves.takes.tracked_take import COASTING, LOST, TRACKED, MarkedBody, TrackedTake
+from gloves.takes.take import COASTING, LOST, TRACKED, RigidBody, Take
 from handsim.hand.model import join_qpos
 from handsim.space.objects import named_object
 from handsim.space.transforms import random_quaternions
@@ -180,7 +179,7 @@ def _poses() -> np.ndarray:
 
 
 @pytest.fixture
-def tracked(_poses) -> TrackedTake:
+def tracked(_poses) -> Take:
     """Two hands in wild poses, the left one lost in the last frames; a controller, lost in the first one."""
     layout = load_layout("dense19")
     hands = tuple(nominal_fit(layout, size, side) for size, side in (("L", "right"), ("M", "left")))
@@ -200,24 +199,22 @@ def tracked(_poses) -> TrackedTake:
     bodies[0] = np.nan
     body_status = np.where(np.isnan(bodies[..., 0]), LOST, TRACKED).astype(np.int8)
     controller = named_object("controller")
-    return TrackedTake(
+    return Take(
         rate=120.0,
         times=np.arange(FRAMES) / 120.0,
         hands=hands,
         qpos=qpos,
         status=status,
         rms=np.where(status == LOST, np.nan, 1e-3),
-        markers=markers,
-        filled=filled & (status != LOST)[..., None],
         points=points,
         ids=np.where(labels >= 0, labels, -1).astype(np.int32),
         labels=labels.astype(np.int16),
         confidence=confidence,
-        bodies=(MarkedBody("controller", controller.marker_names, controller.markers),),
+        bodies=(RigidBody("controller", controller.marker_names, controller.markers),),
         body_poses=bodies,
         body_status=body_status,
         body_rms=np.full((FRAMES, 1), np.nan),
-        settings={},
+        settings={"tracker": {}},
     )
 
 
@@ -225,10 +222,17 @@ def tracked(_poses) -> TrackedTake:
 def simulated(tracked) -> Take:
     """The same hands as a simulated take's truth."""
     qpos = np.where(np.isnan(tracked.qpos), tracked.qpos[:1], tracked.qpos)
-    hands = tuple(GlovedHand(hand, qpos[:, number]) for number, hand in enumerate(tracked.hands))
-    body = HeldBody("pen", named_object("pen").marker_names, np.tile(np.eye(4), (FRAMES, 1, 1)))
-    return Take(
-        120.0, tracked.points, tracked.ids, tracked.labels.astype(np.int64), hands, body, {"rig": "six"}
+    pen = named_object("pen")
+    return Take.of_truth(
+        tracked.hands,
+        qpos,
+        tracked.points,
+        tracked.ids,
+        tracked.labels,
+        rate=120.0,
+        bodies=[RigidBody("pen", pen.marker_names, pen.markers)],
+        body_poses=np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (FRAMES, 1, 1)),
+        settings={"rig": "six"},
     )
 
 

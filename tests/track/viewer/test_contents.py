@@ -11,7 +11,7 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.layout import starter_layout
-from gloves.takes.tracked_take import COASTING, LOST
+from gloves.takes.take import COASTING, LOST
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
@@ -21,7 +21,7 @@ from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings.captures import CaptureRecording
 from track.viewer.recordings.datasets import DatasetRecording
 from track.viewer.recordings.recording import runs_of
-from track.viewer.recordings.takes import TruthRecording, doubts_of, frame_confidence
+from track.viewer.recordings.takes import TakeRecording, doubts_of, frame_confidence
 from track.viewer.scene.rig_view import box_edges, camera_counts
 from train.data.shards import Dataset
 
@@ -55,8 +55,8 @@ def files(tmp_path, tracked, simulated, capture, training_set):
     (tmp_path / "f.toml").write_text(f'name = "pair"\nfield_of_view = 60\n{cameras}\n')
     save_user(tmp_path / "g.json", [tracked.hands[0], tracked.hands[0].with_side("left")])
     return {
-        "tracked": tmp_path / "a.npz",
-        "truth": tmp_path / "b.npz",
+        "take": tmp_path / "a.npz",
+        "take truth": tmp_path / "b.npz",
         "capture": tmp_path / "c.trc",
         "capture c3d": tmp_path / "d.c3d",
         "layout": tmp_path / "e.toml",
@@ -70,7 +70,7 @@ def files(tmp_path, tracked, simulated, capture, training_set):
 
 def test_every_kind_opens_and_fills_a_page(files, server, page_of):
     expected = {
-        "tracked": "/hands/1", "truth": "/bodies/pen", "capture": "/points", "capture c3d": "/points",
+        "take": "/hands/1", "take truth": "/bodies/pen", "capture": "/points", "capture c3d": "/points",
         "layout": "/markers", "rig": "/cameras/2", "user": "/before/left/skin", "dataset": "/hands/0",
         "layout shipped": "/hand", "rig shipped": "/coverage",
     }  # fmt: skip
@@ -132,9 +132,9 @@ def test_a_training_set_shows_its_rows_and_who_sees_them(training_set):
 
 
 def test_a_rig_of_a_take_is_shown_only_if_it_is_shipped(simulated):
-    assert TruthRecording(simulated).rig.name == "six"
+    assert TakeRecording(simulated).rig.name == "six"
     for name in ("/etc/passwd", 3, None):
-        assert TruthRecording(dataclasses.replace(simulated, settings={"rig": name})).rig is None
+        assert TakeRecording(dataclasses.replace(simulated, settings={"rig": name})).rig is None
 
 
 def test_doubtful_frames_are_the_worst_of_their_runs(tracked):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from track.viewer.contents import show_recording
-from track.viewer.recordings.takes import TrackedRecording
+from track.viewer.recordings.takes import TakeRecording
 from track.viewer.scene.frame_view import FrameView
 
 
 def test_bones_in_the_page_carry_the_skin_to_where_the_model_has_it(server, page_of, tracked):
-    recording = TrackedRecording(tracked)
+    recording = TakeRecording(tracked)
     view = FrameView(server, recording)
     view.show(recording.frame(0))
     page = page_of(server)
@@ -26,7 +26,7 @@ def test_bones_in_the_page_carry_the_skin_to_where_the_model_has_it(server, page
 
 
 def test_a_frame_sends_poses_and_never_a_mesh_again(server, page_of, tracked):
-    recording = TrackedRecording(tracked)
+    recording = TakeRecording(tracked)
     view = FrameView(server, recording)
     view.show(recording.frame(0))
     page = page_of(server)
@@ -43,7 +43,7 @@ def test_a_frame_sends_poses_and_never_a_mesh_again(server, page_of, tracked):
 
 
 def test_points_have_their_places_colors_and_sizes(server, page_of, tracked):
-    recording = TrackedRecording(tracked)
+    recording = TakeRecording(tracked)
     view = FrameView(server, recording)
     page = page_of(server)
     view.show(recording.frame(20))
@@ -55,7 +55,7 @@ def test_points_have_their_places_colors_and_sizes(server, page_of, tracked):
     there = np.isfinite(tracked.points[20, :, 0])
     count = int(there.sum())
     np.testing.assert_allclose(places[:count], tracked.points[20, there], atol=1e-6)
-    np.testing.assert_allclose(places[count], tracked.markers[20, 0, 4], atol=1e-6)  # filled in
+    np.testing.assert_allclose(places[count], tracked.markers("right")[20, 4], atol=1e-6)  # filled in
     assert (sizes[:count] == 1.0).all() and 0.0 < sizes[count, 0] < 1.0 and (sizes[count + 1 :] == 0.0).all()
     assert np.ptp(colors[count - 1]) == 0, "a ghost is gray"
     assert np.ptp(colors[0]) > 100 and (colors[0] == colors[18]).all(), "one marker of two hands, one color"
@@ -63,7 +63,7 @@ def test_points_have_their_places_colors_and_sizes(server, page_of, tracked):
 
 
 def test_bodies_are_where_they_are_tracked_and_hidden_where_they_are_lost(server, page_of, tracked):
-    recording = TrackedRecording(tracked)
+    recording = TakeRecording(tracked)
     view = FrameView(server, recording)
     page = page_of(server)
     view.show(recording.frame(0))
@@ -76,7 +76,7 @@ def test_bodies_are_where_they_are_tracked_and_hidden_where_they_are_lost(server
 
 
 def test_switches_take_things_away_and_names_follow_their_points(server, page_of, tracked):
-    recording = TrackedRecording(tracked)
+    recording = TakeRecording(tracked)
     view = FrameView(server, recording)
     view.show(recording.frame(5))
     page = page_of(server)
@@ -94,20 +94,20 @@ def test_switches_take_things_away_and_names_follow_their_points(server, page_of
 
 
 def test_the_eye_is_led_to_the_hands(server, page_of, tracked):
-    recording = TrackedRecording(tracked)
+    recording = TakeRecording(tracked)
     view = FrameView(server, recording)
     view.show(recording.frame(29))
     page = page_of(server)
     page.press("Look at the hands")
     page.wait(lambda: page.counts["SetCameraLookAtMessage"] > 0)
     page.settle()
-    right = np.concatenate([tracked.qpos[29, :1, :3], tracked.markers[29, 0]])
+    right = np.concatenate([tracked.qpos[29, :1, :3], tracked.markers("right")[29]])
     np.testing.assert_allclose(page.camera["look_at"], right.mean(axis=0), atol=0.02)
     np.testing.assert_allclose(page.camera["position"] - page.camera["look_at"], [1, 1, 1], atol=1e-6)
 
 
 def test_a_slider_in_the_page_leads_to_a_frame(server, page_of, tracked):
-    run = show_recording(server, TrackedRecording(tracked))
+    run = show_recording(server, TakeRecording(tracked))
     page = page_of(server)
     page.press("frame", 21)
     run(lambda: page.says("**frame 21** of 30"))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from gloves.takes.corrections import corrections_of, corrections_path
-from gloves.takes.tracked_take import load_tracked_take
+from gloves.takes.take import load_take
 from handsim.errors import CaptureError, HandSimWarning
 from track.viewer.contents import open_content, show_recording
 from track.viewer.recordings.corrector import Corrector
-from track.viewer.recordings.takes import TrackedRecording
+from track.viewer.recordings.takes import TakeRecording
 
 TIP = "right:ThumbTip"
 
@@ -74,10 +74,10 @@ def test_a_click_two_labels_and_a_save(open_page, path, tracked):
     page.wait(lambda: page.says(f"corrected: {names[3]}"))
     page.press("Save take")
     page.wait(lambda: page.says("saved "))
-    saved = load_tracked_take(path)
+    saved = load_take(path)
     np.testing.assert_array_equal(saved.labels, tracked.labels)
     assert (saved.confidence[8:15, 2:4] == 1.0).all()
-    np.testing.assert_allclose(saved.markers[8:15, 0, 2:4], tracked.points[8:15, 2:4])
+    np.testing.assert_allclose(saved.markers("right")[8:15, 2:4], tracked.points[8:15, 2:4])
     assert [one.label for one in corrections_of(path)] == [names[2], names[3]]
     again = Corrector(path, saved)
     assert not again.unsaved and again.take is saved, "what the take has is not made again"
@@ -101,22 +101,22 @@ def test_what_was_not_saved_is_taken_back(open_page, path, tracked):
 
 
 def test_what_is_not_saved_at_the_end_is_told(server, path):
-    corrector = Corrector(path, load_tracked_take(path))
-    run = show_recording(server, TrackedRecording(corrector.take), corrector)
+    corrector = Corrector(path, load_take(path))
+    run = show_recording(server, TakeRecording(corrector.take), corrector)
     corrector.add(10, 2, (8, 14), TIP)
     with pytest.warns(HandSimWarning, match=rf"tracked\.npz: not saved: {TIP} in frames 8 to 14"):
         run(lambda: True)
 
 
 def test_a_marker_that_was_not_seen_has_no_point_to_correct(open_page, tracked):
-    click(open_page, tracked.markers[0, 0, 4])
+    click(open_page, tracked.markers("right")[0, 4])
     open_page.wait(lambda: open_page.says("That marker was not seen"))
     open_page.press("Correct")
     open_page.wait(lambda: open_page.says("Choose a point first"))
 
 
 def test_the_span_is_cut_to_where_the_point_is(path):
-    corrector = Corrector(path, load_tracked_take(path))
+    corrector = Corrector(path, load_take(path))
     assert corrector.span_of(0, 20) == (0, 24), "the left hand is lost from frame 25 on"
     correction = corrector.add(3, 20, (0, 29), "none")
     assert (correction.first, correction.last) == (0, 24)
@@ -125,7 +125,7 @@ def test_the_span_is_cut_to_where_the_point_is(path):
 
 
 def test_one_label_for_two_points_is_refused_until_one_of_them_gives_it_back(path):
-    corrector = Corrector(path, load_tracked_take(path))
+    corrector = Corrector(path, load_take(path))
     corrector.add(10, 2, (8, 14), TIP)
     with pytest.raises(CaptureError, match="two points of frame 9 are corrected to right:ThumbTip"):
         corrector.add(10, 3, (9, 9), TIP)
@@ -136,7 +136,7 @@ def test_one_label_for_two_points_is_refused_until_one_of_them_gives_it_back(pat
 
 
 def test_files_that_changed_meanwhile_are_not_overwritten(path, tracked):
-    corrector = Corrector(path, load_tracked_take(path))
+    corrector = Corrector(path, load_take(path))
     corrector.add(10, 2, (8, 14), "none")
     tracked.save(path)
     with pytest.raises(CaptureError, match="have changed since they were opened"):
@@ -152,7 +152,7 @@ def test_a_file_that_the_take_does_not_know_is_applied_and_told(path, tracked, r
     )
     open_content(str(path))
     assert "none in frames 8 to 14 no longer fits" in str(recwarn.pop().message)
-    corrector = Corrector(path, load_tracked_take(path))
+    corrector = Corrector(path, load_take(path))
     index = tracked.label_names.index(TIP)
     assert corrector.unsaved and (corrector.take.labels[8:15, 2] == index).all()
     corrections_path(path).write_text(
@@ -163,5 +163,5 @@ def test_a_file_that_the_take_does_not_know_is_applied_and_told(path, tracked, r
 
 
 def test_only_a_take_with_a_file_can_be_corrected(server, page_of, tracked):
-    show_recording(server, TrackedRecording(tracked))
+    show_recording(server, TakeRecording(tracked))
     assert not any(props.get("label") == "Correct labels" for props in page_of(server).panel.values())

@@ -34,23 +34,19 @@ def test_batches_give_the_labels_of_clouds_alone(clouds):
 
 
 def test_a_copy_on_another_device_gives_the_same(clouds, monkeypatch):
-    expected = load_labeler("dense19").label_frames(clouds)
+    expected = drawn_cnn().label_frames(clouds[:8])
     other = torch.device("cpu", 0)  # which is another name than that of the network's device
     monkeypatch.setattr(batch_network, "batch_device", lambda: other)
-    labeler = load_labeler("dense19")
-    assert same_labels(labeler.label_frames(clouds), expected)
-    assert labeler._batches._placed[0] is not labeler.network
+    assert same_labels(drawn_cnn().label_frames(clouds[:8]), expected)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-@pytest.mark.parametrize("kind", ["set", "cnn"])
-def test_a_gpu_gives_the_labels_of_the_cpu(clouds, monkeypatch, kind):
-    def labeled():
-        if kind == "set":
-            return load_labeler("dense19").label_frames(clouds)
-        torch.manual_seed(0)
-        return labeler_of(new_network(CNNConfig()), NAMES).label_frames(clouds)
-
-    on_gpu = labeled()
+def test_a_gpu_gives_the_labels_of_the_cpu(clouds, monkeypatch):
+    on_gpu = drawn_cnn().label_frames(clouds)
     monkeypatch.setattr(batch_network, "batch_device", lambda: torch.device("cpu"))
-    assert same_labels(on_gpu, labeled())
+    assert same_labels(on_gpu, drawn_cnn().label_frames(clouds))
+
+
+def drawn_cnn():
+    torch.manual_seed(0)
+    return labeler_of(new_network(CNNConfig()), NAMES)

@@ -7,8 +7,9 @@ import itertools
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
 
-from train.matching.assignment import GHOST, match_probabilities, pair_probabilities
+from train.matching.assignment import GHOST, assign, match_probabilities, pair_probabilities
 from train.matching.verification import match_scores
 
 
@@ -87,3 +88,18 @@ def test_scores_that_rule_something_out_altogether():
     labels, confidence = match_scores(np.zeros((len(by_point), 3)), by_point, by_label, None)
     assert labels.tolist() == [0, GHOST]
     np.testing.assert_allclose(confidence, 1.0)
+
+
+@given(seed=st.integers(0, 10_000), count=st.integers(0, 30), num_labels=st.integers(1, 25))
+@settings(max_examples=100, deadline=None)
+def test_an_assignment_is_that_of_scipy(seed, count, num_labels):
+    """A column of its own stands for each point's reject there."""
+    rng = np.random.default_rng(seed)
+    costs, reject = rng.normal(0.0, 3.0, (count, num_labels)), rng.normal(2.0, 3.0, count)
+    table = np.full((count, num_labels + count), 1e6)
+    table[:, :num_labels] = costs
+    table[np.arange(count), num_labels + np.arange(count)] = reject
+    rows, columns = linear_sum_assignment(table)
+    total, labels = assign(costs, reject)
+    assert np.isclose(total, table[rows, columns].sum())
+    assert labels.tolist() == np.where(columns < num_labels, columns, GHOST).tolist()

@@ -36,12 +36,12 @@ def test_a_take_keeps_its_place_and_its_stretches():
     take = simulate_take(TakeConfig("hand-pen", num_frames=60, glove="tips8"))
     (scene,) = work_of_take(take, None, 40)["the take"]
     assert scene.num_frames == 40 and scene.moving_object is not None
-    assert scene.hands[0].qpos == pytest.approx(take.hands[0].qpos[:40])
+    assert scene.hands[0].qpos == pytest.approx(take.qpos[:40, 0])
     assert scene.hands[0].fit.layout.num_markers == 8
-    take.hands[0].qpos[20:30] = np.nan
+    take.qpos[20:30, 0] = np.nan
     parts = work_of_take(take, load_layout("dense19"), 1000)["the take"]
     assert [one.num_frames for one in parts] == [20, 30]
     assert parts[0].hands[1].fit.layout.num_markers == 19
-    take.hands[1].qpos[:] = np.nan
+    take.qpos[:, 1] = np.nan
     with pytest.raises(CaptureError, match="no 12 frames in a row"):
         work_of_take(take, None, 1000)

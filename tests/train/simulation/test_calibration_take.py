@@ -29,10 +29,10 @@ def test_a_take_of_both_hands_has_its_truth(rng):
     hands = [HandModel.named("M", side=side) for side in ("right", "left")]
     fits = tuple(attach(load_layout("dense19"), hand) for hand in hands)
     take = simulate_calibration(fits, CalibrationTakeConfig(free=0.5, rounds=0), rng=rng)
-    assert [hand.fit.side for hand in take.hands] == ["right", "left"]
+    assert [hand.side for hand in take.hands] == ["right", "left"]
     assert take.settings["kind"] == "calibration"
     assert take.markers_present().mean() > 0.9
-    for label, hand, fit in zip(take.hand_labels, take.hands, fits, strict=True):
+    for label, hand, fit in zip(take.hand_labels, take.moving_hands(), fits, strict=True):
         off = take.observed(label) - fit.markers(hand.qpos)[0]
         assert np.nanmedian(np.linalg.norm(off, axis=-1)) < 0.0005
     middles = [np.nanmedian(take.observed(label), axis=(0, 1)) for label in take.hand_labels]

@@ -25,7 +25,7 @@ def real_like() -> Take:
 
 def test_markers_are_off_by_noise_and_flesh():
     take = real_like()
-    for hand, label in zip(take.hands, take.hand_labels, strict=True):
+    for hand, label in zip(take.moving_hands(), take.hand_labels, strict=True):
         bones = hand.fit.model.forward_kinematics(hand.qpos)
         off = take.observed(label) - hand.fit.attachment.centers(hand.fit.model, bones)
         assert np.sqrt(np.nanmean(off**2)) == pytest.approx(np.hypot(NOISE, FLESH), rel=0.15)
@@ -33,7 +33,7 @@ def test_markers_are_off_by_noise_and_flesh():
 
 
 def test_a_part_of_the_displacement_repeats_with_the_pose_in_the_frame_of_the_wrist():
-    hand = real_like().hands[0]
+    hand = real_like().moving_hands()[0]
     still = hand.qpos[np.tile(np.arange(4) * 60, 500)]  # four poses, again and again
     repeated = type(hand)(hand.fit, still)
     moved = move_skin(repeated, rng=np.random.default_rng(1))

@@ -148,7 +148,7 @@ def test_two_markers_make_no_body_but_three_do(rng):
         np.testing.assert_array_equal(labels[38 : 38 + count], expected)
         take = pack_take(scene, sources, RIG, CLEAN, {}, rng=rng)
         assert (take.labels >= 38).any() == (count == 3)
-        assert take.body is not None and take.body.marker_names == thing.marker_names
+        assert take.bodies[0].marker_names == thing.marker_names
 
 
 def test_only_shiny_things_mirror(rng):

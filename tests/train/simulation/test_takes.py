@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.objects import named_object
-from handsim.space.transforms import quaternion_matrix
+from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.object_motion import object_penetration
 from poses.shapes.couplings import HIGH, LOW
@@ -51,12 +51,12 @@ def test_shapes_and_settings(kind):
     columns = take.points.shape[1]
     assert take.points.shape == (FRAMES, columns, 3)
     assert take.ids.shape == take.labels.shape == (FRAMES, columns)
-    assert [hand.qpos.shape for hand in take.hands] == [(FRAMES, 27)] * 2
+    assert take.qpos.shape == (FRAMES, 2, 27)
     assert [hand.shape.side for hand in take.hands] == ["right", "left"]
     assert take.rate == RATE
     assert take.settings["kind"] == kind and take.settings["num_frames"] == FRAMES
     thing = {"hand-pen": "pen", "hand-controller": "controller"}.get(kind)
-    assert (take.body.name if take.body else None) == thing
+    assert [body.name for body in take.bodies] == ([thing] if thing else [])
     there = np.isfinite(take.points[..., 0])
     assert (take.labels[~there] == -1).all() and (take.ids[~there] == -1).all()
     for label in take.hand_labels:
@@ -67,21 +67,21 @@ def test_shapes_and_settings(kind):
 def test_every_frame_is_valid(kind):
     take = short(kind) if kind in KINDS else whole()
     right, left = models(take)
-    for model, hand in zip((right, left), take.hands, strict=True):
+    for model, hand in zip((right, left), take.moving_hands(), strict=True):
         angles = hand.qpos[:, 7:]
         assert (angles >= LOW - 1e-9).all() and (angles <= HIGH + 1e-9).all()
         assert model.penetration(hand.qpos).max() <= SELF_DEEPEST + 1e-9
         assert np.abs(hand.qpos[:, :3] - ROOM_CENTER).max() <= WRIST_VOLUME, "where no camera may stand"
-    assert two_hands_penetration(right, left, *(hand.qpos for hand in take.hands)).max() <= DEEPEST
-    if take.body is not None:
-        thing = named_object(take.body.name)
-        for model, hand in zip((right, left), take.hands, strict=True):
-            assert object_penetration(model, thing, hand.qpos, take.body.T_world_body).max() <= DEEPEST
+    assert two_hands_penetration(right, left, *(hand.qpos for hand in take.moving_hands())).max() <= DEEPEST
+    for number, body in enumerate(take.bodies):
+        thing, poses = named_object(body.name), pose_matrices(take.body_poses[:, number])
+        for model, hand in zip((right, left), take.moving_hands(), strict=True):
+            assert object_penetration(model, thing, hand.qpos, poses).max() <= DEEPEST
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_hands_move_as_hands_do(kind):
-    for hand in short(kind).hands:
+    for hand in short(kind).moving_hands():
         wrist = np.linalg.norm(np.diff(hand.qpos[:, :3], axis=0), axis=1) * RATE
         assert wrist.max() < 3.0, "m/s"
         turns = quaternion_matrix(hand.qpos[:, 3:7])
@@ -92,7 +92,9 @@ def test_hands_move_as_hands_do(kind):
 
 def test_the_pen_points_at_markers_of_the_other_hand():
     take = short("hand-pen")
-    tip = np.einsum("tij,j->ti", take.body.T_world_body, np.append(named_object("pen").markers[0], 1.0))
+    tip = np.einsum(
+        "tij,j->ti", pose_matrices(take.body_poses[:, 0]), np.append(named_object("pen").markers[0], 1.0)
+    )
     away = np.linalg.norm(take.observed(take.hand_labels[1]) - tip[:, None, :3], axis=2)
     nearest = np.nanmin(away, axis=1)
     assert (nearest < 0.025).mean() > 0.4
@@ -202,12 +204,12 @@ def test_the_whole_hand_controller_twin_is_near_table_3():
 def test_one_hand_alone(kind, side):
     take = simulate_take(TakeConfig(kind=kind, num_frames=FRAMES, hands=(side,)))
     assert [hand.shape.side for hand in take.hands] == [side] and take.settings["hands"] == (side,)
-    assert take.num_frames == len(take.hands[0].qpos) == FRAMES
+    assert take.num_frames == len(take.qpos) == FRAMES
     assert set(np.unique(take.labels)) <= {-1, *range(19)}
     assert np.isfinite(take.observed(take.hand_labels[0])).all(axis=-1).mean() > 0.8
     model = HandModel(take.hands[0].shape)
-    assert model.penetration(take.hands[0].qpos).max() <= SELF_DEEPEST + 1e-6
-    assert np.ptp(take.hands[0].qpos[:, 7:], axis=0).max() > 0.1, "it moves"
+    assert model.penetration(take.qpos[:, 0]).max() <= SELF_DEEPEST + 1e-6
+    assert np.ptp(take.qpos[:, 0][:, 7:], axis=0).max() > 0.1, "it moves"
 
 
 def test_calibration_has_touches_and_free_motion_of_both_hands():
@@ -216,7 +218,7 @@ def test_calibration_has_touches_and_free_motion_of_both_hands():
     assert take.num_frames > 45 * RATE, "40 s of free motion after the touches"
     free = simulate_take(TakeConfig(kind="free", num_frames=FRAMES))
     assert len(free.hands) == 2 and free.num_frames == FRAMES
-    apart = np.linalg.norm(free.hands[0].qpos[:, :3] - free.hands[1].qpos[:, :3], axis=1)
+    apart = np.linalg.norm(free.qpos[:, 0, :3] - free.qpos[:, 1, :3], axis=1)
     assert apart.min() > 0.2
 
 

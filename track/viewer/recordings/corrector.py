@@ -18,7 +18,7 @@ from gloves.takes.corrections import (
     follow_point,
     save_corrections,
 )
-from gloves.takes.tracked_take import TrackedTake
+from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from track.corrected_take import correct_take
 
@@ -34,7 +34,7 @@ class Corrector:
         CaptureError: The corrections cannot be read, or cannot be meant for this take.
     """
 
-    def __init__(self, path: Path, take: TrackedTake) -> None:
+    def __init__(self, path: Path, take: Take) -> None:
         self.path, self._base, self._lock = path, take, threading.Lock()
         self.saved: tuple[Correction, ...] = corrections_of(path)
         """What the file of corrections holds."""
@@ -148,7 +148,7 @@ class Corrector:
         self.take = corrected.take if every else self._base
 
 
-def label_of(take: TrackedTake, frame: int, column: int) -> str:
+def label_of(take: Take, frame: int, column: int) -> str:
     """Name of a point's marker, or `NO_MARKER`."""
     label = int(take.labels[frame, column])
     return take.label_names[label] if label >= 0 else NO_MARKER

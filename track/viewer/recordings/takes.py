@@ -1,4 +1,4 @@
-"""Takes as the viewer shows them: a tracked one with its status, a simulated one with its truth."""
+"""Takes as the viewer shows them, simulated or tracked: labels, poses and their status."""
 
 from __future__ import annotations
 
@@ -8,67 +8,62 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from gloves.takes.take import Take
-from gloves.takes.tracked_take import COASTING, LOST, STATUSES, TrackedTake
+from gloves.takes.take import COASTING, LOST, STATUSES, RigidBody, Take
 from handsim.space.cameras import CameraRig, list_rigs, named_rig
-from handsim.space.objects import named_object, object_names
-from handsim.space.transforms import rotation_quaternions
 from track.viewer.recordings.recording import Curve, Doubt, Recording, ShownBody, ShownFrame, runs_of
 
 _CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
 _MOST_DOUBTS: Final = 12  # rows
 
 
-class TrackedRecording(Recording):
-    """A tracked take: labels, poses and status as the tracker made them.
+class TakeRecording(Recording):
+    """A take: labels, poses and status as they were simulated or tracked.
 
     Args:
         take: The take.
-        rig: The cameras, where they are known.
+        rig: The cameras; those that the take names, if they come with handsim, when None.
     """
 
-    def __init__(self, take: TrackedTake, rig: CameraRig | None = None) -> None:
-        self._take = take
+    def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
         self._models = tuple(hand.model for hand in take.hands)
-        self._offsets = np.cumsum([0, *(hand.layout.num_markers for hand in take.hands)])
         points = np.isfinite(take.points[..., 0]).sum(axis=1)
         super().__init__(
             take.times,
             take.label_names,
-            most_points=int(points.max()) + int(self._offsets[-1]),
+            most_points=int(points.max()) + take.hand_labels[-1].stop,
             radius=take.hands[0].layout.radius,
-            bodies=tuple(shown_body(body.name) for body in take.bodies),
-            rig=rig,
-            curves=_curves(take),
-            doubts=doubts_of(take),
+            bodies=tuple(shown_body(body) for body in take.bodies),
+            rig=shipped_rig(take.settings.get("rig")) if rig is None else rig,
         )
+        self.replace(take)
 
-    def replace(self, take: TrackedTake) -> None:
+    def replace(self, take: Take) -> None:
         """Show the same frames with other labels and poses."""
         self._take, self.curves, self.doubts = take, _curves(take), doubts_of(take)
+        self._filled = np.concatenate([take.filled(side) for side in take.sides], axis=1)
+        self._markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
 
     def frame(self, index: int) -> ShownFrame:
         """One of the frames."""
         take = self._take
         there = np.isfinite(take.points[index, :, 0])
-        filled = take.filled[index] & np.isfinite(take.markers[index, ..., 0])
-        hand, marker = np.nonzero(filled)
+        filled = np.flatnonzero(self._filled[index])
         return ShownFrame(
             time=float(take.times[index]),
             words=tuple(self._words(index)),
             hands=self._models,
             qpos=take.qpos[index],
-            points=np.concatenate([take.points[index, there], take.markers[index][filled]]),
-            labels=np.concatenate([take.labels[index, there].astype(np.int64), self._offsets[hand] + marker]),
-            seen=np.repeat([True, False], [int(there.sum()), len(hand)]),
+            points=np.concatenate([take.points[index, there], self._markers[index, filled]]),
+            labels=np.concatenate([take.labels[index, there].astype(np.int64), filled]),
+            seen=np.repeat([True, False], [int(there.sum()), len(filled)]),
             bodies=take.body_poses[index],
         )
 
     def _words(self, index: int) -> list[str]:
         take = self._take
         rows: list[tuple[str, int, float, int]] = [
-            (side, take.status[index, hand], take.rms[index, hand], int(take.filled[index, hand].sum()))
-            for hand, side in enumerate(take.sides)
+            (side, take.status[index, hand], take.rms[index, hand], int(self._filled[index, labels].sum()))
+            for hand, (side, labels) in enumerate(zip(take.sides, take.hand_labels, strict=True))
         ]
         rows += [
             (body.name, take.body_status[index, number], take.body_rms[index, number], 0)
@@ -84,7 +79,7 @@ class TrackedRecording(Recording):
         return [*lines, f"{there.sum()} points, {(take.labels[index, there] < 0).sum()} without label"]
 
 
-def doubts_of(take: TrackedTake) -> tuple[Doubt, ...]:
+def doubts_of(take: Take) -> tuple[Doubt, ...]:
     """Spans in which a hand is lost or coasts, the longest first, then unsure labels, the worst first.
 
     A hand that has not been seen yet is not lost.
@@ -107,13 +102,15 @@ def doubts_of(take: TrackedTake) -> tuple[Doubt, ...]:
     return tuple(doubt for *_, doubt in found[:_MOST_DOUBTS])
 
 
-def _curves(take: TrackedTake) -> tuple[Curve, ...]:
-    """RMS of each hand, and doubt."""
+def _curves(take: Take) -> tuple[Curve, ...]:
+    """RMS of each hand, and doubt; nothing where no pose was fitted, as of a truth."""
+    if not np.isfinite(take.rms).any():
+        return ()
     curves = [Curve(f"{side} RMS [mm]", 1e3 * take.rms[:, hand]) for hand, side in enumerate(take.sides)]
     return (*curves, Curve("doubt, 0 to 1", 1.0 - frame_confidence(take)))
 
 
-def frame_confidence(take: TrackedTake) -> Float[np.ndarray, "T"]:
+def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
     """The least confidence of a frame's labels; 0 where a hand is coasting or has just been lost.
 
     NaN in frames without labels.
@@ -127,64 +124,12 @@ def frame_confidence(take: TrackedTake) -> Float[np.ndarray, "T"]:
     return least
 
 
-class TruthRecording(Recording):
-    """The truth of a simulated take.
-
-    Args:
-        take: The take.
-        rig: The cameras; those that the take names, if they come with handsim, when None.
-    """
-
-    def __init__(self, take: Take, rig: CameraRig | None = None) -> None:
-        self._take = take
-        self._models = tuple(hand.fit.model for hand in take.hands)
-        self._bodies = np.empty((take.num_frames, 0, 7))
-        names = [f"{hand.side}:{name}" for hand in take.hands for name in hand.layout.names]
-        bodies: tuple[ShownBody, ...] = ()
-        if take.body is not None:
-            names += [f"{take.body.name}:{name}" for name in take.body.marker_names]
-            bodies = (shown_body(take.body.name),)
-            self._bodies = poses_of(take.body.T_world_body)[:, None]
-        super().__init__(
-            np.arange(take.num_frames) / take.rate,
-            tuple(names),
-            most_points=int(np.isfinite(take.points[..., 0]).sum(axis=1).max(initial=0)),
-            radius=take.hands[0].layout.radius if take.hands else 0.0035,
-            bodies=bodies,
-            rig=shipped_rig(take.settings.get("rig")) if rig is None else rig,
-            has_filled=False,
-        )
-
-    def frame(self, index: int) -> ShownFrame:
-        """One of the frames."""
-        take = self._take
-        there = np.isfinite(take.points[index, :, 0])
-        labels = take.labels[index, there].astype(np.int64)
-        return ShownFrame(
-            time=float(self.times[index]),
-            words=("**truth** of a simulated take", f"{len(labels)} points, {(labels < 0).sum()} ghosts"),
-            hands=self._models,
-            qpos=np.array([hand.qpos[index] for hand in take.hands]).reshape(-1, 27),
-            points=take.points[index, there],
-            labels=labels,
-            seen=np.ones(len(labels), dtype=np.bool_),
-            bodies=self._bodies[index],
-        )
-
-
-def shown_body(name: str) -> ShownBody:
-    """A body with its shape, if it is one of handsim's own objects."""
-    if name not in object_names():
-        return ShownBody(name)
-    obj = named_object(name)
-    return ShownBody(name, obj.vertices, obj.faces)
+def shown_body(body: RigidBody) -> ShownBody:
+    """A body with its surface, where that is known."""
+    thing = body.shape
+    return ShownBody(body.name) if thing is None else ShownBody(body.name, thing.vertices, thing.faces)
 
 
 def shipped_rig(name: object) -> CameraRig | None:
     """A rig that comes with handsim; None for any other: a file's settings are no path to follow."""
     return named_rig(name) if isinstance(name, str) and name in list_rigs() else None
-
-
-def poses_of(transforms: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float64]:
-    """Positions and quaternions (T, 7)."""
-    return np.concatenate([transforms[:, :3, 3], rotation_quaternions(transforms[:, :3, :3])], axis=1)

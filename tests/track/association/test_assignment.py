@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from track.association.assignment import best_combination
 from track.association.digit_hypotheses import IMPOSSIBLE
-from track.association.joint_assignment import best_combination
 
 
 @st.composite

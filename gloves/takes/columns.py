@@ -1,0 +1,153 @@
+"""The one table of a take's arrays: names, types and shapes of what is kept, checked, recorded and saved.
+
+A shape is letters and numbers: T frames, H hands, N points, B bodies, M markers of all hands, Q those of all
+bodies. An array that begins with T grows by a row a frame while a take is recorded.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from handsim.hand.keypoints import NUM_KEYPOINTS
+from handsim.hand.records import HAND_DTYPE
+from handsim.hand.topology import NUM_QPOS
+
+
+class Column(NamedTuple):
+    """An array of a take."""
+
+    name: str
+    dtype: str
+    shape: tuple[str | int, ...]
+    """Letters and numbers."""
+    missing: float | None = None
+    """Of an array with an entry per point: what stands where a column of points has none."""
+
+    @property
+    def of_points(self) -> bool:
+        """Whether there is an entry per point of a frame, not per frame."""
+        return self.missing is not None
+
+    @property
+    def entry(self) -> tuple[int, ...]:
+        """Shape of one entry of a frame, or of a point; all its letters must have been given numbers."""
+        return tuple(int(size) for size in self.shape[2 if self.of_points else 1 :])
+
+    @property
+    def size(self) -> int:
+        """Bytes of an entry."""
+        return np.dtype(self.dtype).itemsize * math.prod(self.entry)
+
+    def sized(self, sizes: Mapping[str, int]) -> Column:
+        """The same with numbers in the place of letters."""
+        return self._replace(shape=tuple(sizes.get(str(size), size) for size in self.shape))
+
+
+FRAMES: Final = (
+    Column("times", "<f8", ("T",)),
+    Column("qpos", "<f8", ("T", "H", NUM_QPOS)),
+    Column("status", "|i1", ("T", "H")),
+    Column("rms", "<f8", ("T", "H")),
+    Column("points", "<f8", ("T", "N", 3), np.nan),
+    Column("ids", "<i4", ("T", "N"), -1),
+    Column("labels", "<i2", ("T", "N"), -1),
+    Column("confidence", "<f8", ("T", "N"), np.nan),
+    Column("body_poses", "<f8", ("T", "B", 7)),
+    Column("body_status", "|i1", ("T", "B")),
+    Column("body_rms", "<f8", ("T", "B")),
+)
+"""The fields of a take with a row a frame."""
+NUMBERS: Final = Column("numbers", "<i8", ("T",))
+"""The numbers of streamed frames; a take of anything else has none."""
+KEYPOINTS: Final = Column("keypoints", "<f8", ("T", "H", NUM_KEYPOINTS, 3))
+"""Joint positions, for programs without a model of the hand: written, and not read, as poses give them."""
+ATTACHMENT: Final = (
+    Column("attachment_points", "<f8", ("M", 3)),
+    Column("attachment_normals", "<f8", ("M", 3)),
+    Column("attachment_bone_indices", "<i8", ("M", 4)),
+    Column("attachment_bone_weights", "<f8", ("M", 4)),
+)
+"""The gloves on the hands, one after another."""
+BODY_MARKERS: Final = Column("body_markers", "<f8", ("Q", 3))
+_HANDS: Final = "hands"
+WORN: Final = (*ATTACHMENT, BODY_MARKERS)
+"""What does not change from frame to frame, beside the `hands`, which are records."""
+STORED: Final = (*FRAMES, KEYPOINTS, *WORN)
+"""All that every file holds, beside the hands."""
+
+
+def fitted(column: Column, values: ArrayLike, sizes: Mapping[str, int]) -> NDArray[Any]:
+    """Values as an array of a column's type.
+
+    Args:
+        column: The column.
+        values: What is to be kept in it.
+        sizes: The number that each letter stands for.
+
+    Raises:
+        ValueError: They have another shape, or numbers of this type cannot hold them.
+    """
+    array, dtype = np.asarray(values), np.dtype(column.dtype)
+    expected = column.sized(sizes).shape
+    if array.shape != expected:
+        shape = ", ".join(map(str, expected))
+        raise ValueError(f"{column.name} has shape {array.shape}, expected ({shape})")
+    if array.dtype == dtype:
+        return array
+    whole = dtype.kind == "i"
+    if array.dtype.kind not in ("iu" if whole else "iuf"):
+        kind = "whole numbers" if whole else "numbers"
+        raise ValueError(f"{column.name} holds values of type {array.dtype}, expected {kind}")
+    if whole and array.size:
+        limits = np.iinfo(dtype)
+        if array.min() < limits.min or array.max() > limits.max:
+            raise ValueError(f"{column.name} holds numbers beyond {limits.min} to {limits.max}")
+    return array.astype(dtype)
+
+
+def check_stored(arrays: Mapping[str, NDArray[Any]], sizes: Mapping[str, int]) -> None:
+    """Raise a `ValueError` unless a file's arrays have the types and shapes of the table."""
+    columns = [*STORED, *([NUMBERS] if NUMBERS.name in arrays else [])]
+    if arrays[_HANDS].dtype != HAND_DTYPE or arrays[_HANDS].shape != (sizes["H"],):
+        raise ValueError("the hands are of another type")
+    for column in columns:
+        array = arrays[column.name]
+        if array.dtype != column.dtype or array.shape != column.sized(sizes).shape:
+            raise ValueError(f"{column.name} is of type {array.dtype} and shape {array.shape}")
+
+
+def stacked_frames(
+    frames: Sequence[Mapping[str, NDArray[Any]]], present: NDArray[np.bool_]
+) -> dict[str, NDArray[Any]]:
+    """Rows of single frames as arrays over all of them.
+
+    Args:
+        frames: By name the entries of each frame: those of points for the points it has.
+        present: Which columns of points have one in each frame, (T, N).
+
+    Returns:
+        The arrays of `FRAMES`, and the numbers of the frames.
+    """
+    stacked: dict[str, NDArray[Any]] = {}
+    for column in (*FRAMES, NUMBERS):
+        rows = [np.asarray(frame[column.name], column.dtype) for frame in frames]
+        if not column.of_points:
+            stacked[column.name] = np.array(rows)
+            continue
+        values = np.concatenate(rows)
+        table = np.full(present.shape + values.shape[1:], column.missing, dtype=column.dtype)
+        table[present] = values
+        stacked[column.name] = table
+    return stacked
+
+
+def spans(counts: Sequence[int]) -> tuple[range, ...]:
+    """The numbers of each of several groups, counted through all of them."""
+    bounds = np.cumsum([0, *counts]).tolist()
+    return tuple(range(low, high) for low, high in itertools.pairwise(bounds))

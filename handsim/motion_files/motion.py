@@ -1,0 +1,138 @@
+"""What the writers of motion files take: hands and rigid bodies over time, as a take has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+from handsim.hand.model import HandModel
+from handsim.hand.topology import Side
+from handsim.space.objects import RigidObject
+from handsim.space.transforms import pose_matrices
+
+UpAxis = Literal["y", "z"]
+
+
+class HasModel(Protocol):
+    """Anything with a hand: a `gloves.GloveFit`."""
+
+    @property
+    def model(self) -> HandModel:
+        """The hand."""
+        ...
+
+
+class NamedBody(Protocol):
+    """A rigid body."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def shape(self) -> RigidObject | None:
+        """Its surface; None where only its poses are known."""
+        ...
+
+
+class Motion(Protocol):
+    """Hands and rigid bodies, frame by frame: a `gloves.Take`. Each has a pose in one frame at least."""
+
+    @property
+    def rate(self) -> float:
+        """Frames per second [Hz]; of a stream, the usual one."""
+        ...
+
+    @property
+    def times(self) -> Float[np.ndarray, "T"]:
+        """Time of each frame [s], increasing."""
+        ...
+
+    @property
+    def hands(self) -> Sequence[HasModel]:
+        """The hands, at most one per side."""
+        ...
+
+    @property
+    def qpos(self) -> Float[np.ndarray, "T H 27"]:
+        """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where there is no pose."""
+        ...
+
+    @property
+    def bodies(self) -> Sequence[NamedBody]:
+        """The rigid bodies."""
+        ...
+
+    @property
+    def body_poses(self) -> Float[np.ndarray, "T B 7"]:
+        """Position [m] and orientation (wxyz); NaN where there is no pose."""
+        ...
+
+
+class PosedHand(NamedTuple):
+    """A hand of a motion."""
+
+    model: HandModel
+    side: Side
+    present: Bool[np.ndarray, "T"]
+    """The frames with a pose."""
+    qpos: Float[np.ndarray, "T 27"]
+    """The poses [m, rad]; without one the last pose, and before the first one that."""
+
+
+class PosedBody(NamedTuple):
+    """A rigid body of a motion."""
+
+    name: str
+    shape: RigidObject | None
+    present: Bool[np.ndarray, "T"]
+    """The frames with a pose."""
+    T_world_body: Float[np.ndarray, "T 4 4"]
+    """The poses [m]; without one the last pose, and before the first one that."""
+
+
+def posed_hands(motion: Motion) -> Iterator[PosedHand]:
+    """Each hand, with its last pose where it has none."""
+    for number, hand in enumerate(motion.hands):
+        qpos = motion.qpos[:, number]
+        present: NDArray[np.bool_] = np.isfinite(qpos[:, 0])
+        yield PosedHand(hand.model, hand.model.shape.side, present, _held(qpos, present))
+
+
+def posed_bodies(motion: Motion) -> Iterator[PosedBody]:
+    """Each rigid body, with its last pose where it has none."""
+    for number, body in enumerate(motion.bodies):
+        poses = motion.body_poses[:, number]
+        present: NDArray[np.bool_] = np.isfinite(poses[:, 0])
+        yield PosedBody(body.name, body.shape, present, pose_matrices(_held(poses, present)))
+
+
+def seconds_of(motion: Motion) -> Float[np.ndarray, "T"]:
+    """Time since the first frame [s]."""
+    seconds: NDArray[np.float64] = motion.times - motion.times[0]
+    return seconds
+
+
+def file_axes(up: UpAxis) -> Float[np.ndarray, "3 3"]:
+    """Turns the world into axes with y up, as glTF, BVH and OpenXR have them; x stays."""
+    if up == "y":
+        return np.eye(3)
+    return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+
+
+def changes(present: Bool[np.ndarray, "T"]) -> Int[np.ndarray, "K"]:
+    """The first frame, and every frame from which on something appears or disappears."""
+    indices: NDArray[np.intp] = np.flatnonzero(np.diff(present, prepend=not present[0]))
+    return indices
+
+
+def _held(values: NDArray[np.float64], present: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Rows, with the last row that is present in the place of each that is not."""
+    last = np.maximum.accumulate(np.where(present, np.arange(len(present)), -1))
+    held: NDArray[np.float64] = values[np.where(last < 0, np.argmax(present), last)]
+    return held
