@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 from gloves.captures.collection import find_captures, read_markers
-from gloves.takes.take import load_take
+from gloves.takes.take import Take, load_take
 from handsim.errors import CaptureError, HandSimError
 from handsim.files.json_files import save_json
 from handsim.files.outputs import check_outputs
@@ -63,7 +63,7 @@ def evaluate(
                 "a simulated take is counted whole, with its own gaps and ghosts: leave out --occlude, "
                 "--ghosts and --every"
             )
-        report = evaluate_takes(network, [load_take(path) for path in captures])
+        report = evaluate_takes(network, [_load_truth(path) for path in captures])
         title = f"{len(captures)} takes, {report.num_frames} frames of one hand"
     else:
         files = find_captures(captures)
@@ -86,6 +86,18 @@ def evaluate(
         found = {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
         found["slot_accuracy_by_marker"] = by_marker
         save_json(json, {**drawn, **found})
+
+
+def _load_truth(path: Path) -> Take:
+    """A take whose labels are true.
+
+    Raises:
+        CaptureError: It cannot be read, or its labels are a tracker's.
+    """
+    take = load_take(path)
+    if take.is_tracked:
+        raise CaptureError(f"{path}: a tracked take, expected the truth of a simulated capture")
+    return take
 
 
 def _are_takes(captures: tuple[Path, ...]) -> bool:
