@@ -44,7 +44,7 @@ from poses.shapes.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import SkinPatch, displace_markers
-from track.calibration.user_calibration import calibrate
+from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
@@ -166,7 +166,7 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
     rows = {"before": tell("before", start, true, held_out)}
     for name, (seen, begin) in ways.items():
         began = time.perf_counter()
-        result = calibrate(seen, begin, take.rate)
+        result = calibrate_hand(seen, begin, take.rate)
         took = time.perf_counter() - began
         within = (1e3 * hand_errors(result.hand, true).wrist_positions < 2e3 * result.position_errors).mean()
         rows[name] = tell(name, result.hand, true, held_out)
@@ -185,7 +185,7 @@ def tell_people(captures: Path, layout: MarkerLayout) -> list[list[float]]:
     for name, markers in right_hands(captures, layout.names).items():
         half = len(markers) // 2
         seen = markers[half:][np.isfinite(markers[half:, :, 0]).all(axis=1)][::EVERY]
-        result = calibrate(markers[:half], nominal_fit(layout, "M", "right"), 120.0)
+        result = calibrate_hand(markers[:half], nominal_fit(layout, "M", "right"), 120.0)
         off = [1e3 * PoseSolver(hand).solve(seen).rms for hand in (result.start, result.hand)]
         print(f"{name}: {len(seen)} held-out frames, 3D RMS median {np.median(off[0]):.2f} mm before, "
               f"{np.median(off[1]):.2f} mm after (p95 {np.percentile(off[1], 95):.2f}); "

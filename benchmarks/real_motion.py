@@ -32,11 +32,11 @@ from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.layout import load_layout
 from track.calibration.hand_size import fit_size, sample_frames
+from track.finder.frame_hands import HandFinder
+from track.finder.labeling import label_hands
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from train.hands.frame_hands import HandFinder
-from train.hands.labeling import label_hands
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 
 SIDES = ("right", "left")
 

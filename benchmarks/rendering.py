@@ -42,7 +42,7 @@ from render.session import draw_frames
 from render.shown_take import ShownTake, show_take
 from render.skin.look import ALL_TONES
 from render.studio.studio import Studio
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
@@ -58,7 +58,7 @@ KINDS: Final = {
 
 @functools.lru_cache(maxsize=1)
 def a_take(frames: int) -> ShownTake:
-    return show_take(simulate_take(TakeConfig(kind="hand-hand", num_frames=frames)))
+    return show_take(simulate_take(kind="hand-hand", num_frames=frames))
 
 
 def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:

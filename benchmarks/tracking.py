@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 import time
 from collections.abc import Sequence
 from functools import cache
@@ -43,19 +42,16 @@ from benchmarks.paper.take_evaluation import (
 )
 from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
 from benchmarks.record import Figures, add_save, describe, save_figures
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
-from handsim.cli.calibrate import calibrate
-from track.capture_tracking import warm_up
+from track.capture_calibration import calibrate
+from track.setup import warm_up
 from track.tracker import Tracker
-from track.user import load_user
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 from train.simulation.room_settings import KINDS, SIMULATED_KINDS, SimulatedKind
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
@@ -70,7 +66,7 @@ HANDS = {
 
 @cache
 def twin(kind: SimulatedKind, frames: int | None, seed: int) -> Take:
-    return simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)).without_body()
+    return simulate_take(kind=kind, num_frames=frames, seed=seed).without_body()
 
 
 @cache
@@ -110,13 +106,7 @@ def calibrated_users(take: Take, seed: int, free: float) -> list[GloveFit]:
     people = tuple(true_users(take))
     rng = np.random.default_rng((seed, 1))
     made = simulate_calibration(people, CalibrationTakeConfig(free=free), rng=rng)
-    with tempfile.TemporaryDirectory() as folder:
-        capture, user = Path(folder) / "calibration.c3d", Path(folder) / "user.json"
-        names = tuple(f"point{number}" for number in range(made.points.shape[1]))
-        write_capture(capture, Capture(names, made.points, made.rate))
-        calibrate(capture, out=user)
-        found = {hand.side: hand for hand in load_user(user)}
-    return [found[hand.side] for hand in take.hands]
+    return list(calibrate(made).of_sides(take.sides))
 
 
 def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:

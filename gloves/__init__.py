@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gloves.captures.capture import Capture
     from gloves.captures.formats import read_capture, write_capture
     from gloves.fit import GlovedHand, GloveFit, attach, nominal_fit
-    from gloves.layout import MarkerLayout, load_layout
+    from gloves.layout import MarkerLayout, MarkerPlace, load_layout
     from gloves.takes.take import Take, load_take
 
 __getattr__, __dir__ = lazy_exports(
@@ -24,6 +24,7 @@ __getattr__, __dir__ = lazy_exports(
         "GloveFit": "gloves.fit",
         "GlovedHand": "gloves.fit",
         "MarkerLayout": "gloves.layout",
+        "MarkerPlace": "gloves.layout",
         "Take": "gloves.takes.take",
         "attach": "gloves.fit",
         "load_layout": "gloves.layout",
@@ -39,6 +40,7 @@ __all__ = [
     "GloveFit",
     "GlovedHand",
     "MarkerLayout",
+    "MarkerPlace",
     "Take",
     "__version__",
     "attach",

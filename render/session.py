@@ -19,7 +19,7 @@ from handsim.app.interrupts import Stopped
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning, choices
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from render.cameras.own_cameras import check_hands_in_view

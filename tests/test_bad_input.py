@@ -17,7 +17,7 @@ from gloves.captures.formats import write_capture
 from gloves.layout import load_layout, save_layout
 from gloves.takes.archives import write_archive
 from handsim.cli.main import main
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
@@ -79,7 +79,7 @@ def folder(tmp_path, monkeypatch):
         (tmp_path / name).write_text(content)
     write_archive(tmp_path / "tracked.npz", "tracked take", 1, {}, {})
     write_archive(tmp_path / "newer.npz", "tracked take", 99, {}, {})
-    take = simulate_take(TakeConfig(num_frames=2))
+    take = simulate_take(num_frames=2)
     take.save(tmp_path / "good.truth.npz")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "broken.jpg").write_text("no picture")

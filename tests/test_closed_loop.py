@@ -15,8 +15,6 @@ from render.cameras.viewpoints import ViewConfig
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0
@@ -36,7 +34,7 @@ def tracked(truth):
     """Tracked from the file of points alone."""
     take, folder = truth
     capture = read_capture(folder / "take.c3d")
-    result = track_capture(capture, Tracker(true_users(take), load_labeler("dense19")))
+    result = track_capture(capture, hands=true_users(take), labeler="dense19")
     result.save(folder / "tracked.npz")
     return load_take(folder / "tracked.npz"), folder
 

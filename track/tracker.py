@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from time import perf_counter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -32,8 +33,8 @@ from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 
 _EVIDENCE_PER_FRAME: Final = (
     2.0  # of a label (log-odds), less half the squared Mahalanobis distance of its point
@@ -107,6 +108,7 @@ class Tracker:
         Raises:
             ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time.
         """
+        began = perf_counter()
         incoming = self._intake.check_frame(points, ids, time)
         bodies, labels = self._track_bodies(incoming)
         free = labels < 0
@@ -133,7 +135,10 @@ class Tracker:
         all_labels, all_confidence = np.full(incoming.num_points, -1), np.ones(incoming.num_points)
         all_labels[incoming.kept] = labels
         all_labels[incoming.kept[free]], all_confidence[incoming.kept[free]] = final.labels, final.confidence
-        return TrackedFrame(float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes)
+        seconds = perf_counter() - began
+        return TrackedFrame(
+            float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes, seconds
+        )
 
     def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
         """Every body, and the labels (P,) of their points."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -109,7 +110,7 @@ def check_labels(
 
 
 def poses_of(
-    hands: tuple[GloveFit, ...], qpos: Float[np.ndarray, "T H 27"]
+    hands: Sequence[GloveFit], qpos: Float[np.ndarray, "T H 27"]
 ) -> tuple[Float[np.ndarray, "T 2 21 3"], Float[np.ndarray, "T 2 20"]]:
     """Joints [m] and joint angles [rad] of poses, the right hand first; NaN for a hand that is not there."""
     keypoints, frames = keypoints_of(hands, qpos), len(qpos)

@@ -18,15 +18,14 @@ from benchmarks.public.answers import SIDES, Answers, BenchmarkError, poses_of, 
 from benchmarks.public.difficulties import BENCHMARK, GLOVE
 from benchmarks.public.manifest import Benchmark
 from gloves.captures.capture import Capture
-from gloves.fit import GloveFit, nominal_fit
-from gloves.layout import load_layout
+from gloves.fit import GloveFit
 from handsim.files.json_files import claim
 from handsim.hand.topology import NUM_QPOS
-from track.calibration.hand_size import fit_size, sample_frames
-from track.capture_tracking import capture_frames
+from track.setup import measure_hands
+from track.streams.frame_source import capture_frames
 from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]
@@ -68,29 +67,23 @@ def run_baseline(
     """
     about = {"benchmark": BENCHMARK, "size": benchmark.size, "tracker": tracker, "users": users}
     claim(out / ABOUT, about, noun="set of results", error=BenchmarkError)
-    labeler = labeler_for_glove(GLOVE, None)
+    labeler = load_labeler(GLOVE, None)
     for one in benchmark.captures:
         path = out / f"{one.name}.npz"
         if not path.is_file():
             capture, truth = benchmark.capture(one.name), benchmark.truth(one.name)
             here = np.isfinite(capture.positions[0, :, 0])
-            hands = benchmark.user(one.name) if users == "calibrated" else measured_hands(capture, labeler)
+            if users == "calibrated":
+                hands = benchmark.user(one.name)
+            else:
+                hands = measure_hands(capture, GLOVE, labeler=labeler, hands=SIDES)
             made = _TRACKERS[tracker](hands, labeler, truth.labels[0, here])
             save_answers(path, track_answers(capture, hands, made))
         if progress is not None:
             progress(one.num_frames)
 
 
-def measured_hands(capture: Capture, labeler: Labeler) -> tuple[GloveFit, ...]:
-    """Hands of the size that is measured in the capture, as `handsim track` does; else of the usual one."""
-    layout = load_layout(GLOVE)
-    size = fit_size(sample_frames(list(capture_frames(capture))), layout, SIDES, labeler)
-    if size is None:
-        return tuple(nominal_fit(layout, _USUAL_SIZE, side) for side in SIDES)
-    return size.hands(SIDES)
-
-
-def track_answers(capture: Capture, hands: tuple[GloveFit, ...], tracker: FrameTracker) -> Answers:
+def track_answers(capture: Capture, hands: Sequence[GloveFit], tracker: FrameTracker) -> Answers:
     """What a tracker of these hands says of a capture."""
     present = np.isfinite(capture.positions[..., 0])
     labels = np.full(present.shape, -1)

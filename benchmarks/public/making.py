@@ -35,11 +35,11 @@ from gloves.fit import GloveFit
 from gloves.layout import load_layout, save_layout
 from gloves.takes.take import Take
 from handsim.files.atomic import atomic_write, remove_leftovers
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free
 from handsim.files.json_files import claim
 from handsim.hand.model import HandModel
 from handsim.space.cameras import load_rig, save_rig
-from track.user import load_user, save_user
+from track.user import User, load_user
 from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room import record_take
 from train.simulation.room_settings import Kind
@@ -97,7 +97,7 @@ def make_capture(plan: Plan, out: Path, number: int) -> int:
     rounded = _round(joints, _POINT_DECIMALS), _round(angles, _ANGLE_DECIMALS)
     write_capture(out / capture_path(planned.name), capture)
     notes = "The true hands and gloves of this capture, as a perfect calibration finds them."
-    save_user(out / user_path(planned.name), hands, notes)
+    User(hands, notes).save(out / user_path(planned.name))
     save_answers(out / truth_path(planned.name), Answers(labels, *rounded))  # last: it is finished now
     return number
 

@@ -16,14 +16,13 @@ from benchmarks.public.answers import SIDES, Answers, BenchmarkError, load_answe
 from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture
-from gloves.fit import GloveFit
 from gloves.layout import load_layout
 from handsim._version import __version__
 from handsim.errors import DatasetError
 from handsim.files.inputs import checksum
 from handsim.files.json_files import load_json, save_json
 from handsim.hand.keypoints import KEYPOINT_NAMES
-from track.user import load_user
+from track.user import User, load_user
 from train.simulation.motion import RATE
 
 MANIFEST: Final = "manifest.json"
@@ -83,7 +82,7 @@ class Benchmark:
         """
         return read_capture(self._checked(capture_path(name)))
 
-    def user(self, name: str) -> tuple[GloveFit, ...]:
+    def user(self, name: str) -> User:
         """The right hand and the left one of a capture in their gloves, as they were worn.
 
         Raises:

@@ -6,7 +6,7 @@ import functools
 import os
 from typing import Any
 
-from handsim.app.system_packages import EGL_PACKAGES
+from handsim._extras import EGL_PACKAGES
 from handsim.errors import HandSimError
 
 _BROKEN_PYRENDER = "0.1.45"  # cannot draw beside NumPy 2 on Python 3.12 and later

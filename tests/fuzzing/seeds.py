@@ -23,7 +23,7 @@ from handsim.space.objects import named_object
 from track.bodies.body_file import save_body
 from track.bodies.rigid_body import RigidTemplate
 from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
-from track.user import save_user
+from track.user import User
 
 FRAMES, COLUMNS = 4, 24
 SETTINGS = {"num_frames": 10, "glove": "dense19", "scenes": {"one": 1.0}}
@@ -203,7 +203,7 @@ def tracked(folder: Path) -> list[Path]:
 
 
 def user(folder: Path) -> list[Path]:
-    save_user(folder / "user.json", hands(), "calibrated")
+    User(hands(), "calibrated").save(folder / "user.json")
     return [folder / "user.json"]
 
 

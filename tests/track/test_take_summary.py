@@ -13,22 +13,19 @@ from gloves.takes.take import LOST, Take
 from handsim.cli.main import main
 from track.capture_tracking import track_capture
 from track.take_summary import suspicions
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 FRAMES = 40
 
 
 @pytest.fixture(scope="module")
 def truth() -> Take:
-    return simulate_take(TakeConfig(kind="single-hand", num_frames=FRAMES))
+    return simulate_take(kind="single-hand", num_frames=FRAMES)
 
 
 @pytest.fixture(scope="module")
 def tracked(truth) -> Take:
-    tracker = Tracker(list(truth.hands), load_labeler("dense19"))
-    return track_capture(truth.capture(), tracker)
+    return track_capture(truth, hands=truth.hands, labeler="dense19")
 
 
 def test_a_good_take_tells_nothing(tracked):

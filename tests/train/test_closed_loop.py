@@ -16,10 +16,8 @@ from render.cameras.viewpoints import ViewConfig
 from render.session import RenderConfig, draw_frames
 from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
-from track.tracker import Tracker
 from train.data.shards import Dataset
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
 SMALL = [
@@ -94,12 +92,9 @@ def test_empty_frames_are_labeled_as_empty(run):
 
 
 def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
-    truth = simulate_take(TakeConfig(num_frames=240))
+    truth = simulate_take(num_frames=240)
     truth.save(run / "one.truth.npz")
-    columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
-    capture = Capture(columns, truth.points, truth.rate)
-    tracker = Tracker(true_users(truth), load_labeler(run / "run"))
-    track_capture(capture, tracker).save(run / "tracked.npz")
+    track_capture(truth, hands=true_users(truth), labeler=run / "run").save(run / "tracked.npz")
     shown, true = load_shown_take(run / "tracked.npz"), load_shown_take(run / "one.truth.npz").hands[0]
     mine = shown.hands[0].qpos
     there = np.isfinite(mine[:, 0])
@@ -130,9 +125,9 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        train_labeler(dataset, config, tmp_path / "killed", progress=kill, save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "killed", save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "whole")
+        train_labeler(dataset, tmp_path / "killed", config, progress=kill, save_every=0.0)
+    train_labeler(dataset, tmp_path / "killed", config, save_every=0.0)
+    train_labeler(dataset, tmp_path / "whole", config)
     resumed, whole = (load_file(tmp_path / name / "labeler.safetensors") for name in ("killed", "whole"))
     for name, values in whole.items():
         np.testing.assert_allclose(resumed[name], values, atol=1e-6)

@@ -23,8 +23,8 @@ from track.association.assignment import match_log_odds, match_points, peak_log_
 from track.association.frame_state import targets_of
 from track.association.hand_state import HandState
 from track.config import TrackerConfig
+from track.finder.measures import longest_link
 from track.kinematics.pose_solver import PoseFit
-from train.hands.measures import longest_link
 from train.labelers.protocol import Labeler, Labeling
 
 MOST_POINTS: Final = 100

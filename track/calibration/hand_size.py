@@ -1,4 +1,4 @@
-"""The size and proportions of a user's hands from a few labeled frames.
+"""The size and proportions of a user's hands, measured in some frames of unlabeled points.
 
 Length and breadth of hands of mean proportions are searched first; then the proportions and the positions of
 the markers follow as far as the frames tell. `user_calibration` finds the rest from a longer capture.

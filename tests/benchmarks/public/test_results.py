@@ -17,8 +17,6 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.captures.markers import labeled_capture, unlabeled_frames
 from track.capture_tracking import track_capture
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
 
 NAME = "hand-controller-hard-1"
 LABELS = label_names()
@@ -112,7 +110,7 @@ def test_points_that_were_moved_or_labels_without_a_side_are_told(capture, tmp_p
 
 def test_a_tracked_take_gives_labels_joints_and_angles(benchmark, capture, truth, tmp_path):
     users = benchmark.user(NAME)
-    take = track_capture(capture, Tracker(users[::-1], load_labeler("dense19")))
+    take = track_capture(capture, hands=users[::-1], labeler="dense19")
     take.save(tmp_path / f"{NAME}.npz")
     answers = read_result(tmp_path / f"{NAME}.npz", capture, LABELS)
     assert (answers.labels == truth.labels).mean() > 0.97

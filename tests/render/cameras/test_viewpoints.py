@@ -11,12 +11,12 @@ from handsim.errors import ArgumentError
 from handsim.space.transforms import quaternion_matrix
 from render.cameras.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, hand_centers
 from render.shown_take import ShownTake, show_take
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
 def take() -> ShownTake:
-    return show_take(simulate_take(TakeConfig(kind="hand-controller", num_frames=60)))
+    return show_take(simulate_take(kind="hand-controller", num_frames=60))
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)

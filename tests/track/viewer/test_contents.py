@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import named_rig
 from tests.rigs import mixed_rig
-from track.user import save_user
+from track.user import User
 from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings.captures import CaptureRecording
 from track.viewer.recordings.datasets import DatasetRecording
@@ -54,7 +54,7 @@ def files(tmp_path, tracked, simulated, capture, training_set):
     (tmp_path / "e.toml").write_text(starter_layout())
     cameras = "\n".join(f"[[camera]]\nposition = [{x}, 0, 1]\ntarget = [0, 0, 1]" for x in (-1, 1))
     (tmp_path / "f.toml").write_text(f'name = "pair"\nfield_of_view = 60\n{cameras}\n')
-    save_user(tmp_path / "g.json", [tracked.hands[0], tracked.hands[0].with_side("left")])
+    User((tracked.hands[0], tracked.hands[0].with_side("left"))).save(tmp_path / "g.json")
     return {
         "take": tmp_path / "a.npz",
         "take truth": tmp_path / "b.npz",
