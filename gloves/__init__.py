@@ -13,7 +13,7 @@ from handsim._lazy import lazy_exports
 if TYPE_CHECKING:
     from gloves.captures.capture import Capture
     from gloves.captures.formats import read_capture, write_capture
-    from gloves.fit import GlovedHand, GloveFit, attach, nominal_fit
+    from gloves.fit import GloveFit, attach
     from gloves.layout import MarkerLayout, MarkerPlace, load_layout
     from gloves.takes.take import Take, load_take
 
@@ -22,14 +22,12 @@ __getattr__, __dir__ = lazy_exports(
     {
         "Capture": "gloves.captures.capture",
         "GloveFit": "gloves.fit",
-        "GlovedHand": "gloves.fit",
         "MarkerLayout": "gloves.layout",
         "MarkerPlace": "gloves.layout",
         "Take": "gloves.takes.take",
         "attach": "gloves.fit",
         "load_layout": "gloves.layout",
         "load_take": "gloves.takes.take",
-        "nominal_fit": "gloves.fit",
         "read_capture": "gloves.captures.formats",
         "write_capture": "gloves.captures.formats",
     },
@@ -38,7 +36,6 @@ __getattr__, __dir__ = lazy_exports(
 __all__ = [
     "Capture",
     "GloveFit",
-    "GlovedHand",
     "MarkerLayout",
     "MarkerPlace",
     "Take",
@@ -46,7 +43,6 @@ __all__ = [
     "attach",
     "load_layout",
     "load_take",
-    "nominal_fit",
     "read_capture",
     "write_capture",
 ]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gloves import Capture
-from handsim import HandSimError
+from handsim import HandModel, HandSimError
 from train import Corruption
 
 PACKAGES = ("handsim", "poses", "gloves", "train")
@@ -34,7 +34,6 @@ VALID: dict[str, dict[str, object]] = {
     "gloves.attach": {"layout": "tips8", "model": "M"},
     "gloves.load_layout": {"glove": "tips8"},
     "gloves.load_take": {"path": "gone.npz"},
-    "gloves.nominal_fit": {"layout": "tips8", "size": "M", "side": "right"},
     "gloves.read_capture": {"capture": CAPTURE},
     "gloves.write_capture": {"path": "out.trc", "capture": CAPTURE},
     "train.corrupt": {"markers": np.zeros((1, 5, 3)), "corruption": Corruption(), "rng": RNG},
