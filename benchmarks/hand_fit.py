@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.people import right_hands
-from benchmarks.record import describe
+from benchmarks.record import add_save, describe, save_figures
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim.hand.jacobian import skinned_jacobian
@@ -131,6 +131,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--held-out", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
+    add_save(parser)
     arguments = parser.parse_args()
     print(describe("scipy"))
     rng, layout, everyone = np.random.default_rng(arguments.seed), load_layout("dense19"), []
@@ -142,6 +143,8 @@ def main() -> None:
         everyone.append(1e3 * fit.rms)
     rms = np.concatenate(everyone)
     print(f"all: median {np.median(rms):.2f} mm, p95 {np.percentile(rms, 95):.2f} mm")
+    what = f"fit of the hand to {len(rms)} other frames, 3D RMS median and p95 [mm]"
+    save_figures(arguments.save, {"all": (what, np.percentile(rms, [50, 95]))})
 
 
 if __name__ == "__main__":

@@ -37,15 +37,15 @@ import cv2
 import numpy as np
 import torch
 import trimesh
+from render.own_poses import PoseFile, load_poses
 
-from benchmarks.record import describe
+from benchmarks.record import Figures, add_save, describe, save_figures
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
-from render.frames.frame import RenderedFrame
-from render.own_poses import PoseFile, load_poses
+from render.frames import RenderedFrame
 from render.painting.figures import Appearance, sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
@@ -95,7 +95,7 @@ def draw_no_relief(count: int, seed: int) -> Any:
 
 
 def draw_no_shadows(count: int, seed: int) -> Any:
-    with patch("render.studio.studio.light_behind", return_value=None):
+    with patch("render.studio.light_behind", return_value=None):
         return EXAMPLE.draw(count, seed)
 
 
@@ -114,7 +114,7 @@ def draw_plain(count: int, seed: int) -> Any:
                 frames = range(step * shard, step * shard + step)
                 for frame in draw_shard(take, view, config, shard, frames):
                     picture = plain_picture(frame, renderer, rng)
-                    found.append(EXAMPLE.cut_out(picture, frame.hands[0].pixels, rng))
+                    found.append(EXAMPLE.cut_out(picture, frame.hands[0].keypoints, rng))
     return EXAMPLE.Pictures(*(np.stack(values) for values in zip(*found, strict=True)))
 
 
@@ -206,6 +206,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=240000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--page", type=Path)
+    add_save(parser)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     print(describe())
@@ -213,17 +214,24 @@ def main() -> None:
     held_out = EXAMPLE.middle_of(pictures_of("ours", 1000, HELD_OUT, options.out))
     print(f"{options.pictures} pictures, {options.samples} samples; {len(photos.crops)} photographs")
     result = {}
+    figures: Figures = {
+        "photographs": ("photographs of hands on which the reference is sure", len(photos.crops))
+    }
     for variant in options.variants:
         network = network_of(variant, options)
         sets = {"learned": learned_by(variant, options), "drawn": held_out, "photographs": photos}
         found = result[variant] = {name: 100 * EXAMPLE.pck(network, one) for name, one in sets.items()}
         shares = "  ".join(f"{name} {share:5.1f}" for name, share in found.items())
         print(f"{variant:15s} {shares}", flush=True)
+        key, sets_of = variant.replace(" ", "_"), "pictures learned from | other drawn hands | photographs"
+        figures[key] = (f"trained on {variant}, PCK@0.1 [%]: {sets_of}", list(found.values()))
         if "ours" in result and variant != "ours":
             ratio = (100 - found["photographs"]) / (100 - result["ours"]["photographs"])
             print(f"misses on photographs, {variant} over ours: {ratio:.2f}", flush=True)
+            figures[f"{key}_ratio"] = (f"misses on photographs, {variant} over ours", ratio)
         if options.page is not None:
             page(network, photos, options.page.with_stem(f"{options.page.stem}_{variant.replace(' ', '_')}"))
+    save_figures(options.save, figures)
     (options.out / "result.json").write_text(json.dumps(result, indent=1))
 
 

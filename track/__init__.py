@@ -13,13 +13,13 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from track.calibration.capture_calibration import calibrate
-    from track.calibration.hand_size import measure_hands
+    from track.capture_calibration import calibrate
     from track.capture_labeling import label_capture
     from track.capture_tracking import track_capture
     from track.config import TrackerConfig
     from track.kinematics.pose_solver import solve_pose
     from track.recorder import Recorder
+    from track.setup import measure_hands
     from track.sinks.addresses import open_sinks
     from track.sinks.message import LiveMessage
     from track.streams.addresses import open_source
@@ -40,10 +40,10 @@ __getattr__, __dir__ = lazy_exports(
         "Tracker": "track.tracker",
         "TrackerConfig": "track.config",
         "User": "track.user",
-        "calibrate": "track.calibration.capture_calibration",
+        "calibrate": "track.capture_calibration",
         "label_capture": "track.capture_labeling",
         "load_user": "track.user",
-        "measure_hands": "track.calibration.hand_size",
+        "measure_hands": "track.setup",
         "open_sinks": "track.sinks.addresses",
         "open_source": "track.streams.addresses",
         "solve_pose": "track.kinematics.pose_solver",

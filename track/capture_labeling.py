@@ -13,11 +13,10 @@ from gloves.captures.markers import labeled_capture, unlabeled_frames
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
 from handsim.hand.topology import NUM_QPOS
-from track.calibration.hand_size import USUAL_SIZE
 from track.finder.frame_hands import HandFinder
 from track.finder.labeling import label_hands
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, glove_of, labeler_of
-from track.setup import BOTH
+from track.setup import BOTH, USUAL_SIZE
 from track.user import nominal_user
 
 

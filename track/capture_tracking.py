@@ -7,30 +7,27 @@ import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from gloves.optics.identities import number_runs
 from gloves.takes.corrections import Correction, find_pins, load_corrections, told
-from gloves.takes.take import STATUSES, Take, label_names
+from gloves.takes.take import Take, label_names
 from handsim.errors import CaptureError, HandSimWarning
+from track.bodies.body_file import AnyBody
 from track.calibration.hand_size import sample_frames
 from track.config import TrackerConfig
 from track.corrected_take import correct_take
-from track.given import AnyBody, AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.recorder import TakeRecorder
 from track.setup import BOTH, AnyHands, Size, TrackerSetup
 from track.sinks.addresses import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
-from track.tracked_frame import Status, TrackedFrame
-from track.tracker import Tracker
+from track.tracked_frame import TrackedFrame
 
 Progress = Callable[[int, int], None]
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
-
-_NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 
 
 def track_capture(
@@ -119,68 +116,3 @@ def _corrected(take: Take, path: Path, corrections: Sequence[Correction]) -> Tak
     for sentence in told(path, corrected.unfitting):
         warnings.warn(sentence, HandSimWarning, stacklevel=3)
     return corrected.take
-
-
-class TakeRecorder:
-    """Records tracked frames; `take` gives the take so far at any time.
-
-    Args:
-        tracker: The tracker, for its hands and bodies.
-    """
-
-    def __init__(self, tracker: Tracker) -> None:
-        self._hands = tracker.hands
-        self._config = tracker.config
-        self._bodies = tracker.bodies
-        self._rows: list[dict[str, NDArray[Any]]] = []
-
-    @property
-    def num_frames(self) -> int:
-        """Number of recorded frames."""
-        return len(self._rows)
-
-    @property
-    def duration(self) -> float:
-        """Time from the first frame to the last [s]."""
-        return float(self._rows[-1]["times"] - self._rows[0]["times"]) if self._rows else 0.0
-
-    def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
-        """Record a frame, unless it stands for a silence of the stream."""
-        if not frame.silent:
-            self._rows.append(frame_values(frame, tracked))
-
-    def take(self, capture: Capture | None = None) -> Take:
-        """The take so far.
-
-        Args:
-            capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
-                rate is the median one.
-
-        Raises:
-            CaptureError: There are too few frames to determine the rate of a stream.
-        """
-        rows = self._rows
-        if not rows or (capture is None and len(rows) < 2):
-            raise CaptureError(f"{len(rows)} frames came, expected two or more")
-        settings = {"tracker": dataclasses.asdict(self._config)}
-        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=settings)
-
-
-def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
-    """A frame's entries of the arrays of a take, by their names; those of points for its N points."""
-    hands, bodies = tracked.hands, tracked.bodies
-    poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
-    return {
-        "times": np.array(frame.time),
-        "numbers": np.array(frame.number),
-        "qpos": np.array([hand.qpos for hand in hands]),
-        "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
-        "rms": np.array([hand.rms for hand in hands]),
-        "body_poses": np.array(poses).reshape(len(bodies), 7),
-        "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
-        "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
-        "points": frame.points,
-        "ids": frame.ids.astype(np.int32),
-        "labels": tracked.labels.astype(np.int16),
-        "confidence": tracked.confidence,
-    }

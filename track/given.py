@@ -10,8 +10,7 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim._checks import shown_value
 from handsim.errors import ArgumentError, WeightsError
-from track.bodies.rigid_body import RigidTemplate
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 AnyCapture = Capture | Take | str | Path
@@ -19,8 +18,6 @@ AnyCapture = Capture | Take | str | Path
 AnyGlove = MarkerLayout | str | Path
 AnyLabeler = Labeler | str | Path | None
 """A labeler, what `load_labeler` reads, or None for the one of the glove."""
-AnyBody = RigidTemplate | str | Path
-"""A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
 
 
 def capture_of(capture: AnyCapture) -> Capture:
@@ -62,7 +59,7 @@ def labeler_of(glove: MarkerLayout, labeler: AnyLabeler) -> Labeler:
         WeightsError: The labeler is unknown, damaged, or knows other markers.
     """
     if labeler is None or isinstance(labeler, str | Path):
-        return labeler_for_glove(glove, labeler)
+        return load_labeler(glove, labeler)
     if not callable(getattr(labeler, "label_frames", None)):
         raise ArgumentError(
             f"labeler is {shown_value(labeler)}, expected a Labeler, or the name or path of one"

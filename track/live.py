@@ -12,7 +12,7 @@ import numpy as np
 
 from gloves.takes.take import Take
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
+from handsim.app.messages import LiveStatus
 from track.capture_tracking import OnFrame
 from track.recorder import Recorder
 from track.setup import TrackerSetup

@@ -1,7 +1,7 @@
-"""Recording of a live stream: frames go to disk as they come, and memory does not grow.
+"""Recording of tracked frames: in memory, or on disk, as they come, so that memory does not grow.
 
-A recording grows in `take.npz.part` (`gloves.takes.growing`), which is readable at any time and holds all but
-the last half second, whatever ends the process. `finish` turns it into `take.npz`.
+A recording on disk grows in `take.npz.part` (`gloves.takes.growing`), which is readable at any time and holds
+all but the last half second, whatever ends the process. `finish` turns it into `take.npz`.
 """
 
 from __future__ import annotations
@@ -12,10 +12,15 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Final, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
+from gloves.captures.capture import Capture
 from gloves.takes.columns import FRAMES, KEYPOINTS, NUMBERS
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
 from gloves.takes.take import (
     RATED_FRAMES,
+    STATUSES,
     Take,
     keypoints_of,
     take_header,
@@ -24,12 +29,77 @@ from gloves.takes.take import (
     worn_arrays,
 )
 from handsim.errors import ArgumentError, CaptureError
-from track.capture_tracking import frame_values
 from track.streams.frame_source import StreamedFrame
-from track.tracked_frame import TrackedFrame
+from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 
+_NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
 _SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
+
+
+class TakeRecorder:
+    """Records tracked frames; `take` gives the take so far at any time.
+
+    Args:
+        tracker: The tracker, for its hands and bodies.
+    """
+
+    def __init__(self, tracker: Tracker) -> None:
+        self._hands = tracker.hands
+        self._config = tracker.config
+        self._bodies = tracker.bodies
+        self._rows: list[dict[str, NDArray[Any]]] = []
+
+    @property
+    def num_frames(self) -> int:
+        """Number of recorded frames."""
+        return len(self._rows)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return float(self._rows[-1]["times"] - self._rows[0]["times"]) if self._rows else 0.0
+
+    def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        """Record a frame, unless it stands for a silence of the stream."""
+        if not frame.silent:
+            self._rows.append(frame_values(frame, tracked))
+
+    def take(self, capture: Capture | None = None) -> Take:
+        """The take so far.
+
+        Args:
+            capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
+                rate is the median one.
+
+        Raises:
+            CaptureError: There are too few frames to determine the rate of a stream.
+        """
+        rows = self._rows
+        if not rows or (capture is None and len(rows) < 2):
+            raise CaptureError(f"{len(rows)} frames came, expected two or more")
+        settings = {"tracker": dataclasses.asdict(self._config)}
+        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=settings)
+
+
+def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
+    """A frame's entries of the arrays of a take, by their names; those of points for its N points."""
+    hands, bodies = tracked.hands, tracked.bodies
+    poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
+    return {
+        "times": np.array(frame.time),
+        "numbers": np.array(frame.number),
+        "qpos": np.array([hand.qpos for hand in hands]),
+        "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
+        "rms": np.array([hand.rms for hand in hands]),
+        "body_poses": np.array(poses).reshape(len(bodies), 7),
+        "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
+        "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
+        "points": frame.points,
+        "ids": frame.ids.astype(np.int32),
+        "labels": tracked.labels.astype(np.int16),
+        "confidence": tracked.confidence,
+    }
 
 
 class Recorder:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,14 +12,15 @@ from typing import Any, Final, Literal, Self, get_args
 import numpy as np
 
 from gloves.fit import GloveFit
-from handsim.errors import ArgumentError, choices
+from gloves.layout import MarkerLayout
+from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
-from track.bodies.body_file import load_bodies
+from track.bodies.body_file import AnyBody, load_bodies
 from track.bodies.rigid_body import RigidTemplate
-from track.calibration.hand_size import USUAL_SIZE, measured_user
+from track.calibration.hand_size import fit_size, sample_frames
 from track.config import TrackerConfig
-from track.given import AnyBody, AnyGlove, AnyLabeler, glove_of, labeler_of
-from track.streams.frame_source import StreamedFrame
+from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, glove_of, labeler_of
+from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
 from track.user import User, check_sides, load_user, nominal_user
 from train.labelers.protocol import Labeler
@@ -28,6 +30,8 @@ AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
 """A user, hands in their gloves, or the path of a user's file; or sides, whose hands are to be measured."""
 BOTH: Final[tuple[Side, ...]] = ("right", "left")
 USUAL_GLOVE: Final = "dense19"
+USUAL_SIZE: Final = "M"
+"""The size of hands that could not be measured."""
 _SHOWN: Final = 0.8  # share of one hand's markers in a frame in which its size can be measured
 _HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
 _UNSURE_EXTENT: Final = 0.12  # of clouds that no labeler is sure of [m]
@@ -90,6 +94,53 @@ class TrackerSetup:
     def tracker(self) -> Tracker:
         """A tracker of the hands and bodies."""
         return Tracker(self.user, self.labeler, self.bodies, self.config)
+
+
+def measure_hands(
+    capture: AnyCapture,
+    glove: AnyGlove = "dense19",
+    *,
+    labeler: AnyLabeler = None,
+    hands: Sequence[Side] = BOTH,
+) -> User:
+    """The hands of a capture with their size and proportions measured; a `Tracker` takes them.
+
+    Args:
+        capture: Points [m], or the path of a marker file or a take; names of markers are not used.
+        glove: Marker layout, or its shipped name or the path of its .toml file.
+        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
+        hands: Which hands.
+
+    Returns:
+        The hands, all of one shape; printed, it is their length and breadth. Where no hand is found that
+        shows most of its markers, hands of size M, with a warning.
+
+    Raises:
+        ArgumentError: The capture is not in meters, or a hand is named twice.
+        CaptureError: The capture cannot be read, or most of its points are far from any room.
+        LayoutError: The glove is unknown, or does not fit a hand.
+        WeightsError: The labeler is unknown, or knows other markers.
+    """
+    check_sides(hands)
+    layout = glove_of(glove)
+    frames = checked_frames(capture_of(capture))
+    return measured_user(sample_frames(frames), layout, hands, labeler_of(layout, labeler))
+
+
+def measured_user(
+    frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
+) -> User:
+    """The user whose hands are in some frames; of size M, with a warning, if no hand is found."""
+    size = fit_size(frames, layout, sides, labeler)
+    if size is not None:
+        return User(size.hands(sides), f"auto, {size}")
+    warnings.warn(
+        f"no hand was found to measure its size; size {USUAL_SIZE} is used, or name a size",
+        HandSimWarning,
+        stacklevel=3,
+    )
+    usual = nominal_user(layout, USUAL_SIZE, sides)
+    return User(usual.hands, f"auto, {USUAL_SIZE}")
 
 
 def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
@@ -57,29 +57,6 @@ class Measurement:
     """Frames until all was right, from random frames of the take; NaN: never. See `trials`."""
     recovery: Float[np.ndarray, "S"]
     """The same after a second without points."""
-
-    def record(self) -> dict[str, Any]:
-        """All results, for JSON; None where nothing was counted."""
-        figures = {name: number_or_none(value) for name, value in self.report.figures().items()}
-        errors = [
-            {
-                "missing": list(bounds),
-                "hands": count,
-                "joint_error": number_or_none(joint),
-                "angle_error": number_or_none(angle),
-            }
-            for bounds, (count, joint, angle) in self.report.by_occlusion().items()
-        ]
-        return {
-            "method": self.method,
-            "hands": self.users,
-            "capture": self.capture,
-            "frames": len(self.report.right),
-            **figures,
-            "by_occlusion": errors,
-            "first_lock_frames": [number_or_none(value) for value in self.initialization],
-            "recovery_frames": [number_or_none(value) for value in self.recovery],
-        }
 
 
 def trackers(labeler: Labeler, seed: int) -> dict[str, MakeTracker]:
@@ -176,8 +153,3 @@ def _run_trials(
     if name in NEED_FIRST_LABELS:
         return nothing, recovery
     return initialization_times(take, lambda part: make(part, hands), trials, rng=rng), recovery
-
-
-def number_or_none(value: float) -> float | None:
-    """A number for JSON, which has no NaN."""
-    return None if np.isnan(value) else float(value)

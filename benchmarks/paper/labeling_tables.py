@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
+from benchmarks.record import Figures, save_figures
 from gloves.captures.collection import find_captures, read_markers
 from gloves.captures.gaps import count_gaps, run_lengths
 from gloves.takes.take import Take
@@ -23,14 +24,15 @@ from train.config import Kind, default_config
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler, evaluate_takes
-from train.glove_labeler import labeler_for_glove
+from train.evaluate import evaluate_labeler
+from train.evaluation.labeler_evaluation import Report
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.storage import shipped_labelers
 from train.loop import train_labeler
 from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 PUBLISHED_GAPS: Final = "3-4", "24-43"  # median and p90 of real finger markers' gaps [frames]; docs/room.md
 FIGURES: Final = {
@@ -46,6 +48,13 @@ FIGURES: Final = {
     "ghost_recall": "G recall",
 }
 """Rows of Tables 4 and 6, the paper's and ours."""
+_KEYS: Final = dict(
+    zip(
+        FIGURES,
+        "slots points frames f1 o_ratio o_precision o_recall g_ratio g_precision g_recall".split(),
+        strict=True,
+    )
+)
 
 
 def table2(
@@ -57,6 +66,7 @@ def table2(
     num_frames: int = 5000,
     captures: tuple[Path, ...] = (),
     seed: int = 0,
+    save: str | None = None,
 ) -> None:
     """Train with and without random drops and ghosts, and test each network with and without them.
 
@@ -68,6 +78,7 @@ def table2(
         num_frames: Test frames of people and poses that are not in the training set.
         captures: Labeled captures or folders of them, for a second table.
         seed: Seed of the training, the test frames and their corruption.
+        save: Name under which the last table's figures are kept in benchmarks/figures, such as table2.
     """
     dataset = Dataset(data)
     names, glove = dataset.marker_names, str(dataset.manifest.config["glove"])
@@ -81,10 +92,11 @@ def table2(
             _train_augmentation(dataset, kind, name, run, samples, seed)
         for title, markers in tests.items():
             nets = {
-                name: measure_augmentations(labeler_for_glove(glove, run), markers, seed=seed)
+                name: measure_augmentations(load_labeler(glove, run), markers, seed=seed)
                 for name, run in runs.items()
             }
             Console().print(print_table2(nets, title=f"Table 2, {kind}: {title}, ours (the paper's) [%]"))
+            save_figures(save, _table2_figures(nets, f"Table 2, {kind}, {title}"))
 
 
 def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samples: int, seed: int) -> None:
@@ -94,24 +106,26 @@ def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samp
     with progress_bar("samples") as (bar, task):
         train_labeler(
             dataset,
-            config,
             run,
+            config,
             progress=lambda done, total, loss: bar.update(
                 task, completed=done, total=total, description=f"{kind} {name}, loss {loss:.3f}"
             ),
         )
 
 
-def table3(glove: str = "dense19", seed: int = 0) -> None:
+def table3(glove: str = "dense19", seed: int = 0, save: str | None = None) -> None:
     """Frames, gaps and ghosts of the simulated twins of the paper's captures.
 
     Args:
         glove: Marker layout: a shipped name or the path of a .toml file.
         seed: Seed of the captures; 0 gives the twins, others give other captures of the same kinds.
+        save: Name under which the figures are kept in benchmarks/figures, such as table3.
     """
     takes = _simulate(glove, seed)
     Console().print(_table3(takes))
     Console().print(_by_marker(takes))
+    save_figures(save, _table3_figures(takes))
 
 
 def table4(
@@ -119,6 +133,7 @@ def table4(
     num_frames: int = 5000,
     captures: tuple[Path, ...] = (),
     seed: int = 0,
+    save: str | None = None,
 ) -> None:
     """Labelers of the dense layout on simulated test frames and on the twins of the paper's captures.
 
@@ -127,8 +142,9 @@ def table4(
         num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
         captures: Labeled captures or folders of them, for another column with the paper's recipe.
         seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
+        save: Name under which the last labeler's figures are kept in benchmarks/figures, such as table4.
     """
-    _print_tests("Table 4", "dense19", TABLE4, labelers, num_frames, captures, seed)
+    _print_tests("Table 4", "dense19", TABLE4, labelers, num_frames, captures, seed, save)
 
 
 def table6(
@@ -136,6 +152,7 @@ def table6(
     num_frames: int = 5000,
     captures: tuple[Path, ...] = (),
     seed: int = 0,
+    save: str | None = None,
 ) -> None:
     """Labelers of the sparse layout on simulated test frames and on the twins of the paper's captures.
 
@@ -144,8 +161,9 @@ def table6(
         num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
         captures: Labeled captures or folders of them, for another column with the paper's recipe.
         seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
+        save: Name under which the last labeler's figures are kept in benchmarks/figures, such as table4.
     """
-    _print_tests("Table 6", "sparse13", TABLE6, labelers, num_frames, captures, seed)
+    _print_tests("Table 6", "sparse13", TABLE6, labelers, num_frames, captures, seed, save)
 
 
 LABELING_TABLES: Final[dict[str, Callable[..., None]]] = {
@@ -164,12 +182,12 @@ def _print_tests(
     num_frames: int,
     captures: tuple[Path, ...],
     seed: int,
+    save: str | None,
 ) -> None:
     if num_frames < 1:
         raise HandSimError(f"num_frames is {num_frames}, expected at least 1")
     found = {
-        name: labeler_for_glove(glove, name if name in shipped_labelers() else Path(name))
-        for name in labelers
+        name: load_labeler(glove, name if name in shipped_labelers() else Path(name)) for name in labelers
     }
     stills = {"synthetic": held_out_markers(glove, num_frames, seed=seed)}
     takes = _simulate(glove, seed)
@@ -179,6 +197,7 @@ def _print_tests(
     for name, labeler in found.items():
         reports = measure_tests(labeler, stills, takes, seed=seed)
         Console().print(print_tests(reports, paper, title=f"{table}, {name}: ours (the paper's)"))
+        save_figures(save, _tests_figures(reports, paper, f"{table}, {name}"))
 
 
 def _simulate(glove: str, seed: int) -> dict[str, Take]:
@@ -206,6 +225,53 @@ def _table3(takes: dict[str, Take]) -> Table:
             f"{100 * ghosts / present.size:.2f} % ({100 * TWINS[kind].ghost_ratio:.2f} %)",
         )
     return table
+
+
+def _table3_figures(takes: Mapping[str, Take]) -> Figures:
+    """The figures of Table 3."""
+    kept: Figures = {}
+    columns = "frames, gaps, AGL, AMF, ghosts / labels [%], each with the paper's"
+    missing_columns = "missing, mean, least and most marker [%]; gaps, median, p90, p99 [frames]"
+    for kind, take in takes.items():
+        present, paper, key = take.markers_present(), TWINS[kind].paper, kind.split("-")[-1]
+        key, ours = "single" if kind == "single-hand" else key, count_gaps(present)
+        ghosts = int(((take.labels < 0) & np.isfinite(take.points[..., 0])).sum())
+        pairs = [
+            [ours.frames, paper.frames],
+            [ours.gaps, paper.gaps],
+            [ours.average_length, paper.average_length],
+            [ours.average_missing, paper.average_missing],
+            [100 * ghosts / present.size, 100 * TWINS[kind].ghost_ratio],
+        ]
+        share, lengths = 100 * (~present).mean(axis=0), run_lengths(~present)
+        quantiles = np.quantile(lengths, [0.5, 0.9, 0.99]) if len(lengths) else np.full(3, np.nan)
+        kept[key] = f"Table 3, {kind}: {columns}", pairs
+        row = [share.mean(), share.min(), share.max(), *quantiles]
+        kept[f"gaps_{key}"] = f"{kind}: {missing_columns}", row
+    return kept
+
+
+def _table2_figures(nets: Mapping[str, Mapping[str, Report]], title: str) -> Figures:
+    """The figures of Table 2: a row a test set, ours and the paper's of each network."""
+    kept: Figures = {}
+    for key, test in zip(("base", "o", "g", "og"), AUGMENTATIONS, strict=True):
+        ours = [100 * reports[test].figures["slot_accuracy"] for reports in nets.values()]
+        row = [[one, 100 * paper] for one, paper in zip(ours, TABLE2[test], strict=True)]
+        kept[key] = f"{title}: {test}, ours and the paper's [%], networks trained on {', '.join(nets)}", row
+    return kept
+
+
+def _tests_figures(
+    reports: Mapping[str, Report], paper: Mapping[str, tuple[float, ...]], title: str
+) -> Figures:
+    """The figures of Tables 4 and 6: a row a figure, the paper's beside where it has one."""
+    kept: Figures = {}
+    for figure, words in FIGURES.items():
+        printed = dict(zip(TEST_SETS, paper[figure], strict=True)) if figure in paper else {}
+        ours = {test: 100 * report.figures[figure] for test, report in reports.items()}
+        row = [[one, 100 * printed[test]] if test in printed else one for test, one in ours.items()]
+        kept[_KEYS[figure]] = f"{title}, ours and the paper's [%], {', '.join(reports)}: {words}", row
+    return kept
 
 
 def _by_marker(takes: dict[str, Take]) -> Table:
@@ -248,7 +314,7 @@ def simulate_takes(glove: str, seed: int, done: Callable[[], None]) -> dict[str,
     """The twins of the paper's four captures."""
     takes: dict[str, Take] = {}
     for kind in KINDS:
-        takes[kind] = simulate_take(TakeConfig(kind=kind, glove=glove, seed=seed))
+        takes[kind] = simulate_take(kind=kind, glove=glove, seed=seed)
         done()
     return takes
 
@@ -273,7 +339,7 @@ def measure_tests(
         name: evaluate_labeler(labeler, markers, recipe, rng=np.random.default_rng(seed))
         for name, markers in stills.items()
     }
-    return reports | {name: evaluate_takes(labeler, [take]) for name, take in takes.items()}
+    return reports | {name: evaluate_labeler(labeler, [take]) for name, take in takes.items()}
 
 
 def print_table2(nets: Mapping[str, Mapping[str, Report]], *, title: str) -> Table:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import tyro
@@ -15,6 +15,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from benchmarks.paper.comparison import (
+    NEED_FIRST_LABELS,
+    OURS,
+    PAPERS_LOOP,
     TRIALS,
     USERS,
     Measurement,
@@ -23,16 +26,20 @@ from benchmarks.paper.comparison import (
     trackers,
 )
 from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, HAN, TABLE5, TABLE7
+from benchmarks.record import Figures, save_figures
 from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
-from handsim.files.json_files import save_json
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.simulation.room_settings import KINDS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import TakeConfig, record_config
 
 _HEAD: Final = ("method", "hands")
 _PAPERS_GLOVE: Final = "dense19"
 _WITH_BODY: Final = "hand-controller"
+_METHOD_KEYS: Final = dict(
+    zip((OURS, PAPERS_LOOP, *NEED_FIRST_LABELS), ("", "loop_", "nearest_", "hungarian_"), strict=True)
+)
+_USER_KEYS: Final = {"calibrated": "true", "uncalibrated": "size"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +54,8 @@ class TableConfig:
     """Frames of each capture; the paper's numbers when not given."""
     seed: int = 0
     """Seed of the captures and of random choices in tracking; 0 gives the twins."""
-    json: Path | None = None
-    """File for the results."""
+    save: str | None = None
+    """Name under which the figures are kept in benchmarks/figures, such as table5_seed1."""
 
 
 _Config = Annotated[TableConfig, tyro.conf.arg(name="")]
@@ -65,7 +72,7 @@ def table5(config: _Config) -> None:
     console = Console()
     console.print(print_table5([*measured, *with_body], with_paper=config.glove == _PAPERS_GLOVE))
     console.print(*print_errors(measured), print_trials(measured), print_times(measured), sep="\n")
-    _save("table5", config, [*measured, *with_body])
+    save_figures(config.save, table5_figures(measured) | body_figures(with_body))
 
 
 def table7(config: _Config) -> None:
@@ -76,7 +83,7 @@ def table7(config: _Config) -> None:
     """
     _, measured = _measure(config)
     Console().print(print_table7(measured, with_paper=config.glove == _PAPERS_GLOVE))
-    _save("table7", config, measured)
+    save_figures(config.save, table7_figures(measured))
 
 
 def cameras(config: _Config, rig: str = "six") -> None:
@@ -92,7 +99,8 @@ def cameras(config: _Config, rig: str = "six") -> None:
     missing = 1.0 - takes["single-hand"].markers_present().mean()
     with_paper = config.glove == _PAPERS_GLOVE
     Console().print(print_cameras(measured, missing, rig=rig, with_paper=with_paper))
-    _save("cameras", config, measured, rig=rig, missing=float(missing))
+    what = f"share of markers missing before rig {rig} [%]"
+    save_figures(config.save, cameras_figures(measured) | {"missing": (what, 100 * missing)})
 
 
 TRACKING_TABLES: Final[dict[str, Callable[..., None]]] = {
@@ -114,12 +122,12 @@ def _measure_on(
     twins: Mapping[str, TakeConfig], config: TableConfig, *, trials: int = 0
 ) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
-    network = labeler_for_glove(config.glove, config.labeler)
+    network = load_labeler(config.glove, config.labeler)
     takes: dict[str, Take] = {}
     with progress_bar("captures") as (bar, task):
         bar.update(task, total=len(twins))
         for kind, twin in twins.items():
-            takes[kind] = simulate_take(twin)
+            takes[kind] = record_config(twin)
             bar.advance(task)
     bare = {kind: take.without_body() for kind, take in takes.items()}
     frames = sum(take.num_frames for take in takes.values())
@@ -133,17 +141,81 @@ def _measure_on(
 
 def _measure_with_body(take: Take, config: TableConfig) -> list[Measurement]:
     """Our tracker on the capture whose object has markers, with the object tracked as well."""
-    network = labeler_for_glove(config.glove, config.labeler)
+    network = load_labeler(config.glove, config.labeler)
     with progress_bar("frames") as (bar, task):
         bar.update(task, total=take.num_frames * len(USERS))
         return measure_with_body(_WITH_BODY, take, network, done=lambda: bar.advance(task))
 
 
-def _save(table: str, config: TableConfig, measured: list[Measurement], **more: Any) -> None:
-    if config.json is not None:
-        records = [one.record() for one in measured]
-        content = {"table": table, "glove": config.glove, "seed": config.seed, **more, "figures": records}
-        save_json(config.json, content)
+def table5_figures(measured: Sequence[Measurement]) -> Figures:
+    """The figures of Table 5 and of the tables below it."""
+    kept: Figures = {}
+    for key, who, row in _keyed(measured):
+        right = [100 * one.report.figures()["right"] for one in row]
+        errors = [
+            _mean_errors([one.report.by_occlusion()[bound] for one in row])
+            for bound in row[0].report.by_occlusion()
+        ]
+        times = np.concatenate([one.report.seconds for one in row])
+        kept[f"right_{key}"] = f"frames all of whose labels are right [%], {_captures(row)}: {who}", right
+        kept[f"errors_{key}"] = (
+            f"mean errors of joints [mm], angles [deg], by markers missing: none, 1-2, 3-5, 6 or more: {who}",
+            [[1e3 * joint, np.rad2deg(angle)] for joint, angle in errors],
+        )
+        took = 1e3 * np.quantile(times, [0.5, 0.99])
+        kept[f"time_{key}"] = f"time of a frame, median and p99 [ms]: {who}", took
+        if row[0].method == PAPERS_LOOP and row[0].users == "calibrated" and len(row[0].recovery):
+            waits = [np.concatenate([one.initialization for one in row])]
+            waits.append(np.concatenate([one.recovery for one in row]))
+            never = [np.where(np.isnan(wait), np.inf, wait) for wait in waits]
+            kept["loop_starts"] = (
+                "the paper's loop, frames until all is right: median, p90 from nothing, after a dark second",
+                np.ravel([np.quantile(wait, [0.5, 0.9], method="higher") for wait in never]),
+            )
+    return kept
+
+
+def body_figures(measured: Sequence[Measurement]) -> Figures:
+    """The figures of our tracker with a body beside the hands."""
+    return {
+        f"body_{_USER_KEYS[one.users]}": (
+            f"{one.capture}, frames all of whose labels are right [%]: {one.method}, {one.users}",
+            100 * one.report.figures()["right"],
+        )
+        for one in measured
+    }
+
+
+def table7_figures(measured: Sequence[Measurement]) -> Figures:
+    """The figures of Table 7."""
+    kept: Figures = {}
+    for key, who, row in _keyed(measured):
+        figures = [one.report.figures() for one in row]
+        shares = [[100 * one["valid"], 100 * one["right_of_valid"]] for one in figures]
+        kept[key] = f"valid frames, right ones of these [%], {_captures(row)}: {who}", shares
+    return kept
+
+
+def cameras_figures(measured: Sequence[Measurement]) -> Figures:
+    """The figures of few cameras."""
+    kept: Figures = {}
+    for key, who, (one,) in _keyed(measured):
+        figures = one.report.figures()
+        shares = [100 * figures[name] for name in ("valid", "right_of_valid", "valid_and_right")]
+        errors = [1e3 * figures["joint_error"], np.rad2deg(figures["angle_error"])]
+        what = f"valid, right of these, both [%]; joints [mm], joint angles [deg]: {who}"
+        kept[key] = what, [*shares, *errors]
+    return kept
+
+
+def _keyed(measured: Sequence[Measurement]) -> Iterable[tuple[str, str, list[Measurement]]]:
+    """Results by method and hands: their key, the words for it, and what was measured."""
+    for (method, users), row in _rows(measured):
+        yield f"{_METHOD_KEYS[method]}{_USER_KEYS[users]}", f"{method}, {users}", row
+
+
+def _captures(row: Sequence[Measurement]) -> str:
+    return ", ".join(one.capture for one in row)
 
 
 def print_table5(measured: Sequence[Measurement], *, with_paper: bool) -> Table:

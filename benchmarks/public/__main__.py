@@ -27,7 +27,7 @@ from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
 from handsim.files.atomic import atomic_write
-from handsim.files.disk import shown_bytes
+from handsim.files.capacity import shown_bytes
 from handsim.files.json_files import save_json
 from handsim.files.outputs import check_outputs
 

@@ -35,7 +35,7 @@ from gloves.fit import GloveFit
 from gloves.layout import load_layout, save_layout
 from gloves.takes.take import Take
 from handsim.files.atomic import atomic_write, remove_leftovers
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free
 from handsim.files.json_files import claim
 from handsim.hand.model import HandModel
 from handsim.space.cameras import load_rig, save_rig

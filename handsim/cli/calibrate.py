@@ -13,7 +13,7 @@ from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from track.calibration import capture_calibration
+from track import capture_calibration
 from track.calibration.user_calibration import Calibration
 from track.setup import BOTH, Size
 

@@ -10,8 +10,7 @@ import numpy as np
 import tyro
 
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
-from handsim.app.messages import print_line
+from handsim.app.messages import LiveStatus, print_line
 from handsim.errors import ArgumentError
 from track.streams.natnet import COMMAND_PORT
 from track.streams.natnet_server import LOOPBACK, ReplayServer

@@ -10,18 +10,16 @@ import tyro
 from rich.console import Console
 
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
-from handsim.app.messages import print_line
+from handsim.app.messages import LiveStatus, print_line
 from handsim.app.progress import progress_bar
 from handsim.cli.options import chosen_hands
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from handsim.space.cameras import load_rig
-from track.calibration.hand_size import USUAL_SIZE
 from track.config import TrackerConfig
 from track.live import measured_setup
-from track.setup import Size, TrackerSetup, warm_up
+from track.setup import USUAL_SIZE, Size, TrackerSetup, warm_up
 from track.streams.addresses import open_source
 from track.viewer.contents import Content, first_look, open_content
 from track.viewer.live_view import LiveView

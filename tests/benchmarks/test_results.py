@@ -7,6 +7,7 @@ import re
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.record import FOLDER, load_figures, save_figures
@@ -43,8 +44,10 @@ def test_figures_are_kept_with_their_origin(tmp_path):
     )
     if commit.returncode:
         pytest.skip("not a git checkout")
-    path = save_figures("speed", {"median": ("of a frame [ms]", [0.5, 0.7])}, tmp_path)
+    path = save_figures(
+        "speed", {"median": ("of a frame [ms]", [[0.5, np.nan], np.float64(2 / 3), 7])}, tmp_path
+    )
     content = json.loads(path.read_text("utf-8"))
     assert commit.stdout.startswith(content["commit"]) and "cores" in content["machine"]
-    assert content["figures"] == {"median": {"what": "of a frame [ms]", "value": [0.5, 0.7]}}
-    assert load_figures(tmp_path)["speed"].median[1] == 0.7
+    assert content["figures"] == {"median": {"what": "of a frame [ms]", "value": [[0.5, None], 0.666667, 7]}}
+    assert load_figures(tmp_path)["speed"].median[0][0] == 0.5

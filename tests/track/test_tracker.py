@@ -14,8 +14,8 @@ from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240))
+    return simulate_take(kind="hand-controller", num_frames=240)
 
 
 def users(take: Take) -> list[GloveFit]:
@@ -63,7 +63,7 @@ def test_hands_are_initialized_and_tracked(take, labeler):
 def test_gloves_with_few_markers_far_apart_are_tracked(seed):
     """Large hands in the sparse glove: stretched fingers are over 85 mm from the markers on the back."""
     kind = "single-hand" if seed == 0 else "hand-hand"
-    take = simulate_take(TakeConfig(kind=kind, num_frames=60, glove="sparse13", seed=seed))
+    take = simulate_take(kind=kind, num_frames=60, glove="sparse13", seed=seed)
     tracked = run(Tracker(users(take), load_labeler("sparse13")), take, range(60))
     right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
     assert np.mean(right) > 0.95

@@ -17,6 +17,8 @@ from track.bodies.constellation import FEWEST
 from track.bodies.rigid_body import RigidTemplate
 
 SUFFIX: Final = ".toml"
+AnyBody = RigidTemplate | str | Path
+"""A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
 _BODY_KEYS: Final = ("name", "description", "marker")
 _MARKER_KEYS: Final = ("name", "place_mm")
 
@@ -25,7 +27,7 @@ class BodyError(HandSimError):
     """A body's file that cannot be read or written."""
 
 
-def load_body(name_or_path: RigidTemplate | str | Path) -> RigidTemplate:
+def load_body(name_or_path: AnyBody) -> RigidTemplate:
     """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
 
     A body itself is given back.
@@ -51,7 +53,7 @@ def load_body(name_or_path: RigidTemplate | str | Path) -> RigidTemplate:
         raise BodyError(f"{path}: {error}") from error
 
 
-def load_bodies(names_or_paths: Iterable[RigidTemplate | str | Path]) -> tuple[RigidTemplate, ...]:
+def load_bodies(names_or_paths: Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
     """Bodies that are tracked together.
 
     Raises:

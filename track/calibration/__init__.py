@@ -9,7 +9,6 @@
 `report`: noise, standard errors, contact gaps and still joints.
 `hand_size`: the size and proportions of hands from unlabeled points.
 `user_calibration`: calibration of a hand in its glove from labeled markers, all steps.
-`capture_calibration`: calibration of the hands in a capture of unlabeled points.
 `picture`: a picture of a calibration.
 `body_learning`: calibration of a rigid body's markers.
 """

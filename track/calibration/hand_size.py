@@ -6,7 +6,6 @@ the markers follow as far as the frames tell. `user_calibration` finds the rest 
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -17,7 +16,6 @@ from scipy.optimize import minimize_scalar
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
-from handsim.errors import HandSimWarning
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES, shape_from_measures
 from handsim.hand.topology import Side
@@ -26,16 +24,12 @@ from track.calibration.energy import Estimate, Problem
 from track.calibration.hand_parameters import NUM_PARAMETERS
 from track.calibration.skin_coordinates import nearest_coordinates
 from track.calibration.solver import levenberg_marquardt, user_hand
-from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, glove_of, labeler_of
 from track.kinematics.pose_solver import PoseSolver
-from track.streams.frame_source import StreamedFrame, checked_frames
+from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
 from track.tracker import Tracker
-from track.user import User, check_sides, nominal_user
 from train.labelers.protocol import Labeler
 
-USUAL_SIZE: Final = "M"
-"""The size of hands that could not be measured."""
 _LENGTHS: Final = (0.187, 0.205, 0.168, 0.150)  # [m] hands to find the labels with, the likeliest first
 _SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longest in ANSUR II
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
@@ -78,53 +72,6 @@ class SizeFit(NamedTuple):
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
         """The measured hands of these sides."""
         return tuple(self.hand.with_side(side) for side in sides)
-
-
-def measure_hands(
-    capture: AnyCapture,
-    glove: AnyGlove = "dense19",
-    *,
-    labeler: AnyLabeler = None,
-    hands: Sequence[Side] = ("right", "left"),
-) -> User:
-    """The hands of a capture with their size and proportions measured; a `Tracker` takes them.
-
-    Args:
-        capture: Points [m], or the path of a marker file or a take; names of markers are not used.
-        glove: Marker layout, or its shipped name or the path of its .toml file.
-        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
-        hands: Which hands.
-
-    Returns:
-        The hands, all of one shape; printed, it is their length and breadth. Where no hand is found that
-        shows most of its markers, hands of size M, with a warning.
-
-    Raises:
-        ArgumentError: The capture is not in meters, or a hand is named twice.
-        CaptureError: The capture cannot be read, or most of its points are far from any room.
-        LayoutError: The glove is unknown, or does not fit a hand.
-        WeightsError: The labeler is unknown, or knows other markers.
-    """
-    check_sides(hands)
-    layout = glove_of(glove)
-    frames = checked_frames(capture_of(capture))
-    return measured_user(sample_frames(frames), layout, hands, labeler_of(layout, labeler))
-
-
-def measured_user(
-    frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
-) -> User:
-    """The user whose hands are in some frames; of size M, with a warning, if no hand is found."""
-    size = fit_size(frames, layout, sides, labeler)
-    if size is not None:
-        return User(size.hands(sides), f"auto, {size}")
-    warnings.warn(
-        f"no hand was found to measure its size; size {USUAL_SIZE} is used, or name a size",
-        HandSimWarning,
-        stacklevel=3,
-    )
-    usual = nominal_user(layout, USUAL_SIZE, sides)
-    return User(usual.hands, f"auto, {USUAL_SIZE}")
 
 
 def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
