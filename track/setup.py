@@ -12,7 +12,7 @@ from typing import Any, Final, Literal, Self, get_args
 import numpy as np
 
 from gloves.fit import GloveFit
-from gloves.layout import MarkerLayout
+from gloves.layout import MarkerLayout, list_layouts, load_layout
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from track.bodies.body_file import AnyBody, load_bodies
@@ -73,7 +73,7 @@ class TrackerSetup:
         """
         user, is_measured = choose_user(glove, hands, size)
         templates = load_bodies(bodies)
-        network = labeler_of(user.layout, labeler)
+        network = labeler_of(_as_designed(user.layout), labeler)
         name = user.layout.name if glove is None or not isinstance(glove, str | Path) else str(glove)
         settings = {"glove": name, "user": user.notes or str(user), "labeler": _name_of(labeler, name)}
         return cls(user, is_measured, network, templates, config, settings)
@@ -212,6 +212,14 @@ def _in_glove(user: User, glove: AnyGlove | None, size: Size) -> User:
             f"but glove '{name}' has {', '.join(expected)}"
         )
     return user
+
+
+def _as_designed(worn: MarkerLayout) -> MarkerLayout:
+    """The shipped layout of a glove on whose hand markers have slipped, which its labeler was trained on."""
+    if worn.name not in list_layouts():
+        return worn
+    designed = load_layout(worn.name)
+    return designed if designed.names == worn.names else worn
 
 
 def _name_of(labeler: AnyLabeler, glove: str) -> str:
