@@ -37,6 +37,7 @@ import cv2
 import numpy as np
 import torch
 import trimesh
+from render.own_poses import PoseFile, load_poses
 
 from benchmarks.record import Figures, add_save, describe, save_figures
 from handsim.files.atomic import atomic_write
@@ -44,8 +45,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
 from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
-from render.frames.frame import RenderedFrame
-from render.own_poses import PoseFile, load_poses
+from render.frames import RenderedFrame
 from render.painting.figures import Appearance, sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
@@ -95,7 +95,7 @@ def draw_no_relief(count: int, seed: int) -> Any:
 
 
 def draw_no_shadows(count: int, seed: int) -> Any:
-    with patch("render.studio.studio.light_behind", return_value=None):
+    with patch("render.studio.light_behind", return_value=None):
         return EXAMPLE.draw(count, seed)
 
 
@@ -114,7 +114,7 @@ def draw_plain(count: int, seed: int) -> Any:
                 frames = range(step * shard, step * shard + step)
                 for frame in draw_shard(take, view, config, shard, frames):
                     picture = plain_picture(frame, renderer, rng)
-                    found.append(EXAMPLE.cut_out(picture, frame.hands[0].pixels, rng))
+                    found.append(EXAMPLE.cut_out(picture, frame.hands[0].keypoints, rng))
     return EXAMPLE.Pictures(*(np.stack(values) for values in zip(*found, strict=True)))
 
 

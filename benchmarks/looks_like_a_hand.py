@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from render.shown_take import ShownTake
 
 from gloves.fit import GlovedHand, attach
 from gloves.layout import load_layout
@@ -38,15 +39,13 @@ from handsim.space.camera import Camera, preset
 from poses.shapes.library import gesture
 from poses.shapes.validity import make_valid
 from render.formats.writer import open_writer
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.scenery.backgrounds import Background, BackgroundConfig
-from render.scenery.lights import Lighting
-from render.scenery.surroundings import expose_for, sample_surroundings
+from render.scenery.lights import Lighting, expose_for, sample_surroundings
 from render.sensors.exposure import ExposureConfig, sample_exposure
-from render.shown_take import ShownTake
 from render.skin.look import TONES
-from render.studio.studio import FrameChoices, Studio
+from render.studio import FrameChoices, Studio
 
 POSES: Final[dict[str, tuple[str, ...]]] = {
     "open": ("flat", "spread", "stretched", "four", "asl_b", "count_thumb_5"),

@@ -27,21 +27,21 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
+from render.shown_take import ShownTake, show_take
 
 from benchmarks.record import Figures, add_save, describe, save_figures
 from handsim.app.workers import run_jobs
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig
 from render.formats.writer import open_writer
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
 from render.session import draw_frames
-from render.shown_take import ShownTake, show_take
 from render.skin.look import ALL_TONES
-from render.studio.studio import Studio
+from render.studio import Studio
 from train.simulation.takes import simulate_take
 
 SECTIONS: Final = ("speed", "accuracy", "memory")

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from handsim import Camera
-from render import RenderConfig, RenderedFrame, SkinLook, ViewConfig, draw_frames, render_take
+from render import RenderConfig, RenderedFrame, SkinLook, ViewConfig, draw, render_take
 from track import track_capture
 from train import simulate_take
 
@@ -23,7 +23,7 @@ from train import simulate_take
 def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
     camera: Camera = frame.camera
     for hand, true in zip(frame.hands, truth.hands, strict=True):
-        off = np.linalg.norm(hand.pixels - camera.project(true.keypoints), axis=1)[hand.visible]
+        off = np.linalg.norm(hand.keypoints - camera.project(true.keypoints_world), axis=1)[hand.visible]
         shown = frame.ideal.depth[frame.ideal.depth > 0]
         print(
             f"{frame.key}, {hand.shape.side}: {hand.visible.sum()} of 21 keypoints visible, "
@@ -38,8 +38,8 @@ def main() -> None:
     config = RenderConfig(
         view=ViewConfig("orbit"), passes=("rgb", "depth"), tones=(tone - 5.0, tone + 5.0), every=40, seed=1
     )
-    drawn = draw_frames(tracked, config, [0, 40, 80])
-    for pair in zip(drawn, draw_frames(truth, config, [0, 40, 80]), strict=True):
+    drawn = draw(tracked, config=config, frames=[0, 40, 80])
+    for pair in zip(drawn, draw(truth, config=config, frames=[0, 40, 80]), strict=True):
         compare(*pair)
     with TemporaryDirectory() as folder:
         tracked.save(Path(folder) / "tracked.npz")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gloves import Capture
-from handsim import HandSimError
+from handsim import HandModel, HandSimError
 from train import Corruption
 
 PACKAGES = ("handsim", "poses", "gloves", "train")

@@ -22,11 +22,11 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.space.cameras import load_rig
 from poses.shapes.library import gesture
 from render.config import RenderConfig
+from render.drawing import draw
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
 from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
 from render.illustrations.scene import PosedHand
-from render.session import draw_frames
 from track.capture_tracking import track_capture
 from train.data.augmentation import Corruption, corrupt
 from train.data.shards import Dataset
@@ -250,7 +250,7 @@ def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
         joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, take.qpos[:, number])]
         errors.append(1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
     frames = np.linspace(0, tracked.num_frames - 1, _PICTURES).astype(int).tolist()
-    drawn = draw_frames(tracked, RenderConfig(seed=seed, vary="frame"), frames)
+    drawn = draw(tracked, config=RenderConfig(seed=seed, vary="frame"), frames=frames)
     write_png(out / "pictures.png", contact_sheet(list(drawn)))
     return Section(
         "Tracked hands, drawn",

@@ -15,7 +15,7 @@ from gloves.takes.archives import CutOffWarning
 from gloves.takes.take import Take, load_take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
-from render.shown_take import load_shown_take
+from render.subject import load_subject
 from track import recorder as module
 from track.bodies.rigid_body import RigidTemplate
 from track.recorder import Recorder, TakeRecorder
@@ -90,7 +90,7 @@ def test_a_recording_that_was_cut_off_is_read(tmp_path):
     with pytest.warns(CutOffWarning, match=r"take\.npz\.part: a recording that was cut off .* 24 frames"):
         assert_equal(load_take(recorder.part), in_memory())
     with pytest.warns(CutOffWarning):
-        assert load_shown_take(recorder.part).num_frames == FRAMES
+        assert load_subject(recorder.part, seed=0).take.num_frames == FRAMES
     with pytest.raises(CaptureError, match=r"take\.npz: no such file, but .*take\.npz\.part is a recording"):
         load_take(tmp_path / "new" / "take.npz")
     with pytest.raises(CaptureError, match="exists: a recording that was cut off"):

@@ -47,10 +47,11 @@ class HandTruth:
     """Shape and side of the hand."""
     qpos: Float[np.ndarray, "27"]
     """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
-    keypoints: Float[np.ndarray, "21 3"]
-    """Keypoints in the world [m]; see `handsim.hand.keypoints`."""
-    pixels: Float[np.ndarray, "21 2"]
-    """Pixels of the keypoints, inside the picture or not [px]; NaN where the lens cannot see them."""
+    keypoints: Float[np.ndarray, "21 2"]
+    """Keypoints in the picture or beside it [px], see `handsim.hand.keypoints`; NaN where the lens cannot see
+    them."""
+    keypoints_world: Float[np.ndarray, "21 3"]
+    """The same keypoints in the world [m]; `frame.camera.local` gives them in the camera's axes."""
     visible: Bool[np.ndarray, "21"]
     """Whether each keypoint is in the picture, with nothing in front of it but the flesh around it."""
     box: Float[np.ndarray, "4"]
@@ -93,6 +94,26 @@ class RenderedFrame:
     label_names: tuple[str, ...]
     choices: Mapping[str, Any]
     """Every random choice that made the pictures, as JSON."""
+
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "H W 3"] | None:
+        """The perfect color picture (sRGB); `noisy.rgb` is the simulated sensor's."""
+        return self.ideal.rgb
+
+    @property
+    def depth(self) -> Float32[np.ndarray, "H W"] | None:
+        """The true depth [m]; `noisy.depth` is the simulated sensor's."""
+        return self.ideal.depth
+
+    @property
+    def normals(self) -> Float32[np.ndarray, "H W 3"] | None:
+        """The true normals."""
+        return self.ideal.normals
+
+    @property
+    def ids(self) -> UInt8[np.ndarray, "H W"] | None:
+        """Number of the hand or body in each pixel, 0 for the background: `ideal.instances`."""
+        return self.ideal.instances
 
     @property
     def key(self) -> str:

@@ -8,11 +8,10 @@ from poses.shapes.library import gesture
 from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import shade_colors, skin_material
-from render.painting.opengl_lights import add_lights, frame_with_z
-from render.painting.opengl_painter import OPENGL_FROM_OPENCV, pyrender_material
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV, add_lights, frame_with_z, pyrender_material
 from render.scenery.lights import STUDIO, Lamp, Lighting
 from render.skin.look import SkinLook
-from render.skin.mesh import SkinMesh
+from render.skin.mesh import PosableSkin
 from render.skin.texture import skin_texture
 
 
@@ -28,7 +27,7 @@ def draw(lighting: Lighting) -> np.ndarray:
     """A flat hand's back, (200, 200, 4)."""
     pyrender = load_pyrender()
     model = HandModel.named("M")
-    skin = SkinMesh(model).posed(join_qpos(gesture("flat")[None])[0])
+    skin = PosableSkin(model).posed(join_qpos(gesture("flat")[None])[0])
     view = view_along(np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), skin.vertices, (200, 200))
     scene = pyrender.Scene(bg_color=[0.0] * 4)
     primitive = pyrender.Primitive(

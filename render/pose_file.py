@@ -1,4 +1,4 @@
-"""`PoseFile`, a user's own poses to be drawn: an `.npz` of qpos, and whose hands they are."""
+"""Own poses: qpos in an array or an `.npz`, checked, and whose hands they are."""
 
 from __future__ import annotations
 
@@ -6,108 +6,97 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from gloves.fit import GlovedHand, attach
-from gloves.layout import load_layout
-from gloves.takes.take import label_names
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular
-from handsim.hand.model import HandModel
+from handsim.hand.model import join_qpos
 from handsim.hand.records import HAND_DTYPE, unpack_hand
-from handsim.hand.shape import HandShape, named_shape, shape_from_measures
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES, Side
+from handsim.hand.shape import HandShape, shape_from_measures
+from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes.couplings import HIGH, LOW
-from render.shown_take import Cast, ShownTake
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
+MOST_PEOPLE: Final = 1_000_000
 _MOST_FRAMES: Final = 10_000_000
-_MOST_PEOPLE: Final = 1_000_000
 _FARTHEST: Final = 50.0  # [m] of a wrist from the origin
 _BEYOND: Final = np.deg2rad(10.0)  # out of a joint's range that is told
-_SECOND: Final = 1.0  # [s] between frames without times, which are poses without a motion
-_SHAPES: Final = 3  # spawn key of people's shapes and of who is in which frame; `render.session` has others
 _DAMAGE: Final = (
     ValueError, KeyError, TypeError, OverflowError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error
 )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class PoseFile:
-    """A file of poses (T, 27) [m, rad], and what the file does not say of them.
+class OwnPoses(NamedTuple):
+    """Poses that a user made: T frames, H hands."""
 
-    Raises:
-        ArgumentError: A side is unknown or comes twice, or `people` is less than 1.
-    """
-
-    path: Path
-    sides: tuple[Side, ...] = ("right",)
-    """Which hands the poses are of, in the file's order."""
-    people: int | None = None
-    """People whom the frames are distributed over at random; one for each shard when not given. Not for files
-    that say who is in each frame."""
-    glove: str = "dense19"
-    """Marker layout on the hands, where they wear gloves."""
-
-    def __post_init__(self) -> None:
-        for side in self.sides:
-            if side not in SIDES:
-                raise ArgumentError(choices(side, SIDES, noun="hand"))
-        if not 1 <= len(set(self.sides)) == len(self.sides):
-            raise ArgumentError(f"hands are {' '.join(self.sides) or 'none'}, expected right, left or both")
-        if self.people is not None and not 1 <= self.people <= _MOST_PEOPLE:
-            raise ArgumentError(f"people is {self.people}, expected 1 to {_MOST_PEOPLE}")
+    qpos: Float[np.ndarray, "T H 27"]
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN where a hand is not there."""
+    times: Float[np.ndarray, "T"] | None = None
+    """Increasing [s]; None for poses that are no motion."""
+    person: Int[np.ndarray, "T"] | None = None
+    """Who is in each frame; None where the poses do not say."""
+    shapes: tuple[HandShape, ...] | None = None
+    """Hands of the people; None where the poses do not say."""
 
 
-def load_poses(file: PoseFile, *, seed: int = 0) -> ShownTake:
-    """Read a file of poses, to be drawn like a take.
+def read_pose_file(path: Path, num_hands: int) -> OwnPoses:
+    """Poses of an `.npz` that `numpy.savez` wrote; docs/rendering.md has its arrays.
 
     Args:
-        file: The file, and whose hands it holds.
-        seed: Seed of the people who are not in the file.
-
-    Returns:
-        Poses (T, 27) of each hand [m, rad]; `ShownTake.cast` says who is in each frame.
+        path: The file; nothing in it is unpickled.
+        num_hands: Number of hands in each frame, H.
 
     Raises:
-        CaptureError: The file cannot be read, an array has another shape or impossible numbers, or there is
-            no hand in any frame; nothing is unpickled.
-        LayoutError: The glove is unknown or does not fit.
+        CaptureError: It cannot be read, an array has another shape or impossible numbers, or there is no hand
+            in any frame.
     """
-    arrays = _arrays(file.path)
+    arrays = _arrays(path)
     try:
-        qpos = _qpos(arrays, len(file.sides))
+        qpos = _stored_qpos(arrays, num_hands)
         times = _times(arrays, len(qpos))
-        cast = _cast(arrays, file, len(qpos), seed)
+        shapes = _stored_shapes(arrays)
+        person = _person(arrays, len(qpos), shapes)
     except HandSimError as error:
-        raise CaptureError(f"{file.path}: {error}") from error
-    _tell_beyond(file.path, qpos)
-    layout = load_layout(file.glove)
-    model = HandModel(named_shape("M"))
-    hands = tuple(
-        GlovedHand(attach(layout, model).with_side(side), qpos[:, number])
-        for number, side in enumerate(file.sides)
-    )
-    rate = _SECOND if times is None else 1.0 / max(float(np.median(np.diff(times))), 1e-6)
-    return ShownTake(
-        rate=rate,
-        times=_SECOND * np.arange(len(qpos)) if times is None else times,
-        hands=hands,
-        bodies=(),
-        points=np.empty((len(qpos), 0, 3)),
-        labels=np.empty((len(qpos), 0), dtype=np.int64),
-        label_names=label_names([hand.fit for hand in hands], ()),
-        cast=cast,
-        is_motion=times is not None,
-    )
+        raise CaptureError(f"{path}: {error}") from error
+    _tell_beyond(str(path), qpos)
+    return OwnPoses(qpos, times, person, shapes)
+
+
+def check_poses(
+    qpos: NDArray[Any],
+    num_hands: int,
+    *,
+    times: NDArray[Any] | None = None,
+    person: NDArray[Any] | None = None,
+    shapes: tuple[HandShape, ...] | None = None,
+) -> OwnPoses:
+    """A user's arrays as poses.
+
+    Args:
+        qpos: (T, 27) or, without wrists, joint angles (T, 20) of one hand; (T, H, 27) of several [m, rad].
+        num_hands: Number of hands, H.
+        times: Of the frames (T,), increasing [s]; poses are no motion without them.
+        person: Who is in each frame (T,).
+        shapes: Hands of the people.
+
+    Raises:
+        ArgumentError: An array has another shape or impossible numbers, or there is no hand in any frame.
+    """
+    arrays = {"qpos": np.asarray(qpos)}
+    if num_hands == 1 and arrays["qpos"].ndim == 2 and arrays["qpos"].shape[1] == NUM_JOINTS:
+        arrays["qpos"] = join_qpos(arrays["qpos"])
+    arrays |= {} if times is None else {"times": np.asarray(times)}
+    arrays |= {} if person is None else {"person": np.asarray(person)}
+    whole = _stored_qpos(arrays, num_hands)
+    _tell_beyond("poses", whole)
+    return OwnPoses(whole, _times(arrays, len(whole)), _person(arrays, len(whole), shapes), shapes)
 
 
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -124,7 +113,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.ndarray, "T H 27"]:
+def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.ndarray, "T H 27"]:
     if ("qpos" in arrays) == ("angles" in arrays) or ("angles" in arrays) != ("T_world_wrist" in arrays):
         raise ArgumentError(
             f"it holds {', '.join(arrays) or 'nothing'}, expected qpos, or angles and T_world_wrist"
@@ -159,7 +148,7 @@ def _floats(arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, ...
     if shape[0] == 1 and values.ndim == len(shape):
         values = values[:, None]
     if values.shape[1:] != shape or not 1 <= len(values) <= _MOST_FRAMES:
-        hands = "a hand" if shape[0] == 1 else f"{shape[0]} hands (--hands names them)"
+        hands = "a hand" if shape[0] == 1 else f"{shape[0]} hands"
         expected = ", ".join(map(str, shape))
         raise ArgumentError(f"{name} has shape {given.shape}, expected (T, {expected}) for {hands}")
     if np.isinf(values).any():
@@ -205,12 +194,12 @@ def _check_bounds(qpos: NDArray[np.float64]) -> None:
         )
 
 
-def _tell_beyond(path: Path, qpos: NDArray[np.float64]) -> None:
+def _tell_beyond(name: str, qpos: NDArray[np.float64]) -> None:
     angles = qpos[..., 7:]
     beyond = ((angles < LOW - _BEYOND) | (angles > HIGH + _BEYOND)).any(axis=(1, 2))
     if beyond.any():
         told = (
-            f"{path}: in {beyond.sum()} of {len(beyond)} frames (the first: {beyond.argmax()}) a joint is "
+            f"{name}: in {beyond.sum()} of {len(beyond)} frames (the first: {beyond.argmax()}) a joint is "
             "more than 10 degrees beyond its range; they are drawn as they are"
         )
         warnings.warn(told, HandSimWarning, stacklevel=3)
@@ -230,32 +219,26 @@ def _times(arrays: Mapping[str, NDArray[Any]], frames: int) -> NDArray[np.float6
     return times if len(times) > 1 else None
 
 
-def _cast(arrays: Mapping[str, NDArray[Any]], file: PoseFile, frames: int, seed: int) -> Cast:
-    shapes = _stored_shapes(arrays)
-    given = "person" in arrays or (shapes is not None and len(shapes) > 1)
-    if given and file.people is not None:
-        raise ArgumentError("the file says who is in each frame; leave out --people")
-    if shapes is not None and len(shapes) == 1 and file.people is not None:
-        raise ArgumentError("the file has the hand of one person; leave out --people")
+def _person(
+    arrays: Mapping[str, NDArray[Any]], frames: int, shapes: tuple[HandShape, ...] | None
+) -> Int[np.ndarray, "T"] | None:
+    """Who is in each frame: told, or a person a frame, or one for all; None where nothing tells."""
     if "person" in arrays:
-        return Cast(seed, _stored_people(arrays["person"], frames, shapes), shapes)
+        return _stored_people(arrays["person"], frames, shapes)
     if shapes is None:
-        if file.people is None:
-            return Cast(seed)
-        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SHAPES,)))
-        return Cast(seed, rng.integers(file.people, size=frames))
+        return None
     if len(shapes) not in (1, frames):
         raise ArgumentError(
             f"it holds {len(shapes)} hands and {frames} frames, expected one hand, one for each frame, or "
             "the array person that says which"
         )
-    return Cast(seed, np.arange(frames) if len(shapes) > 1 else np.zeros(frames, dtype=np.int64), shapes)
+    return np.arange(frames) if len(shapes) > 1 else np.zeros(frames, dtype=np.int64)
 
 
 def _stored_people(
     person: NDArray[Any], frames: int, shapes: tuple[HandShape, ...] | None
 ) -> Int[np.ndarray, "T"]:
-    most = _MOST_PEOPLE if shapes is None else len(shapes)
+    most = MOST_PEOPLE if shapes is None else len(shapes)
     if person.dtype.kind not in "iu" or person.shape != (frames,):
         raise ArgumentError(
             f"person is {person.dtype} of shape {person.shape}, expected whole numbers ({frames},)"
@@ -270,7 +253,7 @@ def _stored_shapes(arrays: Mapping[str, NDArray[Any]]) -> tuple[HandShape, ...] 
         raise ArgumentError("it holds hands and hand_size, expected at most one of them")
     if "hands" in arrays:
         hands = np.atleast_1d(arrays["hands"])
-        if hands.dtype != HAND_DTYPE or hands.ndim != 1 or not 1 <= len(hands) <= _MOST_PEOPLE:
+        if hands.dtype != HAND_DTYPE or hands.ndim != 1 or not 1 <= len(hands) <= MOST_PEOPLE:
             raise ArgumentError("hands are not records of handsim.hand.records.HAND_DTYPE")
         return tuple(unpack_hand(hand) for hand in hands)
     if "hand_size" not in arrays:

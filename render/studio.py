@@ -1,4 +1,4 @@
-"""`Studio`, which draws single frames of a take for one camera, with their ground truth."""
+"""`Studio`, which draws single moments of a take for one camera, with their ground truth."""
 
 from __future__ import annotations
 
@@ -13,25 +13,26 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
-from gloves.fit import GlovedHand
+from gloves.fit import GloveFit
+from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
 from handsim.space.camera import Camera
+from handsim.space.transforms import pose_matrices
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
-from render.frames.frame import PASSES, BodyTruth, Pictures, RenderedFrame
-from render.painting.cast_shadow import light_behind
+from render.frames import PASSES, BodyTruth, Pictures, RenderedFrame
+from render.hand_truth import hand_truth
 from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
 from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
 from render.painting.shading import GAMMA
+from render.painting.shadows import light_behind
 from render.scenery.backgrounds import Background, draw_background
 from render.scenery.enclosures import Enclosure, draw_surroundings
 from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
 from render.sensors.exposure import Exposure, expose, linear_of
 from render.sensors.shutter import Shutter, combine, shutter_times
-from render.shown_take import ShownTake
 from render.skin.look import SkinLook
-from render.studio.hand_truth import hand_truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,61 +53,114 @@ class FrameChoices:
     """The box whose walls have the background, for several cameras; None: a picture without depth."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """One frame of a take, and the time around it, which shutters blur."""
+
+    take: Take
+    frame: int
+    person: Int[np.ndarray, "T"] | None = None
+    """Who is in each frame, where that changes: the time around a frame ends where another person comes."""
+
+    def hand(self, number: int, shift: float = 0.0) -> Float[np.ndarray, "27"] | None:
+        """Pose of a hand `shift` seconds after the frame; None where the frame has none."""
+        rows = self.take.qpos[:, number]
+        if not np.isfinite(rows[self.frame]).all():
+            return None
+        (before, after), share = self._around(rows, shift)
+        if before[3:7] @ after[3:7] < 0.0:
+            after = np.concatenate([after[:3], -after[3:7], after[7:]])
+        pose: NDArray[np.float64] = before + share * (after - before)
+        pose[3:7] /= np.linalg.norm(pose[3:7])
+        return pose
+
+    def body(self, number: int, shift: float = 0.0) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of a rigid body `shift` seconds after the frame; None where the frame has none."""
+        rows = self.take.body_poses[:, number]
+        if not np.isfinite(rows[self.frame]).all():
+            return None
+        poses, share = self._around(rows, shift)
+        before, after = pose_matrices(poses)
+        T_world_body: NDArray[np.float64] = before + share * (after - before)
+        left, _, right = np.linalg.svd(T_world_body[:3, :3])
+        T_world_body[:3, :3] = left @ right
+        return T_world_body
+
+    def _around(self, rows: Float[np.ndarray, "T ..."], shift: float) -> tuple[NDArray[np.float64], float]:
+        """The rows before and after a time, and the share of the way between them.
+
+        Rows without numbers, and those of others than the frame's person, count as the frame's own.
+        """
+        frames = shift * self.take.rate
+        step = int(np.floor(frames))
+        indices = np.clip([self.frame + step, self.frame + step + 1], 0, len(rows) - 1)
+        others = [self.person is not None and self.person[i] != self.person[self.frame] for i in indices]
+        kept = [
+            self.frame if other or not np.isfinite(rows[index]).all() else index
+            for index, other in zip(indices, others, strict=True)
+        ]
+        return rows[kept], frames - step
+
+
 class Studio:
-    """Draws frames of one take with the same people.
+    """Draws moments of the same people and rigid bodies.
 
     Args:
-        take: The take.
-        people: Appearance of each of its hands.
-        body_colors: Color of each of its rigid bodies, sRGB in [0, 1].
+        hands: The hands, in the order of the takes.
+        people: Appearance of each hand.
+        bodies: The rigid bodies, in the order of the takes.
+        body_colors: Color of each of them, sRGB in [0, 1].
         passes: Some of `PASSES`.
         painter: What paints colors.
     """
 
     def __init__(
         self,
-        take: ShownTake,
+        hands: Sequence[GloveFit],
         people: Sequence[Appearance],
-        body_colors: Sequence[tuple[float, float, float]],
+        bodies: Sequence[RigidBody] = (),
+        body_colors: Sequence[tuple[float, float, float]] = (),
         passes: Sequence[str] = PASSES,
         painter: Painter = "compiled",
     ) -> None:
-        self.take, self.passes, self.painter = take, tuple(passes), painter
+        self.passes, self.painter = tuple(passes), painter
         self._people = tuple(people)
-        first = np.cumsum([0, *(len(hand.fit.attachment.points) for hand in take.hands)])
+        self._looks = [dataclasses.asdict(look) for look in people]
+        first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
         self._hands = [
-            HandFigure(hand.fit, look, first_marker=int(number))
-            for hand, look, number in zip(take.hands, people, first, strict=False)
+            HandFigure(fit, look, first_marker=int(number))
+            for fit, look, number in zip(hands, people, first, strict=False)
         ]
-        self._bodies = [BodyFigure(body, color) for body, color in zip(take.bodies, body_colors, strict=True)]
+        self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, body_colors, strict=True)]
         self._colors = tuple(body_colors)
+        self._posed: tuple[Moment, list[Drawn]] | None = None  # the last moment's, seen by several cameras
 
     @property
     def skin(self) -> SkinLook | None:
         """The people's skin; None where gloves hide it."""
         return self._people[0].skin if self._people[0].glove is None else None
 
-    def photograph(self, frame: int, camera: Camera, choices: FrameChoices) -> RenderedFrame:
-        """Draw one frame.
+    def photograph(self, moment: Moment, camera: Camera, choices: FrameChoices) -> RenderedFrame:
+        """Draw one moment.
 
         Args:
-            frame: Number of the frame in the take.
+            moment: Poses of the studio's hands and bodies.
             camera: The camera.
             choices: All other choices.
 
         Raises:
             HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
         """
-        rng = np.random.default_rng(choices.seed)
-        drawn = self._drawn(frame, 0.0)
+        take, frame, rng = moment.take, moment.frame, np.random.default_rng(choices.seed)
+        drawn = self._still(moment)
         _check_outside(camera, drawn, frame)
-        present = [n for n, hand in enumerate(self.take.hands) if self._pose(hand, frame) is not None]
+        present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
         noisy = "depth" in self.passes and choices.depth_noise is not None
         truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
         rgb = noisy_rgb = noisy_depth = None
         if "rgb" in self.passes:
             rgb = self._colors_of(camera, drawn, choices)
-            noisy_rgb = self._exposed(frame, camera, rgb, choices, rng)
+            noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
         seen = truth
         if choices.enclosure is not None:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
@@ -116,57 +170,53 @@ class Studio:
                 seen.depth, seen.normals, sensor, camera=camera, reflectance=light, rng=rng
             )
         hands = tuple(
-            hand_truth(self._hands[number], self.take.hands[number].qpos[frame], index, camera, truth)
+            hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth)
             for index, number in enumerate(present)
         )
         bodies = tuple(
-            BodyTruth(body.name, body.T_world_body[frame])
-            for body in self.take.bodies
-            if np.isfinite(body.T_world_body[frame]).all()
+            BodyTruth(body.name, T_world_body)
+            for body, T_world_body in zip(take.bodies, pose_matrices(take.body_poses[frame]), strict=True)
+            if np.isfinite(T_world_body).all()
         )
-        known = np.isfinite(self.take.points[frame, :, 0])
+        known = np.isfinite(take.points[frame, :, 0])
         return RenderedFrame(
             number=frame,
-            time=float(self.take.times[frame]),
+            time=float(take.times[frame]),
             camera=camera,
             hands=hands,
             bodies=bodies,
             ideal=self._requested(seen, rgb),
             noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
-            points=self.take.points[frame, known],
-            labels=self.take.labels[frame, known],
-            label_names=self.take.label_names,
+            points=take.points[frame, known],
+            labels=take.labels[frame, known],
+            label_names=take.label_names,
             choices=self._record(choices),
         )
 
-    def is_clear(self, frame: int, cameras: Sequence[Camera]) -> bool:
-        """Whether all cameras are outside of hands and objects in a frame, so that it can be drawn."""
-        drawn = self._drawn(frame, 0.0)
+    def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
+        """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
+        drawn = self._still(moment)
         return all(_clearance(camera, drawn) >= 2.0 * NEAR for camera in cameras)
 
-    def _pose(self, hand: GlovedHand, frame: int, shift: float = 0.0) -> NDArray[np.float64] | None:
-        """Qpos (27,) of a hand `shift` seconds after a frame; None where the hand has no pose."""
-        people = None if self.take.cast is None else self.take.cast.person
-        pose = _between(hand.qpos, frame, shift * self.take.rate, people)
-        if pose is None:
-            return None
-        pose[3:7] /= np.linalg.norm(pose[3:7])
-        return pose
+    def _still(self, moment: Moment) -> list[Drawn]:
+        """Surfaces of a moment."""
+        if self._posed is None or self._posed[0] is not moment:
+            self._posed = moment, self._drawn(moment, 0.0)
+        return self._posed[1]
 
-    def _drawn(self, frame: int, shift: float) -> list[Drawn]:
+    def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
+        """Surfaces of the hands and bodies that are there, `shift` seconds later."""
         drawn: list[Drawn] = []
         number = 0
-        for hand, figure in zip(self.take.hands, self._hands, strict=False):
-            pose = self._pose(hand, frame, shift)
+        for index, hand in enumerate(self._hands):
+            pose = moment.hand(index, shift)
             if pose is not None:
-                drawn += figure.drawn(pose, number)
+                drawn += hand.drawn(pose, number)
                 number += 1
-        for body in self._bodies:
-            T_world_body = _between(body.body.T_world_body, frame, shift * self.take.rate)
+        for index, body in enumerate(self._bodies):
+            T_world_body = moment.body(index, shift)
             if T_world_body is not None:
                 number += 1
-                left, _, right = np.linalg.svd(T_world_body[:3, :3])
-                T_world_body[:3, :3] = left @ right
                 drawn += body.drawn(T_world_body, number)
         return drawn
 
@@ -231,7 +281,7 @@ class Studio:
 
     def _exposed(
         self,
-        frame: int,
+        moment: Moment,
         camera: Camera,
         rgb: NDArray[np.uint8],
         choices: FrameChoices,
@@ -245,7 +295,7 @@ class Studio:
         else:
             one = choices.shutter
             times, weights = shutter_times(one.exposure, one.readout, one.sub_frames, camera.size[1])
-            moments = (self._colors_of(camera, self._drawn(frame, time), choices) for time in times)
+            moments = (self._colors_of(camera, self._drawn(moment, time), choices) for time in times)
             light = combine(moments, weights)
         return expose(light, choices.exposure or Exposure(), rng=rng)
 
@@ -261,38 +311,12 @@ class Studio:
         )
 
     def _record(self, choices: FrameChoices) -> dict[str, Any]:
-        people = [dataclasses.asdict(look) for look in self._people]
         noise = choices.depth_noise
         kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
         chosen = dataclasses.asdict(choices)
         if choices.enclosure is None:
             del chosen["enclosure"]
-        return {"people": people, "body_colors": self._colors, **kind, **chosen}
-
-
-def _between(
-    rows: Float[np.ndarray, "T ..."],
-    frame: int,
-    shift: float,
-    people: Int[np.ndarray, "T"] | None = None,
-) -> NDArray[np.float64] | None:
-    """The row `shift` frames after a frame, interpolated linearly; None where the frame has none.
-
-    Rows without numbers, and those of others than the frame's person, count as the frame's own.
-    """
-    if not np.isfinite(rows[frame]).all():
-        return None
-    step = int(np.floor(shift))
-    indices = np.clip([frame + step, frame + step + 1], 0, len(rows) - 1)
-    others = [people is not None and people[index] != people[frame] for index in indices]
-    before, after = (
-        rows[frame] if other or not np.isfinite(rows[index]).all() else rows[index]
-        for index, other in zip(indices, others, strict=True)
-    )
-    if before.shape == (27,) and before[3:7] @ after[3:7] < 0.0:
-        after = np.concatenate([after[:3], -after[3:7], after[7:]])
-    mixed: NDArray[np.float64] = before + (shift - step) * (after - before)
-    return mixed
+        return {"people": self._looks, "body_colors": self._colors, **kind, **chosen}
 
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:

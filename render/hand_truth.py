@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera
-from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures
+from render.frames import PARTS_A_HAND, HandTruth, Pictures
 from render.painting.figures import HandFigure
 from render.skin.forearm import FOREARM
 
@@ -39,8 +39,8 @@ def hand_truth(
     return HandTruth(
         shape=model.shape,
         qpos=qpos,
-        keypoints=keypoints,
-        pixels=pixels,
+        keypoints=pixels,
+        keypoints_world=keypoints,
         visible=_visible(keypoints, pixels, figure.flesh, number, camera, pictures),
         box=_box(pictures.parts, number),
         vertices=model.skin(qpos[None])[0].astype(np.float32),

@@ -13,11 +13,11 @@ from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS, PALM, bones_of
 from handsim.space.camera import Camera, look_at, pinhole
 from poses import sample_poses
-from render.frames.frame import Pictures
+from render.frames import Pictures
+from render.hand_truth import hand_truth
 from render.painting.figures import HandFigure, sample_people
 from render.painting.rasterizer import Triangles, join, rasterize
 from render.skin.look import ALL_TONES
-from render.studio.hand_truth import hand_truth
 
 pytest.importorskip("embreex")
 POSES = 80
@@ -68,9 +68,9 @@ def test_keypoints_are_seen_where_rays_say_so(figure):
         surface, camera, pictures = photographed(figure, qpos, rng)
         truth = hand_truth(figure, qpos, 0, camera, pictures)
         eye = camera.T_world_camera[:3, 3]
-        away = np.linalg.norm(truth.keypoints - eye, axis=1)
+        away = np.linalg.norm(truth.keypoints_world - eye, axis=1)
         mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-        rays = (truth.keypoints - eye) / away[:, None]
+        rays = (truth.keypoints_world - eye) / away[:, None]
         expected = away - cast(mesh, np.tile(eye, (21, 1)), rays) <= SLANTING * flesh
         wrong += truth.visible != expected
         seen += expected

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy.ndimage import binary_dilation
 
 from handsim.space.camera import pinhole
-from render.painting.cast_shadow import light_behind
 from render.painting.figures import Drawn
 from render.painting.materials import Material
 from render.painting.rasterizer import Triangles
-from render.scenery.backdrops import SHARE, Backdrop, sample_backdrop
+from render.painting.shadows import light_behind
+from render.scenery.backgrounds import SHARE, Backdrop, sample_backdrop
 from render.scenery.lights import Lamp, Lighting
 
 CAMERA = pinhole("small", (160, 120), 150.0)

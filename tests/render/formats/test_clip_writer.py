@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from handsim.space.camera import Camera, look_at, pinhole
 from handsim.space.transforms import quaternion_matrix
 from render.formats.annotations.common import to_json
-from render.formats.annotations.hand_crops import crop_camera, crops_record
+from render.formats.clip_writer import crop_camera, crops_record
 
 PIXELS = 128
 
@@ -35,7 +35,7 @@ def test_each_seen_hand_has_a_crop_in_each_stream(make_frame, camera: Camera) ->
     for frame in frames:
         for hand in frame.hands:
             entry = record[hand.shape.side][frame.camera.name]
-            pixels = pixels_in_crop(entry, hand.keypoints)
+            pixels = pixels_in_crop(entry, hand.keypoints_world)
             low, high = pixels.min(axis=0), pixels.max(axis=0)
             np.testing.assert_allclose((low + high) / 2, (PIXELS - 1) / 2, atol=0.01)  # in the middle
             np.testing.assert_allclose((high - low).max(), 0.8 * PIXELS, atol=0.01)  # with room around

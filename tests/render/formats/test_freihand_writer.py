@@ -38,8 +38,8 @@ def test_a_freihand_loader_reads_it(make_frame, tmp_path: Path) -> None:
     for number, (frame, place) in enumerate(entries):
         hand = frame.hands[place]
         K, xyz = np.array(lists["K"][number]), np.array(lists["xyz"][number])
-        np.testing.assert_allclose(project(xyz, K), hand.pixels - 0.5, atol=1e-4)
-        bone = np.linalg.norm(hand.keypoints[10] - hand.keypoints[9])
+        np.testing.assert_allclose(project(xyz, K), hand.keypoints - 0.5, atol=1e-4)
+        bone = np.linalg.norm(hand.keypoints_world[10] - hand.keypoints_world[9])
         assert lists["scale"][number] == pytest.approx(bone)
         assert lists["info"][number]["side"] == hand.shape.side
         np.testing.assert_allclose(lists["verts"][number], frame.camera.local(hand.vertices), atol=1e-6)

@@ -19,9 +19,10 @@ from handsim.space.transforms import quaternion_matrix, random_quaternions
 from poses import sample_poses
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
-from render.own_poses import PoseFile, load_poses
+from render.drawing import Drawing
 from render.sensors.shutter import ShutterConfig
-from render.session import draw_frames, render_take
+from render.session import render_take
+from render.subject import PoseFile, load_subject
 
 K = np.array([[300.0, 0, 161.5], [0, 302.0, 118.25], [0, 0, 1]])
 D = np.array([[-0.2, 0.06, 0.001, -0.0015, 0.01]])
@@ -46,6 +47,14 @@ def cameras(tmp_path):
     file.write("image_height", 240)
     file.release()
     return tmp_path / "stereo.yml"
+
+
+def load_poses(file, seed=0):
+    return load_subject(file, seed=seed)
+
+
+def drawn(subject, config, frames, shard=0):
+    return Drawing(subject, config).frames(shard, enumerate(frames))
 
 
 def saved(folder, **arrays):
@@ -98,7 +107,7 @@ def test_angles_with_wrist_transforms_are_the_same(tmp_path, qpos):
     wrists = np.tile(np.eye(4), (4, 1, 1))
     wrists[:, :3, :3], wrists[:, :3, 3] = quaternion_matrix(qpos[:, 3:7]), qpos[:, :3]
     path = saved(tmp_path, angles=qpos[:, 7:], T_world_wrist=wrists)
-    read = load_poses(PoseFile(path)).hands[0].qpos
+    read = load_poses(PoseFile(path)).take.qpos[:, 0]
     signs = np.sign((read[:, 3:7] * qpos[:, 3:7]).sum(axis=1, keepdims=True))
     read[:, 3:7] *= signs
     np.testing.assert_allclose(read, qpos, atol=1e-12)
@@ -111,16 +120,16 @@ def test_two_hands_one_of_them_absent(tmp_path, qpos):
     path = saved(tmp_path, qpos=both)
     take = load_poses(PoseFile(path, ("left", "right")))
     config = RenderConfig(passes=("ids",), depth_sensor=None, background=RenderConfig().background)
-    frames = list(draw_frames(take, config, [0, 1]))
+    frames = list(drawn(take, config, [0, 1]))
     assert [[hand.shape.side for hand in frame.hands] for frame in frames] == [["left", "right"], ["right"]]
 
 
 def lengths(take, frames, config, shard=0):
-    return [frame.hands[0].shape.length for frame in draw_frames(take, config, frames, shard=shard)]
+    return [frame.hands[0].shape.length for frame in drawn(take, config, frames, shard)]
 
 
 def skins(take, frames, config):
-    return [frame.choices["people"][0]["skin"] for frame in draw_frames(take, config, frames)]
+    return [frame.choices["people"][0]["skin"] for frame in drawn(take, config, frames)]
 
 
 def test_people_of_frames(tmp_path, qpos):
@@ -136,9 +145,9 @@ def test_people_of_frames(tmp_path, qpos):
     own = load_poses(PoseFile(saved(tmp_path, qpos=qpos, hand_size=np.c_[each, 0.45 * each])))
     np.testing.assert_allclose(lengths(own, frames, config), each)
     path = saved(tmp_path, qpos=qpos)
-    drawn = load_poses(PoseFile(path, people=2), seed=1)
-    assert len(set(lengths(drawn, frames, config))) == 2
-    assert lengths(drawn, frames, config) == lengths(
+    shared = load_poses(PoseFile(path, people=2), seed=1)
+    assert len(set(lengths(shared, frames, config))) == 2
+    assert lengths(shared, frames, config) == lengths(
         load_poses(PoseFile(path, people=2), seed=1), frames, config
     )
     alone = load_poses(PoseFile(path))
@@ -151,7 +160,7 @@ def test_blur_keeps_to_one_person(tmp_path, qpos):
     times = np.arange(4) / 60.0
     config = RenderConfig(shutter=ShutterConfig(), passes=("rgb",), depth_sensor=None)
     path = saved(tmp_path, qpos=qpos, times=times, person=[0, 0, 1, 1])
-    frame = next(draw_frames(load_poses(PoseFile(path)), config, [1]))
+    frame = next(drawn(load_poses(PoseFile(path)), config, [1]))
     assert frame.noisy.rgb is not None and frame.time == times[1]
     with pytest.raises(HandSimError, match="poses without times have no motion to blur"):
         render_take(PoseFile(saved(tmp_path, qpos=qpos)), tmp_path / "out", ("png",), config)
