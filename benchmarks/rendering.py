@@ -90,7 +90,7 @@ def rate(job: Callable[[], object], count: int) -> float:
     return count / float(np.median(seconds))
 
 
-def rate_run_jobs(job: Callable[[int], int], cores: int, frames: int) -> float:
+def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> float:
     """Pictures per second while all processes are at work: from the second shard of each on."""
     ends = []
     for _ in run_jobs(job, range(1 + 6 * cores), cores):
@@ -141,7 +141,7 @@ def speed(frames: int) -> Figures:
         jobs = {name: functools.partial(draw, config, frames) for name, config in KINDS.items()}
         jobs["- written as WebDataset"] = functools.partial(draw_and_write, COLORS, Path(folder), frames)
         for name, job in jobs.items():
-            rates = rate(lambda job=job: job(0), frames), rate_run_jobs(job, cores, frames)
+            rates = rate(lambda job=job: job(0), frames), rate_in_processes(job, cores, frames)
             print(f"  {name:32s} {rates[0]:8.1f} {rates[1]:8.1f}")
             key = name.strip("- ").split()[-1 if name.startswith("- painted") else 0].strip(",").lower()
             figures[key] = (f"pictures per second, one process | {cores}: {name}", rates)
