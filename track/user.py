@@ -50,7 +50,7 @@ class User(Sequence[GloveFit]):
     """
 
     hands: tuple[GloveFit, ...]
-    """One hand or two, all with the same markers."""
+    """One hand or two, all with the same markers; lengths in [m], angles in [rad]."""
     notes: str = ""
     """Where they are from, in words."""
     calibrations: tuple[Calibration, ...] = ()
@@ -75,7 +75,7 @@ class User(Sequence[GloveFit]):
         return tuple(hand.side for hand in self.hands)
 
     def __str__(self) -> str:
-        """Length and breadth of the hands, which are those of one shape unless they were calibrated."""
+        """Length and breadth of the hands [mm], one pair where both are alike."""
         sizes = [f"{1e3 * one.shape.length:.0f} x {1e3 * one.shape.breadth:.0f} mm" for one in self.hands]
         return " and ".join(dict.fromkeys(sizes))
 
