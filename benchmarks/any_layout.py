@@ -26,9 +26,10 @@ from train.any_layout.skin_bank import sample_places
 from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
-from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.evaluate import evaluate_labeler
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler, shipped_labelers
+from train.labelers.storage import shipped_labelers
 
 CAPTURE_FRAMES = 3000
 

@@ -34,8 +34,8 @@ from handsim.app.workers import run_jobs
 from render.config import RenderConfig
 from render.session import render_take
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.generation import make_dataset
+from train.simulation.takes import simulate_take
 
 WAIT = 60.0  # [s] for a scheduler or a worker to come
 
@@ -104,7 +104,7 @@ def main() -> None:
     print(describe("dask", "distributed"))
     with tempfile.TemporaryDirectory() as name, running(Path(name), options.workers) as dask:
         folder = Path(name)
-        take = simulate_take(TakeConfig(kind="hand-hand", num_frames=options.pictures))
+        take = simulate_take(kind="hand-hand", num_frames=options.pictures)
         take.save(folder / "take.npz")
         kinds: dict[str, Make] = {
             f"{options.frames} training frames": functools.partial(frames, options.frames),
@@ -128,7 +128,7 @@ def running(folder: Path, workers: int) -> Iterator[DaskProcesses]:
 
 
 def frames(count: int, out: Path, workers: int | Executor) -> None:
-    generate_dataset(DatasetConfig(num_frames=count, seed=3), out, workers=workers)
+    make_dataset(DatasetConfig(num_frames=count, seed=3), out, workers=workers)
 
 
 def pictures(take: Path, out: Path, workers: int | Executor) -> None:

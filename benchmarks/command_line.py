@@ -6,9 +6,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import tyro
-
 from handsim.app.messages import told_warnings
+from handsim.cli.parsing import run_command
 from handsim.errors import HandSimError
 
 
@@ -32,9 +31,7 @@ def run(
     program = f"python -m {module}"
     try:
         with told_warnings(program):
-            tyro.extras.subcommand_cli_from_dict(
-                dict(commands), prog=program, description=description, args=args
-            )
+            run_command(dict(commands), prog=program, help_line=description or "", args=args)
     except HandSimError as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 1

@@ -20,13 +20,13 @@ from benchmarks.paper.printed import AUGMENTATIONS, TABLE2
 from benchmarks.record import add_save, describe, save_figures
 from gloves.captures.collection import find_captures, read_markers
 from gloves.layout import load_layout
-from train.config import KINDS, TrainConfig, default_config
+from train.config import KINDS, TrainConfig, batch_recipe, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.labelers.kinds import labeler_of
 from train.loop import start_fabric
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.simulation.held_out import held_out_markers
 from train.training_state import TrainingState
 
@@ -70,15 +70,16 @@ def race(
 ) -> dict[str, dict[str, float]]:
     """Minutes from the start until the paper's best network was beaten, by test set and kind of test."""
     start, measuring = time.perf_counter(), 0.0
-    generate_dataset(DatasetConfig(glove=GLOVE, num_frames=frames), folder / "set")
+    make_dataset(DatasetConfig(glove=GLOVE, num_frames=frames), folder / "set")
     dataset = Dataset(folder / "set")
     rows, names = dataset.rows(), dataset.marker_names
+    recipe = batch_recipe(config, len(names))
     print(f"{(time.perf_counter() - start) / 60:5.1f} min: {frames} frames generated")
     state = TrainingState(config, start_fabric(config, folder), rows)
     beaten: dict[str, dict[str, float]] = {name: {} for name in tests}
     while state.done < config.samples:
         rng = np.random.default_rng(state.done)
-        state.step(draw_batch(rows, config, rng=rng), rng=rng)
+        state.step(draw_batch(rows, recipe, rng=rng), rng=rng)
         if state.done % EVERY[config.labeler] >= config.batch and state.done < config.samples:
             continue
         stopped = time.perf_counter()

@@ -33,7 +33,7 @@ from poses.shapes.validity import sample_valid_angles
 from train.data.shards import row_dtype
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.simulation.people import sample_hands
 
 CONFIG = DatasetConfig()
@@ -125,7 +125,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             config = DatasetConfig(num_frames=frames, scenes=scenes)
             start, busy = time.perf_counter(), sum(os.times()[:4])
-            generate_dataset(config, Path(folder) / "set", workers=workers)
+            make_dataset(config, Path(folder) / "set", workers=workers)
             seconds, busy = time.perf_counter() - start, sum(os.times()[:4]) - busy  # workers' time too
         print(
             f"{name}, {workers} worker(s): {frames:,} frames in {seconds:.1f} s, {frames / seconds:,.0f} "

@@ -21,10 +21,11 @@ import torch
 from benchmarks.record import Figures, add_save, describe, save_figures
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
+from train.glove_labeler import load_labeler
 from train.labelers.depth_image import depth_images
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
-from train.labelers.storage import load_labeler, load_network
+from train.labelers.storage import load_network
 from train.labelers.views import principal_axes
 from train.simulation.held_out import held_out_markers
 

@@ -30,7 +30,7 @@ from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
 from track.kinematics.pose_solver import PoseSolver
 from train.any_layout.fine_tuning import fine_tuned_labeler
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 
 SCORED_FRAMES = 1500  # as `handsim glove score`
 MEASURED_FRAMES = 3000
@@ -111,7 +111,7 @@ def measure(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> Fi
     seconds = time.perf_counter() - begin
     rng = np.random.default_rng(99)
     hands = observe_poses(layout, load_rig("figure5"), MEASURED_FRAMES, rng=rng)
-    score = score_layout(layout, hands, labeler_for_glove(str(glove), run), rng=rng)
+    score = score_layout(layout, hands, load_labeler(str(glove), run), rng=rng)
     return {**slots(score), "joints": solved_errors(hands, rng).tolist(), "seconds": seconds}
 
 

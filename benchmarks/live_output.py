@@ -32,8 +32,8 @@ from track.streams.addresses import open_source
 from track.streams.natnet import ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 RATE = 120.0
 SPAWN = multiprocessing.get_context("spawn")
@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0)
     frames = round(parser.parse_args().seconds * RATE)
     print(describe("numba", "torch", "websockets", "python-osc"))
-    take, half = simulate_take(TakeConfig(kind="hand-hand", num_frames=1200)), frames // 2
+    take, half = simulate_take(kind="hand-hand", num_frames=1200), frames // 2
     sent, websocket, osc = (SPAWN.Array("d", frames, lock=False) for _ in range(3))
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
     command, web, bundles = _free_ports(3)

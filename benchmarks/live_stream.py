@@ -38,8 +38,8 @@ from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.streams.point_stream import open_stream
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 RATE = 120.0
 SHARE = 0.05  # of the packets, for each kind of damage
@@ -176,7 +176,7 @@ def main() -> None:
     parser.add_argument("--no-hands", action="store_true", help="only other markers: the tracker has no work")
     options = parser.parse_args()
     print(describe("numba", "torch"))
-    take = simulate_take(TakeConfig(kind="hand-hand", num_frames=1200))
+    take = simulate_take(kind="hand-hand", num_frames=1200)
     with tempfile.TemporaryDirectory() as folder:
         pace = soak(take, round(options.seconds * RATE), not options.no_hands, Path(folder))
         kill(take, min(1.0, 0.4 * pace) * RATE, Path(folder))  # a busy machine needs a slower stream

@@ -36,7 +36,7 @@ from track.finder.frame_hands import HandFinder
 from track.finder.labeling import label_hands
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 
 SIDES = ("right", "left")
 

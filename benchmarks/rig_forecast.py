@@ -26,7 +26,7 @@ from train.rig_advice.forecast import ROOM, forecast, light
 from train.rig_advice.plan import plan
 from train.rig_advice.work import sample_work
 from train.simulation.room_settings import OpticsOptions, SimulatedKind
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import TakeConfig, record_config
 
 GLOVE = "dense19"
 CAPTURES: tuple[tuple[SimulatedKind, int], ...] = (
@@ -104,7 +104,7 @@ def captured(rig: Path, frames: int, optics: OpticsOptions) -> tuple[float, floa
     """What simulated captures miss: share of marker-frames [%], gaps per marker-minute, median length."""
     missing, lengths, total = 0, [], 0
     for kind, seed in CAPTURES:
-        take = simulate_take(TakeConfig(kind, frames, GLOVE, str(rig), seed, optics))
+        take = record_config(TakeConfig(kind, frames, GLOVE, str(rig), seed, optics))
         present = take.markers_present()[:, : take.hand_labels[-1].stop]
         missing += int((~present).sum())
         total += present.size

@@ -42,7 +42,7 @@ from train.simulation.people import sample_hands
 from train.simulation.room import pack_take
 from train.simulation.room_settings import TWINS
 from train.simulation.sight import SKIN_CHUNK, SceneSight
-from train.simulation.takes import TakeConfig, sample_scene, simulate_take
+from train.simulation.takes import sample_scene, simulate_take
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"
@@ -243,7 +243,7 @@ def whole(kind: str, frames: int, seed: int) -> None:
     if kind == ALONE:
         one_hand(frames, seed, Stopwatch())
     else:
-        simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed))  # type: ignore[arg-type]
+        simulate_take(kind=kind, num_frames=frames, seed=seed)  # type: ignore[arg-type]
 
 
 def worker(kind: str, frames: int, seeds: list[int], barrier: Any, queue: Any) -> None:

@@ -26,11 +26,11 @@ from handsim.app.workers import run_jobs
 from render.config import RenderConfig
 from render.session import render_take
 from train.data.augmentation import Corruption, corrupt
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.simulation.held_out import held_out_markers
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 SHARD = 1.0  # [s] that a shard sleeps
 EACH = 8  # shards of each worker
@@ -80,7 +80,7 @@ def cost(make: Callable[[Path], int], out: Path) -> Cost:
 
 
 def frames(out: Path, count: int) -> int:
-    generate_dataset(DatasetConfig(num_frames=count, seed=1), out, workers=1)
+    make_dataset(DatasetConfig(num_frames=count, seed=1), out, workers=1)
     return count
 
 
@@ -88,7 +88,7 @@ def pictures(out: Path, config: RenderConfig) -> int:
     """Two hands, with colors, depth, normals, ids and keypoints."""
     take = out.parent / "take.npz"
     if not take.exists():
-        simulate_take(TakeConfig(kind="hand-hand", num_frames=PICTURES, seed=1)).save(take)
+        simulate_take(kind="hand-hand", num_frames=PICTURES, seed=1).save(take)
     return render_take(take, out, ("webdataset",), config, workers=1)
 
 

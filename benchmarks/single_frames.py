@@ -18,7 +18,7 @@ from benchmarks.paper.labeling_tables import measure_augmentations
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.captures.collection import find_captures, read_markers
 from train.evaluation.labeler_evaluation import Report
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 
 COLUMNS = (
     "slot, point, frame accuracy, occlusion and ghost precision / recall, macro F1, calibration error, "
@@ -53,7 +53,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     print(describe("torch"))
-    labeler = labeler_for_glove(options.glove, options.labeler)
+    labeler = load_labeler(options.glove, options.labeler)
     markers = read_markers(find_captures([options.data]), labeler.marker_names)[:: options.every]
     print(f"[%]: {COLUMNS}")
     reports = measure_augmentations(labeler, markers, seed=0)

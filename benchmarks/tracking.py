@@ -47,11 +47,11 @@ from gloves.takes.take import Take
 from track.capture_calibration import calibrate
 from track.setup import warm_up
 from track.tracker import Tracker
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 from train.simulation.room_settings import KINDS, SIMULATED_KINDS, SimulatedKind
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
@@ -66,7 +66,7 @@ HANDS = {
 
 @cache
 def twin(kind: SimulatedKind, frames: int | None, seed: int) -> Take:
-    return simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)).without_body()
+    return simulate_take(kind=kind, num_frames=frames, seed=seed).without_body()
 
 
 @cache

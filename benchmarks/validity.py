@@ -26,7 +26,7 @@ from poses.grasps.object_motion import object_penetration
 from poses.motion.scripts import script_names, scripted_motion
 from poses.shapes.couplings import HIGH, LOW
 from train.simulation.room_settings import KINDS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 SECONDS = 10.0
 WORST = (
@@ -82,7 +82,7 @@ def twins(frames: int | None, seeds: int) -> np.ndarray:
         "fastest wrist [m/s], [rad/s] and hinge [rad/s]; farthest wrist from the room's middle, an axis [m]"
     )
     for kind, seed in itertools.product(KINDS, range(seeds)):
-        take = simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed))
+        take = simulate_take(kind=kind, num_frames=frames, seed=seed)
         own, between, thing = overlaps(take)
         outside = sum(out_of_range(hand.qpos) for hand in take.moving_hands())
         speeds = np.max([fastest(hand.qpos, take.rate) for hand in take.moving_hands()], axis=0)

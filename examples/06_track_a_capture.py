@@ -13,7 +13,7 @@ import numpy as np
 from gloves import Take
 from handsim import HandModel
 from track import track_capture
-from train import TakeConfig, simulate_take
+from train import simulate_take
 
 
 def joints(model: HandModel, qpos: np.ndarray) -> np.ndarray:
@@ -31,7 +31,7 @@ def compare(name: str, tracked: Take, truth: Take) -> None:
 
 
 def main() -> None:
-    truth = simulate_take(TakeConfig(kind="hand-controller", num_frames=240))  # 2 s at 120 Hz
+    truth = simulate_take(kind="hand-controller", num_frames=240)  # 2 s at 120 Hz
     capture = truth.capture()  # no names, many gaps, some ghosts
     compare("known hands", track_capture(capture, hands=truth.hands), truth)
     compare("measured hands", track_capture(capture, glove="dense19"), truth)

@@ -12,13 +12,14 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from gloves import load_layout, load_take, nominal_fit
+from gloves import attach, load_take
+from handsim import HandModel
 from track import Recorder, Tracker, open_sinks, open_source
 from train import load_labeler
 
 
 def main() -> None:
-    hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
+    hands = [attach("dense19", HandModel.named("M", side=side)) for side in ("right", "left")]
     tracker = Tracker(hands, load_labeler("dense19"))
     with TemporaryDirectory() as folder:
         with (

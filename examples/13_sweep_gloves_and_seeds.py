@@ -12,7 +12,7 @@ import itertools
 import sys
 from statistics import mean
 
-from train import TakeConfig, evaluate_takes, load_labeler, simulate_take
+from train import evaluate_labeler, load_labeler, simulate_take
 
 GLOVES = ("dense19", "sparse13")
 SEEDS = (0, 1, 2)
@@ -20,8 +20,8 @@ SEEDS = (0, 1, 2)
 
 def cell(glove: str, seed: int) -> float:
     """Share of the label slots that are right."""
-    take = simulate_take(TakeConfig(kind="hand-hand", glove=glove, num_frames=60, seed=seed))
-    return evaluate_takes(load_labeler(glove), [take]).figures["slot_accuracy"]
+    take = simulate_take(kind="hand-hand", glove=glove, num_frames=60, seed=seed)
+    return evaluate_labeler(load_labeler(glove), [take]).figures["slot_accuracy"]
 
 
 def run(scheduler: str | None, cells: list[tuple[str, int]]) -> list[float]:

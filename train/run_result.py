@@ -17,7 +17,7 @@ from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption, right_hands
 from train.data.mapped_rows import MappedRows
 from train.data.shards import Manifest
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler, paper_report
+from train.evaluation.labeler_evaluation import Report, evaluate_markers, paper_report
 from train.labelers.cnn_labeler import label_by_distance
 from train.labelers.cnn_network import DeepLabelCNN
 from train.labelers.kinds import cnn_labeler, labeler_of
@@ -80,7 +80,7 @@ def _card(
     """
     labeler = labeler_of(network, manifest.marker_names)
     markers = rows["markers"].astype(np.float64)
-    clean = evaluate_labeler(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
+    clean = evaluate_markers(labeler, markers, Corruption(0, 0), rng=np.random.default_rng(0))
     paper, report = paper_corruption(markers.shape[1]), paper_report(labeler, rows)
     card = {
         "marker_names": list(manifest.marker_names),
@@ -88,7 +88,7 @@ def _card(
         "handsim": __version__,
         "license": UNKNOWN_LICENSE,
         "dataset": manifest.config,
-        "train": dataclasses.asdict(config),
+        "train": config.record(),
         "held_out_simulated": {
             "clean": clean.figures,
             f"occlude {paper.occlude}, ghosts {paper.ghosts}": report.figures,

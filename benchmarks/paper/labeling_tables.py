@@ -24,14 +24,15 @@ from train.config import Kind, default_config
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import Report, evaluate_labeler, evaluate_takes
-from train.glove_labeler import labeler_for_glove
+from train.evaluate import evaluate_labeler
+from train.evaluation.labeler_evaluation import Report
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 from train.labelers.storage import shipped_labelers
 from train.loop import train_labeler
 from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 PUBLISHED_GAPS: Final = "3-4", "24-43"  # median and p90 of real finger markers' gaps [frames]; docs/room.md
 FIGURES: Final = {
@@ -91,7 +92,7 @@ def table2(
             _train_augmentation(dataset, kind, name, run, samples, seed)
         for title, markers in tests.items():
             nets = {
-                name: measure_augmentations(labeler_for_glove(glove, run), markers, seed=seed)
+                name: measure_augmentations(load_labeler(glove, run), markers, seed=seed)
                 for name, run in runs.items()
             }
             Console().print(print_table2(nets, title=f"Table 2, {kind}: {title}, ours (the paper's) [%]"))
@@ -105,8 +106,8 @@ def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samp
     with progress_bar("samples") as (bar, task):
         train_labeler(
             dataset,
-            config,
             run,
+            config,
             progress=lambda done, total, loss: bar.update(
                 task, completed=done, total=total, description=f"{kind} {name}, loss {loss:.3f}"
             ),
@@ -186,8 +187,7 @@ def _print_tests(
     if num_frames < 1:
         raise HandSimError(f"num_frames is {num_frames}, expected at least 1")
     found = {
-        name: labeler_for_glove(glove, name if name in shipped_labelers() else Path(name))
-        for name in labelers
+        name: load_labeler(glove, name if name in shipped_labelers() else Path(name)) for name in labelers
     }
     stills = {"synthetic": held_out_markers(glove, num_frames, seed=seed)}
     takes = _simulate(glove, seed)
@@ -314,7 +314,7 @@ def simulate_takes(glove: str, seed: int, done: Callable[[], None]) -> dict[str,
     """The twins of the paper's four captures."""
     takes: dict[str, Take] = {}
     for kind in KINDS:
-        takes[kind] = simulate_take(TakeConfig(kind=kind, glove=glove, seed=seed))
+        takes[kind] = simulate_take(kind=kind, glove=glove, seed=seed)
         done()
     return takes
 
@@ -339,7 +339,7 @@ def measure_tests(
         name: evaluate_labeler(labeler, markers, recipe, rng=np.random.default_rng(seed))
         for name, markers in stills.items()
     }
-    return reports | {name: evaluate_takes(labeler, [take]) for name, take in takes.items()}
+    return reports | {name: evaluate_labeler(labeler, [take]) for name, take in takes.items()}
 
 
 def print_table2(nets: Mapping[str, Mapping[str, Report]], *, title: str) -> Table:

@@ -29,9 +29,9 @@ from benchmarks.paper.printed import CAMERAS, CAMERAS_FRAMES, HAN, TABLE5, TABLE
 from benchmarks.record import Figures, save_figures
 from gloves.takes.take import Take
 from handsim.app.progress import progress_bar
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.simulation.room_settings import KINDS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import TakeConfig, record_config
 
 _HEAD: Final = ("method", "hands")
 _PAPERS_GLOVE: Final = "dense19"
@@ -122,12 +122,12 @@ def _measure_on(
     twins: Mapping[str, TakeConfig], config: TableConfig, *, trials: int = 0
 ) -> tuple[dict[str, Take], list[Measurement]]:
     """Simulate captures, and run all trackers over them without their bodies, which most cannot track."""
-    network = labeler_for_glove(config.glove, config.labeler)
+    network = load_labeler(config.glove, config.labeler)
     takes: dict[str, Take] = {}
     with progress_bar("captures") as (bar, task):
         bar.update(task, total=len(twins))
         for kind, twin in twins.items():
-            takes[kind] = simulate_take(twin)
+            takes[kind] = record_config(twin)
             bar.advance(task)
     bare = {kind: take.without_body() for kind, take in takes.items()}
     frames = sum(take.num_frames for take in takes.values())
@@ -141,7 +141,7 @@ def _measure_on(
 
 def _measure_with_body(take: Take, config: TableConfig) -> list[Measurement]:
     """Our tracker on the capture whose object has markers, with the object tracked as well."""
-    network = labeler_for_glove(config.glove, config.labeler)
+    network = load_labeler(config.glove, config.labeler)
     with progress_bar("frames") as (bar, task):
         bar.update(task, total=take.num_frames * len(USERS))
         return measure_with_body(_WITH_BODY, take, network, done=lambda: bar.advance(task))

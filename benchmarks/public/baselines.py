@@ -25,7 +25,7 @@ from track.setup import measure_hands
 from track.streams.frame_source import capture_frames
 from track.tracked_frame import FrameTracker
 from track.tracker import Tracker
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 MakeTracker = Callable[[Sequence[GloveFit], Labeler, Int[np.ndarray, "N"]], FrameTracker]
@@ -67,7 +67,7 @@ def run_baseline(
     """
     about = {"benchmark": BENCHMARK, "size": benchmark.size, "tracker": tracker, "users": users}
     claim(out / ABOUT, about, noun="set of results", error=BenchmarkError)
-    labeler = labeler_for_glove(GLOVE, None)
+    labeler = load_labeler(GLOVE, None)
     for one in benchmark.captures:
         path = out / f"{one.name}.npz"
         if not path.is_file():

@@ -15,8 +15,8 @@ from handsim.app.progress import print_above, progress_bar
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.generation import make_dataset
+from train.simulation.takes import simulate_take
 
 _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 
@@ -42,7 +42,7 @@ def generate(
         progress_bar("frames") as (bar, task),
         chosen_workers(cluster, workers, print_above(bar)) as chosen,
     ):
-        manifest = generate_dataset(
+        manifest = make_dataset(
             config,
             place,
             workers=chosen,
@@ -55,9 +55,7 @@ def generate(
 
 def _report(config: DatasetConfig, out: Path) -> Path:
     """Write the page of plots."""
-    # Not in generate_dataset: a set is complete without its report, whose bytes depend on matplotlib.
+    # Not in make_dataset: a set is complete without its report, whose bytes depend on matplotlib.
     with Console(stderr=True).status("drawing the report"):
-        take = simulate_take(
-            TakeConfig(kind="hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
-        )
+        take = simulate_take("hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
         return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)

@@ -1,19 +1,11 @@
-"""How commands read options: defaults from a preset that is named among the arguments, objects by name."""
+"""Commands whose option defaults come from a preset that is named among their arguments."""
 
 from __future__ import annotations
 
 import argparse
-import types
-import typing
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-
-if TYPE_CHECKING:
-    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
-
-_PLAIN: Final = (str, Path, int, float, bool, types.NoneType)
+from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,26 +27,3 @@ def given_option(args: Sequence[str], option: str) -> str | None:
     known, _ = parser.parse_known_args(list(args))
     value: str | None = known.value
     return value
-
-
-def named_objects() -> ConstructorRegistry:
-    """How tyro reads an option that takes an object or its name or path: as text."""
-    from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec
-
-    registry = ConstructorRegistry()
-
-    @registry.primitive_rule
-    def read_name(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        parts = typing.get_args(info.type)
-        union = typing.get_origin(info.type) in (typing.Union, types.UnionType)
-        if not union or str not in parts or all(part in _PLAIN for part in parts):
-            return None
-        return PrimitiveConstructorSpec(
-            nargs=1,
-            metavar="STR",
-            instance_from_str=lambda words: words[0],
-            is_instance=lambda value: True,
-            str_from_instance=lambda value: [str(value)],
-        )
-
-    return registry

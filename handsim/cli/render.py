@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal, cast
 
@@ -17,10 +17,9 @@ from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimError, choices
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from render.cameras.viewpoints import ViewConfig
+from render.cameras.viewpoints import Placement, ViewConfig
 from render.config import RenderConfig
 from render.formats.merging import merge_renderings
-from render.own_poses import PoseFile
 from render.painting.painter import PainterChoice
 from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind
 from render.scenery.photographs import photo_files
@@ -29,19 +28,34 @@ from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
 from render.session import SHEET, left_out_frames, render_take
 from render.skin.look import ALL_TONES, TONES, named_tones
+from render.subject import PoseFile
 
 _NO_SENSOR: Final = "none"
 _AUTO_SENSOR: Final = "auto"
 _DEFAULT: Final = RenderConfig()
-_AS_IN_CONFIG: Final = ("passes", "view", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
+_VIEW: Final = ViewConfig()
+_AS_IN_VIEW: Final = ("placement", "camera", "views", "distance", "rig", "cameras")
+_AS_IN_CONFIG: Final = ("passes", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
 
 
 @dataclass(frozen=True, slots=True)
 class RenderOptions:
     """`RenderConfig` as the options of the command name it."""
 
-    view: Annotated[ViewConfig, tyro.conf.arg(name="")] = field(default_factory=ViewConfig)
-    """Cameras, and where they stand."""
+    placement: Placement = _VIEW.placement
+    """Position of the cameras. still: in front of the hands. orbit: around them. head: at the user's eyes.
+    anywhere: at another position in every frame. rig: at the cameras of a rig."""
+    camera: str = _VIEW.camera
+    """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
+    views: int = _VIEW.views
+    """Number of cameras; a rig has its own number."""
+    distance: tuple[float, float] = _VIEW.distance
+    """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
+    rig: str = _VIEW.rig
+    """Rig for the placement rig: a shipped name or the path of a .toml file."""
+    cameras: str | None = None
+    """File of your own cameras, instead of all these: ours (.toml), OpenCV's (.yml, .json), or COLMAP's (the
+    folder of cameras.txt and images.txt)."""
     passes: tuple[str, ...] = _DEFAULT.passes
     """Pictures to draw: rgb, depth, normals, ids."""
     dress: Literal["skin", "glove"] = _DEFAULT.dress
@@ -79,6 +93,7 @@ class RenderOptions:
         """
         return RenderConfig(
             **{name: getattr(self, name) for name in _AS_IN_CONFIG},
+            view=ViewConfig(**{name: getattr(self, name) for name in _AS_IN_VIEW}),
             tones=_tone_ranges(self.tones),
             background=_backgrounds(self.background, self.photos),
             depth_sensor=_sensors(self.depth_sensor),
@@ -136,7 +151,7 @@ def render(
         source: Path | PoseFile = cast("Path", take)
     else:
         source = PoseFile(poses, hands, people, glove)
-    check_outputs((take, poses, options.view.cameras), (place if isinstance(place, Path) else None,))
+    check_outputs((take, poses, options.cameras), (place if isinstance(place, Path) else None,))
     config = options.config()
     start = time.perf_counter()
     if options.photos is not None:

@@ -21,7 +21,7 @@ from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
 from handsim.files.capacity import check_free, check_memory
 from handsim.files.outputs import check_outputs
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import TakeConfig, record_config
 
 _MEMORY: Final = 20_000
 """Bytes that a frame of two hands takes while it is simulated; 18,000 were measured with 24,000 frames."""
@@ -41,7 +41,7 @@ def simulate(
     """
     truth = out.with_suffix(SUFFIX)
     check_suffix(out, WRITABLE)
-    check_outputs((config.glove, config.rig), (out, truth))
+    check_outputs((str(config.glove), str(config.rig)), (out, truth))
     _check_space(out, config.num_frames or 0)
     if cluster is None:
         take = _simulate_into(out, config)
@@ -60,7 +60,7 @@ def _capture_of_seed(out: Path, config: TakeConfig, seed: int) -> int:
 
 
 def _simulate_into(out: Path, config: TakeConfig) -> Take:
-    take = simulate_take(config)
+    take = record_config(config)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     with atomic_writes(out, out.with_suffix(SUFFIX)) as (capture_file, truth_file):
         # A capture without its truth is no use.

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, RigError, choices
 from handsim.files.atomic import atomic_write
 from handsim.space.camera import Camera, CameraArrays, camera_arrays, camera_from_record, points_in_view
@@ -143,11 +144,7 @@ def load_rig(rig: CameraRig | str | Path) -> CameraRig:
     """
     if isinstance(rig, CameraRig):
         return rig
-    if not isinstance(rig, str | Path):
-        raise ArgumentError(
-            f"a rig is {type(rig).__name__}, expected a CameraRig, a name ({', '.join(list_rigs())}) or the "
-            "path of a .toml file"
-        )
+    check_type("rig", rig, (str, Path), "a CameraRig, or the name or path of one", list_rigs())
     if str(rig) in list_rigs():
         return named_rig(str(rig))
     path = Path(rig)

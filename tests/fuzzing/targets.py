@@ -22,8 +22,8 @@ from handsim.files.json_files import claim, load_json
 from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
 from handsim.space.rig_formats.any_file import import_cameras, load_cameras
-from render.own_poses import PoseFile, load_poses
 from render.scenery.photographs import draw_photo, photo_files
+from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive
@@ -68,13 +68,13 @@ def _silence() -> Iterator[None]:
 
 
 def _read_weights(path: Path) -> None:
-    from train.labelers.storage import load_labeler
+    from train.glove_labeler import load_labeler
 
     load_labeler(path.parent).label_frames([_CLOUD])
 
 
 def _read_onnx(path: Path) -> None:
-    from train.labelers.storage import load_labeler
+    from train.glove_labeler import load_labeler
 
     load_labeler(path).label_frames([_CLOUD])
 
@@ -115,7 +115,7 @@ _ALL: Final = (
     Target("rig", seeds.rig, load_rig),
     Target("cameras", seeds.camera_files, load_cameras),
     Target("calibrations", seeds.calibrations, _read_calibration),
-    Target("poses", seeds.own_poses, lambda path: load_poses(PoseFile(path)), mutate_archive),
+    Target("poses", seeds.own_poses, lambda path: load_subject(PoseFile(path), seed=0), mutate_archive),
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
     Target("truth", seeds.truth, load_take, mutate_archive),

@@ -11,7 +11,7 @@ from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
 from handsim.space.camera import Camera, look_at, pinhole
-from render.frames.frame import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
+from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
 
 
 @pytest.fixture(scope="session")
@@ -116,8 +116,8 @@ def _hand(
     return HandTruth(
         shape=model.shape,
         qpos=qpos[0],
-        keypoints=keypoints,
-        pixels=places,
+        keypoints=places,
+        keypoints_world=keypoints,
         visible=inside & (np.arange(21) % 3 > 0),
         box=box,
         vertices=vertices,

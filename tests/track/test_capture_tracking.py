@@ -32,8 +32,8 @@ from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
 from track.tracked_frame import Status
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 FRAMES = 60
 
@@ -45,7 +45,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def truth() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=FRAMES))
+    return simulate_take(kind="hand-controller", num_frames=FRAMES)
 
 
 @pytest.fixture(scope="module")
@@ -192,14 +192,14 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from track.capture_tracking import track_capture
 from track.setup import warm_up
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 def ready():
     kernels = [one for one in gc.get_objects() if isinstance(one, CPUDispatcher)]
     return {(one.py_func.__qualname__, str(known)) for one in kernels for known in one.signatures}
 
-take = simulate_take(TakeConfig(kind="hand-hand", num_frames=40))
+take = simulate_take(kind="hand-hand", num_frames=40)
 hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
 labeler = load_labeler("dense19")
 warm_up(hands, labeler)

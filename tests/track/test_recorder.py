@@ -15,14 +15,14 @@ from gloves.takes.archives import CutOffWarning
 from gloves.takes.take import Take, load_take
 from handsim.errors import CaptureError
 from handsim.space.objects import named_object
-from render.shown_take import load_shown_take
+from render.subject import load_subject
 from track import recorder as module
 from track.bodies.rigid_body import RigidTemplate
 from track.recorder import Recorder, TakeRecorder
 from track.streams.frame_source import capture_frames
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 FRAMES = 24
 COUNTS = {"missing_frames": 2}
@@ -31,7 +31,7 @@ COUNTS = {"missing_frames": 2}
 @functools.cache
 def tracked():
     """A tracker and the frames that it made of a capture."""
-    take = simulate_take(TakeConfig(kind="hand-controller", num_frames=FRAMES))
+    take = simulate_take(kind="hand-controller", num_frames=FRAMES)
     hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
     tracker = Tracker(hands, load_labeler("dense19"), (RigidTemplate.of(named_object("controller")),))
     return tracker, [
@@ -90,7 +90,7 @@ def test_a_recording_that_was_cut_off_is_read(tmp_path):
     with pytest.warns(CutOffWarning, match=r"take\.npz\.part: a recording that was cut off .* 24 frames"):
         assert_equal(load_take(recorder.part), in_memory())
     with pytest.warns(CutOffWarning):
-        assert load_shown_take(recorder.part).num_frames == FRAMES
+        assert load_subject(recorder.part, seed=0).take.num_frames == FRAMES
     with pytest.raises(CaptureError, match=r"take\.npz: no such file, but .*take\.npz\.part is a recording"):
         load_take(tmp_path / "new" / "take.npz")
     with pytest.raises(CaptureError, match="exists: a recording that was cut off"):

@@ -13,14 +13,14 @@ from gloves.takes.take import LOST, Take
 from handsim.cli.main import main
 from track.capture_tracking import track_capture
 from track.take_summary import suspicions
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 FRAMES = 40
 
 
 @pytest.fixture(scope="module")
 def truth() -> Take:
-    return simulate_take(TakeConfig(kind="single-hand", num_frames=FRAMES))
+    return simulate_take(kind="single-hand", num_frames=FRAMES)
 
 
 @pytest.fixture(scope="module")

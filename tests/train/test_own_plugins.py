@@ -17,7 +17,7 @@ from handsim.errors import ArgumentError, HandSimError
 from poses.shapes.sampling import load_sampler
 from train.data.own_corruption import own_cloud
 from train.data.shards import Dataset
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 
 SOURCE = '''
 import numpy as np
@@ -96,8 +96,7 @@ def folder(tmp_path_factory):
         patch.chdir(folder)
         patch.setattr(sys, "path", [*sys.path, str(folder)])
         yield folder
-    for cached in (load_plugin, load_sampler):
-        cached.cache_clear()
+    load_plugin.cache_clear()
     sys.modules.pop("own_ideas", None)
 
 

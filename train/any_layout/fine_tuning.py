@@ -16,7 +16,7 @@ from gloves.layout import MarkerLayout
 from handsim.space.cameras import CameraRig, as_rig
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.any_layout.layout_network import layout_loss
-from train.config import TrainConfig
+from train.config import TrainConfig, batch_recipe
 from train.data.batches import draw_batch
 from train.data.shards import row_dtype
 from train.simulation.dataset_config import DatasetConfig
@@ -52,7 +52,8 @@ def fine_tuned_labeler(
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler(layout, seed=seed)
     rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
-    network, config = copy.deepcopy(labeler.network).train(), TrainConfig(batch=_BATCH)
+    network = copy.deepcopy(labeler.network).train()
+    recipe = batch_recipe(TrainConfig(batch=_BATCH), layout.num_markers)
     optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
     steps = -(-num_clouds // _BATCH)
     with torch_threads(1):
@@ -60,7 +61,7 @@ def fine_tuned_labeler(
             rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
             for group in optimizer.param_groups:
                 group["lr"] = float(_PEAK_RATE * rate)
-            cloud = draw_batch(rows, config, rng=rng).cloud
+            cloud = draw_batch(rows, recipe, rng=rng).cloud
             points, present = (
                 torch.from_numpy(cloud.points.astype(np.float32)),
                 torch.from_numpy(cloud.present),

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import pickle
+import sys
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Executor
@@ -11,23 +14,27 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from upath import UPath
 
 from gloves.attachment import attach_markers
 from gloves.layout import MarkerLayout, load_layout
+from handsim._checks import check_type, make_settings
+from handsim._plugins import plugin_name
 from handsim.app.interrupts import Stopped
 from handsim.app.output import Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
-from handsim.errors import DatasetError
+from handsim.errors import DatasetError, HandSimWarning
 from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
 from handsim.hand.model import HandModel
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.topology import SIDES
 from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, rig_setting
-from poses.shapes.sampling import load_sampler
+from poses.shapes.sampling import PoseSampler, load_sampler
 from train.data.shards import (
     CONFIG,
     MANIFEST,
+    Dataset,
     Manifest,
     array_bytes,
     hands_name,
@@ -49,13 +56,61 @@ Progress = Callable[[int, int], None]
 
 
 def generate_dataset(
+    out: str | Place,
+    *,
+    glove: MarkerLayout | str | Path = "dense19",
+    sampler: PoseSampler | str | None = None,
+    rig: CameraRig | str | Path = "figure5",
+    num_frames: int = 170_330,
+    seed: int = 0,
+    workers: int | Executor | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    **settings: Any,
+) -> Dataset:
+    """Make a training set, finish a stopped one, or let one grow.
+
+    The same arguments give the same bytes, with any number of workers.
+
+    Args:
+        out: Folder to make it in, or a folder of an object store, as s3://bucket/prefix. A set there may have
+            fewer frames and must have the same settings else.
+        glove: The marker layout, or its name or path.
+        sampler: A pose sampler of your own for hands that are alone: a function like `poses.PoseSampler`,
+            `module:name` of one, or its entry point. Whole poses (T, 27) say where the hands are; joint
+            angles (T, 20) [rad], and wrists left at the origin, are put anywhere.
+        rig: The cameras, or the name or path of a rig.
+        num_frames: Frames; the default is the paper's number.
+        seed: Seed of all randomness.
+        workers: Processes, all cores when not given, or an executor; one process for a sampler that no other
+            can import, such as a lambda.
+        progress: Called after every shard with frames done and frames expected.
+        settings: The other settings of `handsim generate`, as it prints them: `volume=0.5` [m],
+            `scenes={"together": 0.0, "holding": 0.0}`, and so on.
+
+    Returns:
+        The set: `rows()` are its frames, positions in [m] and angles in [rad].
+
+    Raises:
+        ArgumentError: An argument is of another type or out of range, the rig stands in the hands' way, or no
+            hand of the population can rest.
+        DatasetError: `out` holds a set of other settings, its disk is too small, or a worker died.
+        LayoutError, RigError: The glove or rig is unknown, or the glove does not fit.
+    """
+    check_type("out", out, (str, Path, UPath), "the path of a folder")
+    given = {"glove": glove, "sampler": sampler, "rig": rig, "num_frames": num_frames, "seed": seed}
+    config = make_settings(DatasetConfig, "setting of a training set", given | settings)
+    make_dataset(config, out, workers=workers, progress=progress)
+    return Dataset(out)
+
+
+def make_dataset(
     config: DatasetConfig,
     out: str | Place,
     *,
     workers: int | Executor | None = None,
     progress: Progress | None = None,
 ) -> Manifest:
-    """Make a training set, finish a stopped one, or let one grow; the bytes depend on the config alone.
+    """As `generate_dataset`.
 
     Args:
         config: What to make.
@@ -75,6 +130,7 @@ def generate_dataset(
         LayoutError: The glove is unknown or does not fit.
         ArgumentError: The rig is unknown or stands in the hands' way, or no hand of the population can rest.
     """
+    workers = _allowed_workers(workers, config.sampler)
     place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
     layout, rig = load_layout(config.glove), as_rig(config.rig)
     check_outside_volume(rig, np.array(ROOM_CENTER), config.volume)
@@ -100,9 +156,34 @@ def generate_dataset(
         return _complete(config, output, layout)
 
 
+def _allowed_workers(
+    workers: int | Executor | None, sampler: PoseSampler | str | None
+) -> int | Executor | None:
+    """One process for a sampler that others cannot import; a number that was asked for is told about."""
+    if workers == 1 or sampler is None or isinstance(sampler, str):
+        return workers
+    try:
+        pickle.dumps(sampler)
+        alone = getattr(sampler, "__module__", "") == "__main__" and not hasattr(
+            sys.modules["__main__"], "__file__"
+        )  # as in a notebook
+    except Exception:  # whatever an object of a user's raises
+        alone = True
+    if alone and workers is not None:
+        what = f"sampler {plugin_name(sampler)} cannot be imported by other processes"
+        told = f"{what}, so that this one does all; a function at the top of a module can"
+        warnings.warn(told, HandSimWarning, stacklevel=4)
+    return 1 if alone else workers
+
+
 def _settings(config: DatasetConfig, layout: MarkerLayout, rig: CameraRig) -> dict[str, Any]:
     """What decides the bytes of a set, as JSON."""
-    known = dataclasses.replace(config, optics=config.optics.worn(layout.radius))
+    named: dict[str, Any] = {
+        "glove": config.glove.name if isinstance(config.glove, MarkerLayout) else str(config.glove),
+        "rig": rig.name,
+        "sampler": None if config.sampler is None else plugin_name(config.sampler),
+    }
+    known = dataclasses.replace(config, optics=config.optics.worn(layout.radius), **named)
     settings = {
         **dataclasses.asdict(known),
         "rig": rig_setting(rig),

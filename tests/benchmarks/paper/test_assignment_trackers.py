@@ -14,14 +14,14 @@ from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.tracked_frame import Status
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 BOTH = pytest.mark.parametrize("kind", [NearestNeighborTracker, HungarianTracker])
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="single-hand", num_frames=300)).without_body()
+    return simulate_take(kind="single-hand", num_frames=300).without_body()
 
 
 @pytest.fixture(scope="module")

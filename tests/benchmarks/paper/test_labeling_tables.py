@@ -10,16 +10,16 @@ from benchmarks.paper import labeling_tables
 from benchmarks.paper.labeling_tables import FIGURES, LABELING_TABLES, augmentations
 from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
 from handsim.cli.main import main
-from train.evaluation.labeler_evaluation import evaluate_takes
-from train.labelers.storage import load_labeler
+from train.evaluate import evaluate_labeler
+from train.glove_labeler import load_labeler
 from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
 def takes():
-    return {kind: simulate_take(TakeConfig(kind=kind, num_frames=40)) for kind in KINDS}
+    return {kind: simulate_take(kind=kind, num_frames=40) for kind in KINDS}
 
 
 def tables(words):
@@ -108,7 +108,7 @@ def test_table_4_has_a_column_a_test_set(capsys, monkeypatch, takes):
         assert len(row) == len(TEST_SETS)
         for cell, paper in zip(row, TABLE4.get(figure, [None] * 5), strict=True):
             assert cell.endswith(f"({100 * paper:.2f})") if paper is not None else "(" not in cell
-    pen = evaluate_takes(load_labeler("dense19"), [takes["hand-pen"]]).figures
+    pen = evaluate_labeler(load_labeler("dense19"), [takes["hand-pen"]]).figures
     column = TEST_SETS.index("hand-pen")
     assert cells(said, "Accuracy (slots)")[column].startswith(f"{100 * pen['slot_accuracy']:.2f} ")
     assert cells(said, "G recall")[column].startswith(f"{100 * pen['ghost_recall']:.2f} ")

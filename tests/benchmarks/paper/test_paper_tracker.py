@@ -15,9 +15,9 @@ from gloves.fit import GloveFit
 from gloves.takes.take import Take
 from handsim.hand.topology import JOINT_NAMES
 from track.tracked_frame import Status, TrackedFrame
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeling
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 class Asked:
@@ -39,7 +39,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240)).without_body()
+    return simulate_take(kind="hand-controller", num_frames=240).without_body()
 
 
 @pytest.fixture(scope="module")

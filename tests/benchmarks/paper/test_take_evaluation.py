@@ -21,12 +21,12 @@ from handsim.hand.shape import SIZES
 from handsim.hand.topology import NUM_QPOS
 from track.kinematics.pose_solver import PoseSolver
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=100))
+    return simulate_take(kind="hand-controller", num_frames=100)
 
 
 class Knowing:

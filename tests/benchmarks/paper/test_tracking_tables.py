@@ -22,9 +22,9 @@ from benchmarks.paper.printed import CAMERAS, FRAMES, HAN, TABLE5, TABLE7
 from benchmarks.paper.tracking_tables import TRACKING_TABLES, print_errors, print_trials, table5_figures
 from benchmarks.paper.trials import FEWEST_FRAMES
 from handsim.errors import ArgumentError
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 from train.simulation.room_settings import KINDS, TWINS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 pytestmark = pytest.mark.xdist_group("reproduce")  # what they share is made once
 METHODS = (OURS, PAPERS_LOOP, *NEED_FIRST_LABELS)
@@ -108,7 +108,7 @@ def test_table_7_tells_hands_that_fit_and_right_ones_of_them(capsys, quick):
 def test_few_cameras(capsys):
     assert command(["cameras", "--num-frames", "8"]) == 0
     said = capsys.readouterr().out
-    take = simulate_take(TakeConfig(kind="single-hand", num_frames=8, rig="six"))
+    take = simulate_take(kind="single-hand", num_frames=8, rig="six")
     missing = 100 * (1.0 - take.markers_present().mean())
     assert f"{missing:.2f} % of the markers missing" in said
     tables = rows(said)
@@ -124,7 +124,7 @@ def test_the_paper_has_no_figures_of_other_gloves(capsys):
 
 def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     monkeypatch.setattr(comparison, "USERS", {"calibrated": USERS["calibrated"]})
-    take = simulate_take(TakeConfig(kind="single-hand", num_frames=FEWEST_FRAMES)).without_body()
+    take = simulate_take(kind="single-hand", num_frames=FEWEST_FRAMES).without_body()
     measured = compare_trackers({"single-hand": take}, load_labeler("dense19"), seed=0, trials=1)
     by_name = {one.method: one for one in measured}
     assert by_name[OURS].initialization[0] <= 3 and by_name[OURS].recovery[0] <= 3
@@ -145,9 +145,10 @@ def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     ]
 
 
+@pytest.mark.slow
 def test_a_body_that_is_followed_must_have_its_labels():
     labeler = load_labeler("dense19")
-    take = simulate_take(TakeConfig(kind="hand-controller", num_frames=20))
+    take = simulate_take(kind="hand-controller", num_frames=20)
     first, second, *_ = measure_with_body("controller", take, labeler)
     assert (first.users, second.users) == tuple(USERS) and first.report.right.all()
     labels = take.labels.copy()

@@ -16,13 +16,13 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from track.tracked_frame import Status, TrackedFrame, TrackedHand
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=FEWEST_FRAMES + 20))
+    return simulate_take(kind="hand-controller", num_frames=FEWEST_FRAMES + 20)
 
 
 class Late:

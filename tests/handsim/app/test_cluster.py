@@ -25,8 +25,8 @@ from render.session import render_take
 from train.simulation import generation
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.generation import make_dataset
+from train.simulation.takes import simulate_take
 
 distributed = pytest.importorskip("distributed", reason="needs `pip install 'handsim[cluster]'`")
 ROOT = Path(__file__).resolve().parents[3]
@@ -92,25 +92,25 @@ def test_training_sets_have_the_same_bytes_also_when_a_worker_is_killed(
     cluster, client, small_shards, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)  # workers have another folder
-    generate_dataset(CONFIG, Path("here"), workers=1)
+    make_dataset(CONFIG, Path("here"), workers=1)
     expected = contents(tmp_path / "here")
     assert len([name for name in expected if name.startswith("rows-")]) == 12
     there, killed = Path("there"), Path("killed")
     lines, counts = [], []
     with chosen_workers(cluster.scheduler_address, None, lines.append) as workers:
-        generate_dataset(CONFIG, there, workers=workers, progress=lambda done, _: counts.append(done))
+        make_dataset(CONFIG, there, workers=workers, progress=lambda done, _: counts.append(done))
         assert contents(there) == expected
         assert counts == sorted(counts) and counts[-1] == CONFIG.num_frames and len(counts) == 12
         (line,) = lines
         assert "2 workers; dashboard of the cluster: http" in line
         with killing(client) as kill:
-            generate_dataset(CONFIG, killed, workers=workers, progress=kill)
+            make_dataset(CONFIG, killed, workers=workers, progress=kill)
         assert contents(killed) == expected
 
 
 def test_pictures_have_the_same_bytes(client, tmp_path):
     take = tmp_path / "take.truth.npz"
-    simulate_take(TakeConfig(num_frames=24)).save(take)
+    simulate_take(num_frames=24).save(take)
     config = RenderConfig(passes=("depth",), depth_sensor=None, every=6, frames_per_shard=1)
     assert render_take(take, tmp_path / "here", ["png"], config, workers=1) == 4
     executor = client.get_executor()  # Dask's own does as well

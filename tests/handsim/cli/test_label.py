@@ -12,7 +12,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
 from gloves.layout import load_layout
 from handsim.cli.main import main
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 FRAMES = 40
 NAMES = load_layout("dense19").names
@@ -20,7 +20,7 @@ NAMES = load_layout("dense19").names
 
 @pytest.fixture(scope="module")
 def take():
-    return simulate_take(TakeConfig(num_frames=FRAMES))
+    return simulate_take(num_frames=FRAMES)
 
 
 def label(folder, capture, capsys):

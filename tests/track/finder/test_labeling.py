@@ -10,10 +10,10 @@ from gloves.captures.markers import unlabeled_frames
 from gloves.layout import load_layout
 from track.finder.frame_hands import HandFinder
 from track.finder.labeling import label_hands
-from train.evaluation.labeler_evaluation import evaluate_takes
+from train.evaluate import evaluate_labeler
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeling
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 FRAMES = 120
 
@@ -46,15 +46,15 @@ def slots_right(take, labelings):
 
 @pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
 def test_two_hands_are_labeled_as_well_as_each_by_itself(kind, finder):
-    take = simulate_take(TakeConfig(kind=kind, num_frames=FRAMES))
-    alone = evaluate_takes(load_labeler("dense19"), [take]).figures["slot_accuracy"]
+    take = simulate_take(kind=kind, num_frames=FRAMES)
+    alone = evaluate_labeler(load_labeler("dense19"), [take]).figures["slot_accuracy"]
     labelings = label_hands(unlabeled_frames(take.capture()), finder, take.rate)
     assert slots_right(take, labelings) > alone - (0.005 if kind == "single-hand" else 0.03)
     assert np.mean([all(one.hands) for one in labelings]) > 0.95
 
 
 def test_one_hand_none_and_a_body(finder, rng):
-    take = simulate_take(TakeConfig(num_frames=30))
+    take = simulate_take(num_frames=30)
     left = take.observed(take.hand_labels[1])
     body = rng.uniform(-0.9, 0.9, size=(40, 3)) + [0.0, 0.0, 5.0]
     frames = []
@@ -86,7 +86,7 @@ def test_random_points_that_fit_distances_are_no_hand(seed, finder):
 
 
 def test_a_moved_and_mirrored_capture(finder):
-    take = simulate_take(TakeConfig(num_frames=10))
+    take = simulate_take(num_frames=10)
     frames = unlabeled_frames(take.capture())
     straight = label_hands(frames, finder, take.rate)
     mirrored = label_hands([points * [-1.0, 1.0, 1.0] + 3.0 for points in frames], finder, take.rate)
@@ -116,5 +116,5 @@ def test_a_labeler_of_little_confidence_finds_hands(finder):
     rng = np.random.default_rng(0)
     unsure = HandFinder(Unsure(load_labeler("dense19")), load_layout("dense19"), rng=rng)
     assert unsure.certain.confidence < 0.5 < finder.certain.confidence == 0.75
-    take = simulate_take(TakeConfig(num_frames=5))
+    take = simulate_take(num_frames=5)
     assert all(all(one.hands) for one in label_hands(unlabeled_frames(take.capture()), unsure, take.rate))

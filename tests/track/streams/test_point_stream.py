@@ -23,14 +23,14 @@ from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import ReplayServer
 from track.streams.point_stream import open_stream
 from track.tracked_frame import Status
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 LOOPBACK = "127.0.0.1"
 
 
 @functools.cache
 def twin() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=60, seed=5))
+    return simulate_take(kind="hand-controller", num_frames=60, seed=5)
 
 
 class Puppet:

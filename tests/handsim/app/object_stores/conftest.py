@@ -10,8 +10,8 @@ from upath import UPath
 
 from tests.handsim.app.object_stores.stored_set import CONFIG, ROWS, contents
 from train.simulation import generation
-from train.simulation.generation import generate_dataset
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.generation import make_dataset
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +25,7 @@ def whole(tmp_path_factory):
     out = tmp_path_factory.mktemp("whole") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "ROWS_PER_SHARD", ROWS)
-        generate_dataset(CONFIG, out, workers=1)
+        make_dataset(CONFIG, out, workers=1)
     return contents(out)
 
 
@@ -39,5 +39,5 @@ def memory():
 @pytest.fixture(scope="session")
 def take(tmp_path_factory):
     file = tmp_path_factory.mktemp("take") / "take.truth.npz"
-    simulate_take(TakeConfig(num_frames=24)).save(file)
+    simulate_take(num_frames=24).save(file)
     return file

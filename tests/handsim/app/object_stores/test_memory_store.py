@@ -30,18 +30,18 @@ from tests.handsim.app.object_stores.stored_set import (
     write_three,
 )
 from train.data.shards import MANIFEST, Dataset, array_bytes, row_dtype, rows_name, save_array
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 
 pytestmark = pytest.mark.xdist_group("object stores")  # what they share is made once
 
 
 def test_a_training_set_in_a_store_has_the_bytes_of_a_folder(memory, whole, tmp_path):
     told = []
-    manifest = generate_dataset(CONFIG, memory, workers=1, progress=lambda *counts: told.append(counts))
+    manifest = make_dataset(CONFIG, memory, workers=1, progress=lambda *counts: told.append(counts))
     assert told == [(100, 370), (200, 370), (300, 370), (370, 370)]
     assert copied(memory, tmp_path / "copy") == whole
     assert Dataset(tmp_path / "copy").manifest == manifest, "and its checksums are right"
-    assert generate_dataset(CONFIG, tmp_path / "copy", workers=1) == manifest, "a copy goes on as a folder"
+    assert make_dataset(CONFIG, tmp_path / "copy", workers=1) == manifest, "a copy goes on as a folder"
 
 
 def test_a_stopped_one_goes_on_after_what_is_there(memory, whole, tmp_path):
@@ -50,18 +50,18 @@ def test_a_stopped_one_goes_on_after_what_is_there(memory, whole, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(Stopped) as caught:
-        generate_dataset(CONFIG, memory, workers=1, progress=stop)
+        make_dataset(CONFIG, memory, workers=1, progress=stop)
     assert caught.value.kept == f"200 of 370 frames are in {memory}, and the same command goes on after them"
     assert MANIFEST not in names(memory)
     (memory / rows_name(0)).write_bytes(b"half")  # what a store would hold that is none
     told = []
-    generate_dataset(CONFIG, memory, workers=1, progress=lambda *counts: told.append(counts))
+    make_dataset(CONFIG, memory, workers=1, progress=lambda *counts: told.append(counts))
     assert told == [(200, 370), (300, 370), (370, 370)], "shards 0, 2 and 3"
     assert copied(memory, tmp_path / "copy") == whole
 
 
 def test_a_set_grows_and_has_no_manifest_until_it_is_complete(memory, whole, tmp_path):
-    generate_dataset(dataclasses.replace(CONFIG, num_frames=150), memory, workers=1)
+    make_dataset(dataclasses.replace(CONFIG, num_frames=150), memory, workers=1)
     assert MANIFEST in names(memory)
     with_manifest, told = [], []
 
@@ -69,18 +69,18 @@ def test_a_set_grows_and_has_no_manifest_until_it_is_complete(memory, whole, tmp
         with_manifest.append(MANIFEST in names(memory))
         told.append(done)
 
-    generate_dataset(CONFIG, memory, workers=1, progress=note)
+    make_dataset(CONFIG, memory, workers=1, progress=note)
     assert told == [200, 300, 370], "the first shard stays, the half one is made again"
     assert with_manifest == [False] * 3
     assert copied(memory, tmp_path / "copy") == whole
     with pytest.raises(DatasetError, match=f"{memory} holds a .*num_frames: 370 there, 150 here"):
-        generate_dataset(dataclasses.replace(CONFIG, num_frames=150), memory, workers=1)
+        make_dataset(dataclasses.replace(CONFIG, num_frames=150), memory, workers=1)
 
 
 def test_a_store_that_holds_something_else_is_refused(memory, tmp_path):
     (memory / "mine.txt").write_text("mine")
     with pytest.raises(DatasetError, match=f"{memory} is not empty and holds no training set; name another"):
-        generate_dataset(CONFIG, memory, workers=1)
+        make_dataset(CONFIG, memory, workers=1)
     assert names(memory) == {"mine.txt"}
 
 
@@ -167,7 +167,7 @@ def test_without_the_packages_a_sentence_says_how_to_get_them(monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
     with pytest.raises(ArgumentError, match=r"s3://b/x needs a package .* run `pip install 'handsim\[obj"):
-        generate_dataset(CONFIG, "s3://b/x")
+        make_dataset(CONFIG, "s3://b/x")
 
 
 def test_what_renames_its_files_or_merges_goes_to_a_folder(memory, tmp_path, capsys):

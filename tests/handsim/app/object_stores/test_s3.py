@@ -35,7 +35,7 @@ from tests.handsim.app.object_stores.stored_set import (
 )
 from train.data.shards import MANIFEST
 from train.simulation import generation
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 
 pytestmark = pytest.mark.xdist_group("object stores")  # what they share is made once
 ROOT = Path(__file__).resolve().parents[4]
@@ -47,7 +47,7 @@ from train.simulation.frame_scenes import SceneMix
 
 generation.ROWS_PER_SHARD = {ROWS}
 config = DatasetConfig(num_frames={CONFIG.num_frames}, seed=5, frames_per_hand=50, scenes={ALONE})
-generation.generate_dataset(config, sys.argv[1], workers=1)
+generation.make_dataset(config, sys.argv[1], workers=1)
 """
 
 
@@ -183,7 +183,7 @@ def test_workers_of_a_cluster_share_no_folder(s3, whole, tmp_path, monkeypatch):
         # As on another machine: workers do not see the folder that the command runs in.
         monkeypatch.setattr("handsim.app.cluster.Path.cwd", lambda: tmp_path / "nowhere")
         with chosen_workers(cluster.scheduler_address, None, print) as workers:
-            generate_dataset(CONFIG, "s3://bucket/cluster", workers=workers)
+            make_dataset(CONFIG, "s3://bucket/cluster", workers=workers)
     assert contents(s3.folder / "bucket/cluster") == whole
     assert list(here.iterdir()) == []
 
@@ -200,7 +200,7 @@ def test_a_run_that_is_killed_while_it_sends_leaves_whole_objects(s3, whole):
         assert all(name.replace("rows", "hands") in there for name in rows)
         finished.append(len(rows))
     assert finished[0] < finished[1] < 4, "it went on after what was there"
-    generate_dataset(CONFIG, "s3://bucket/killed", workers=1)
+    make_dataset(CONFIG, "s3://bucket/killed", workers=1)
     assert contents(out) == whole
 
 
