@@ -523,6 +523,9 @@ def load_take(path: str | Path) -> Take:
     Args:
         path: The file.
 
+    Returns:
+        Points (T, N, 3) [m] with IDs and labels, and the hands' poses (T, H, 27) [m, rad].
+
     Raises:
         ArgumentError: It is no path.
         CaptureError: No such file, of another kind or schema, or damaged.
