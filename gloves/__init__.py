@@ -13,7 +13,7 @@ from handsim._lazy import lazy_exports
 if TYPE_CHECKING:
     from gloves.captures.capture import Capture
     from gloves.captures.formats import read_capture, write_capture
-    from gloves.fit import GlovedHand, GloveFit, attach, nominal_fit
+    from gloves.fit import GloveFit, attach, nominal_fit
     from gloves.layout import MarkerLayout, load_layout
     from gloves.takes.take import Take, load_take
 
@@ -22,7 +22,6 @@ __getattr__, __dir__ = lazy_exports(
     {
         "Capture": "gloves.captures.capture",
         "GloveFit": "gloves.fit",
-        "GlovedHand": "gloves.fit",
         "MarkerLayout": "gloves.layout",
         "Take": "gloves.takes.take",
         "attach": "gloves.fit",
@@ -37,7 +36,6 @@ __getattr__, __dir__ = lazy_exports(
 __all__ = [
     "Capture",
     "GloveFit",
-    "GlovedHand",
     "MarkerLayout",
     "Take",
     "__version__",
