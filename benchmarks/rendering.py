@@ -1,6 +1,6 @@
 """Speed of rendering, accuracy of depth, and memory.
 
-    MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
+    MUJOCO_GL=egl python -m benchmarks.rendering [speed accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
     colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
@@ -27,22 +27,23 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
-from machine import describe
 
-from handsim.app.workers import in_processes
+from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves.takes.take import Take
+from handsim.app.workers import run_jobs
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig
+from render.drawing import Drawing
 from render.formats.writer import open_writer
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
-from render.session import draw_frames
-from render.shown_take import ShownTake, show_take
 from render.skin.look import ALL_TONES
-from render.studio.studio import Studio
-from train.simulation.takes import TakeConfig, simulate_take
+from render.studio import Moment, Studio
+from render.subject import subject_of_take
+from train.simulation.takes import simulate_take
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
@@ -57,13 +58,14 @@ KINDS: Final = {
 
 
 @functools.lru_cache(maxsize=1)
-def a_take(frames: int) -> ShownTake:
-    return show_take(simulate_take(TakeConfig(kind="hand-hand", num_frames=frames)))
+def a_take(frames: int) -> Take:
+    return simulate_take(kind="hand-hand", num_frames=frames)
 
 
 def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:
     """One worker's share."""
-    return draw_frames(a_take(frames), config, range(frames), shard=shard)
+    drawing = Drawing(subject_of_take(a_take(frames)), config)
+    return drawing.frames(shard, enumerate(range(frames)))
 
 
 def draw(config: RenderConfig, frames: int, shard: int) -> int:
@@ -91,41 +93,39 @@ def rate(job: Callable[[], object], count: int) -> float:
 def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> float:
     """Pictures per second while all processes are at work: from the second shard of each on."""
     ends = []
-    for _ in in_processes(job, range(1 + 6 * cores), cores):
+    for _ in run_jobs(job, range(1 + 6 * cores), cores):
         ends.append(time.perf_counter())
     steady = ends[1 + cores : -cores]  # the first is drawn before there are processes
     return (len(steady) - 1) * frames / (steady[-1] - steady[0])
 
 
-def plain_pyrender(take: ShownTake, color: bool) -> None:
+def plain_pyrender(take: Take, color: bool) -> None:
     """What a user would write: one scene per frame, skinned meshes, one light."""
     pyrender = load_pyrender()
     view = Viewpoints(PLAIN.view, take, rng=np.random.default_rng(0))
     renderer = offscreen_renderer(640, 480)
     for frame in range(take.num_frames):
         scene, camera = pyrender.Scene(), view.cameras(frame)[0]
-        for hand in take.hands:
-            skin = hand.fit.model.skin(hand.qpos[frame : frame + 1])[0]
-            scene.add(
-                pyrender.Mesh.from_trimesh(trimesh.Trimesh(skin, hand.fit.model.surface.faces, process=False))
-            )
+        for number, hand in enumerate(take.hands):
+            skin = hand.model.skin(take.qpos[frame : frame + 1, number])[0]
+            mesh = trimesh.Trimesh(skin, hand.model.surface.faces, process=False)
+            scene.add(pyrender.Mesh.from_trimesh(mesh))
         pose = camera.T_world_camera @ OPENGL_FROM_OPENCV
         scene.add(pyrender.IntrinsicsCamera(600.0, 600.0, 320.0, 240.0), pose=pose)
         scene.add(pyrender.DirectionalLight(intensity=3.0), pose=pose)
         renderer.render(scene, flags=pyrender.RenderFlags.NONE if color else pyrender.RenderFlags.DEPTH_ONLY)
 
 
-def mujoco_loop(take: ShownTake, color: bool) -> None:
+def mujoco_loop(take: Take, color: bool) -> None:
     """MuJoCo's renderer on one hand's capsules; it needs MUJOCO_GL=egl where there is no screen."""
-    hand = take.hands[0]
-    model = hand.fit.model.mj_model
+    model = take.hands[0].model.mj_model
     data = mujoco.MjData(model)
     with mujoco.Renderer(model, 480, 640) as renderer:
         if not color:
             renderer.enable_depth_rendering()
         camera = mujoco.MjvCamera()
         camera.distance = 0.6
-        for qpos in hand.qpos:
+        for qpos in take.qpos[:, 0]:
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)
             camera.lookat[:] = qpos[:3]
@@ -133,23 +133,31 @@ def mujoco_loop(take: ShownTake, color: bool) -> None:
             renderer.render()
 
 
-def speed(frames: int) -> None:
+def speed(frames: int) -> Figures:
     take, cores = a_take(frames), os.cpu_count() or 1
     print(f"\nimages per second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
+    figures: Figures = {}
     with tempfile.TemporaryDirectory() as folder:
         jobs = {name: functools.partial(draw, config, frames) for name, config in KINDS.items()}
         jobs["- written as WebDataset"] = functools.partial(draw_and_write, COLORS, Path(folder), frames)
         for name, job in jobs.items():
-            alone = rate(lambda job=job: job(0), frames)
-            print(f"  {name:32s} {alone:8.1f} {rate_in_processes(job, cores, frames):8.1f}")
+            rates = rate(lambda job=job: job(0), frames), rate_in_processes(job, cores, frames)
+            print(f"  {name:32s} {rates[0]:8.1f} {rates[1]:8.1f}")
+            key = name.strip("- ").split()[-1 if name.startswith("- painted") else 0].strip(",").lower()
+            figures[key] = (f"pictures per second, one process | {cores}: {name}", rates)
+    loops: dict[str, list[float]] = {"pyrender": [], "mujoco": []}
     for color, name in ((False, "depth"), (True, "colors")):
-        print(
-            f"  plain pyrender loop, {name:11s} {rate(lambda c=color: plain_pyrender(take, c), frames):8.1f}"
-        )
-        print(f"  MuJoCo's renderer, {name:13s} {rate(lambda c=color: mujoco_loop(take, c), frames):8.1f}")
+        loops["pyrender"].append(rate(lambda c=color: plain_pyrender(take, c), frames))
+        print(f"  plain pyrender loop, {name:11s} {loops['pyrender'][-1]:8.1f}")
+        loops["mujoco"].append(rate(lambda c=color: mujoco_loop(take, c), frames))
+        print(f"  MuJoCo's renderer, {name:13s} {loops['mujoco'][-1]:8.1f}")
+    what = {"pyrender": "a plain pyrender loop", "mujoco": "MuJoCo's renderer, capsules without skin"}
+    for key, rates_of in loops.items():
+        figures[key] = (f"pictures per second, one process, {what[key]}: depth | colors", rates_of)
+    return figures
 
 
-def accuracy(frames: int) -> None:
+def accuracy(frames: int) -> Figures:
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     take = a_take(frames)
@@ -158,7 +166,7 @@ def accuracy(frames: int) -> None:
     off, agree = [], []
     for frame in np.linspace(0, take.num_frames - 1, 8).astype(int):
         camera = view.cameras(frame)[0]
-        surface = join([one.triangles for one in studio._drawn(int(frame), 0.0)])
+        surface = join([one.triangles for one in studio._drawn(Moment(take, int(frame)), 0.0)])
         mine = rasterize(camera, surface)
         vertices = np.asarray(surface.vertices, dtype=np.float64)
         caster = RayMeshIntersector(trimesh.Trimesh(vertices, surface.faces, process=False))
@@ -177,22 +185,32 @@ def accuracy(frames: int) -> None:
         f"{np.quantile(errors, 0.999):.2g} mm; ids and silhouettes agree on {100 * min(agree):.3f} % of the "
         "pixels or more"
     )
+    return {
+        "median": ("drawn depth against embree, median [mm]", np.median(errors)),
+        "most": ("drawn depth against embree, 99.9 % within [mm]", np.quantile(errors, 0.999)),
+    }
 
 
-def bare_studio(take: ShownTake) -> Studio:
+def bare_studio(take: Take) -> Studio:
     rng = np.random.default_rng(0)
-    return Studio(take, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng), [])
+    return Studio(take.hands, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng))
 
 
-def memory(images: int) -> None:
-    frames = 200
+def memory(images: int) -> Figures:
+    frames, megabytes = 200, list[float]()
     print(f"\nresident memory over {images} pictures (colors, depth, ids)")
     page = os.sysconf("SC_PAGE_SIZE")
     for shard in range(images // frames):
         draw(COLORS, frames, shard)
         if shard % max(1, images // frames // 8) == 0:
             pages = int(Path("/proc/self/statm").read_text().split()[1])
-            print(f"  {(shard + 1) * frames:6d}: {pages * page / 2**20:.1f} MB", flush=True)
+            megabytes.append(pages * page / 2**20)
+            print(f"  {(shard + 1) * frames:6d}: {megabytes[-1]:.1f} MB", flush=True)
+    few = min(1, len(megabytes) - 1)
+    return {
+        "early": ("resident memory at the second look [MB]", megabytes[few]),
+        "late": ("resident memory at the last look [MB]", megabytes[-1]),
+    }
 
 
 def main() -> None:
@@ -200,12 +218,15 @@ def main() -> None:
     parser.add_argument("section", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--images", type=int, default=20000)
+    add_save(parser)
     options = parser.parse_args()
+    if options.save and len(options.section) != 1:
+        parser.error("--save keeps the figures of one section")
     print(describe())
     for name in options.section or SECTIONS:
-        {"speed": speed, "accuracy": accuracy}.get(name, memory)(
-            options.images if name == "memory" else options.frames
-        )
+        section = {"speed": speed, "accuracy": accuracy}.get(name, memory)
+        figures = section(options.images if name == "memory" else options.frames)
+        save_figures(options.save, figures)
 
 
 if __name__ == "__main__":

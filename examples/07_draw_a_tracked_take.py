@@ -14,18 +14,17 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from gloves import nominal_fit
 from handsim import Camera
-from render import RenderConfig, RenderedFrame, SkinLook, ViewConfig, draw_frames, render_take
-from track import Tracker, track_capture
-from train import TakeConfig, load_labeler, simulate_take
+from render import RenderConfig, RenderedFrame, SkinLook, ViewConfig, draw, render_take
+from track import track_capture
+from train import simulate_take
 
 
 def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
     camera: Camera = frame.camera
     for hand, true in zip(frame.hands, truth.hands, strict=True):
-        off = np.linalg.norm(hand.pixels - camera.project(true.keypoints), axis=1)[hand.visible]
-        shown = frame.ideal.depth[frame.ideal.depth > 0]
+        off = np.linalg.norm(hand.keypoints - camera.project(true.keypoints_world), axis=1)[hand.visible]
+        shown = frame.depth[frame.depth > 0]
         print(
             f"{frame.key}, {hand.shape.side}: {hand.visible.sum()} of 21 keypoints visible, "
             f"{np.mean(off):.1f} px off, hands at {1e3 * np.median(shown):.0f} mm"
@@ -33,19 +32,17 @@ def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
 
 
 def main() -> None:
-    truth = simulate_take(TakeConfig(kind="hand-hand", num_frames=120))  # 1 s at 120 Hz
-    hands = [nominal_fit(hand.layout, "M", hand.side) for hand in truth.hands]  # nobody was calibrated
-    tracked = track_capture(truth.capture(), Tracker(hands, load_labeler("dense19")))
+    truth = simulate_take(kind="hand-hand", num_frames=120)  # 1 s at 120 Hz
+    tracked = track_capture(truth.capture(), glove="dense19")  # nobody was calibrated
     tone = SkinLook(lightness=45.0).typology_angle  # [deg]; people with skin about as dark as this
     config = RenderConfig(
         view=ViewConfig("orbit"), passes=("rgb", "depth"), tones=(tone - 5.0, tone + 5.0), every=40, seed=1
     )
-    drawn = draw_frames(tracked, config, [0, 40, 80])
-    for pair in zip(drawn, draw_frames(truth, config, [0, 40, 80]), strict=True):
+    drawn, true = draw(tracked, config=config), draw(truth, config=config)  # every 40th frame
+    for pair in zip(drawn, true, strict=True):
         compare(*pair)
     with TemporaryDirectory() as folder:
-        tracked.save(Path(folder) / "tracked.npz")
-        count = render_take(Path(folder) / "tracked.npz", Path(folder) / "out", ["coco"], config, workers=1)
+        count = render_take(tracked, Path(folder) / "out", "coco", config, workers=1)
         coco = json.loads((Path(folder) / "out" / "annotations.json").read_text())
     print(f"{count} pictures, {len(coco['annotations'])} annotated hands")
 

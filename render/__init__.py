@@ -1,9 +1,8 @@
 """Pictures of hands with exact ground truth.
 
-`render_take` writes colors, depth, normals, ids and annotations of a whole take; `draw_frames` yields
-single `RenderedFrame`s in memory. A `RenderConfig` says what is drawn.
-A `PoseFile` has poses of your own, which `render_take` draws too; `merge_renderings` makes one folder of
-several.
+`draw` yields pictures of a take or of your own poses in memory, `render_take` writes them into files,
+`PictureStream` feeds a training loop without end. A `RenderConfig` says what is drawn, a `ViewConfig` from
+where. `merge_renderings` makes one folder of several.
 """
 
 from typing import TYPE_CHECKING
@@ -14,34 +13,35 @@ from handsim._lazy import lazy_exports
 if TYPE_CHECKING:
     from render.cameras.viewpoints import ViewConfig
     from render.config import RenderConfig
+    from render.drawing import draw
     from render.formats.merging import merge_renderings
-    from render.frames.frame import RenderedFrame
-    from render.own_poses import PoseFile
-    from render.session import draw_frames, render_take
+    from render.frames import RenderedFrame
+    from render.session import render_take
     from render.skin.look import SkinLook
+    from render.stream import PictureStream
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "PoseFile": "render.own_poses",
+        "PictureStream": "render.stream",
         "RenderConfig": "render.config",
-        "RenderedFrame": "render.frames.frame",
+        "RenderedFrame": "render.frames",
         "SkinLook": "render.skin.look",
         "ViewConfig": "render.cameras.viewpoints",
-        "draw_frames": "render.session",
+        "draw": "render.drawing",
         "merge_renderings": "render.formats.merging",
         "render_take": "render.session",
     },
 )
 
 __all__ = [
-    "PoseFile",
+    "PictureStream",
     "RenderConfig",
     "RenderedFrame",
     "SkinLook",
     "ViewConfig",
     "__version__",
-    "draw_frames",
+    "draw",
     "merge_renderings",
     "render_take",
 ]

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+import numpy as np
+
 from handsim.errors import ArgumentError, choices
 from render.cameras.viewpoints import ViewConfig
-from render.frames.frame import PASSES
+from render.frames import PASSES
 from render.painting.painter import PainterChoice, choose_painter
 from render.scenery.backgrounds import BackgroundConfig
 from render.sensors.depth_noise import DepthNoiseConfig
@@ -21,6 +24,23 @@ NEAR_SENSOR: Final = "d435"
 near: it measures from 0.2 m on."""
 FAR_SENSOR: Final = "kinect2"
 """Depth sensor of all other placements; it measures from 0.5 m on."""
+
+
+class SpawnKey(enum.IntEnum):
+    """What a child of a seed draws: the first number of its spawn key."""
+
+    VIEWPOINTS = 1
+    SHARD = 2
+    """Then the number of the shard, and of one of its frames."""
+    PEOPLE_OF_FRAMES = 3
+    PERSON = 4
+    """Then the number of the person, and 0 for the hand or 1 for the skin."""
+    STREAM = 5
+    """Then the kind and the number of what a stream draws."""
+
+    def rng(self, seed: int, *numbers: int) -> np.random.Generator:
+        """The generator of the child with these further numbers."""
+        return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(self, *numbers)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,50 +1,39 @@
-"""Rendering of takes in shards: on all cores, resumable, with the same bytes for any number of workers."""
+"""`render_take`: takes drawn into files in shards, resumable, the same bytes for any number of workers."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
+from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim.app.executors.executor import Executor, executor_of
-from handsim.app.executors.output import FolderOutput, Make, Output, open_output
 from handsim.app.interrupts import Stopped
+from handsim.app.output import Make, Output, Place, open_output, place_of
+from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning, choices
-from handsim.files.atomic import remove_leftovers
-from handsim.files.disk import check_free
-from handsim.files.inputs import checksum
+from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
-from handsim.files.object_folder import ObjectFolder
-from render.cameras.own_cameras import check_hands_in_view
-from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
+from render.drawing import Cameras, Drawing, configured
 from render.formats.annotations.common import without_colors
+from render.formats.clip_writer import TAR
 from render.formats.merging import CONFIG
 from render.formats.shards import INDEX
 from render.formats.writer import FORMATS, NEED_COLORS, open_writer
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 from render.illustrations.captions import write_png
 from render.illustrations.contact_sheet import contact_sheet
-from render.own_poses import PoseFile, load_poses
-from render.painting.figures import sample_people
-from render.painting.painter import choose_painter
-from render.scenery.enclosures import enclose
 from render.scenery.photographs import photo_files
-from render.scenery.surroundings import sample_surroundings
-from render.sensors.depth_noise import sample_depth_noise
-from render.sensors.exposure import sample_exposure
-from render.sensors.shutter import sample_shutter
-from render.shown_take import ShownTake, load_shown_take, show_take
-from render.skin.look import SkinLook
-from render.studio.studio import FrameChoices, Studio
+from render.subject import Model, PoseFile, Source, load_subject, source_of
 
 Progress = Callable[[int, int], None]
 """Called with the numbers of finished pictures and of all pictures."""
@@ -52,28 +41,40 @@ SHEET: Final = "contact_sheet.png"
 _RENAMES: Final = "freihand"
 _LEFT_OUT: Final = "left_out-{}.json"
 _ON_SHEET: Final = 9
-_PATHS: Final = 1  # spawn keys of choices for the whole take, and for one shard
-_SHARDS: Final = 2
-_MOST_STUDIOS: Final = 32  # of people with painted skins that are kept, some 5 MB each
 
 
 def render_take(
-    path: Path | PoseFile,
-    out: Path | ObjectFolder,
-    formats: Sequence[str],
-    config: RenderConfig,
+    source: Take | str | Path | PoseFile | ArrayLike,
+    out: str | Place,
+    formats: str | Sequence[str] = ("webdataset",),
+    config: RenderConfig | None = None,
     *,
+    model: Model | tuple[Model, Model] | None = None,
+    times: ArrayLike | None = None,
+    people: int | Sequence[Model] | None = None,
+    person: ArrayLike | None = None,
+    glove: MarkerLayout | str | None = None,
+    camera: Cameras | None = None,
     workers: int | Executor | None = None,
     progress: Progress | None = None,
 ) -> int:
-    """Draw a take; a second call resumes where the first was stopped.
+    """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
     Args:
-        path: A tracked take (`.npz`), the truth of a simulated one (`.truth.npz`), or poses of your own.
-        out: Folder, or a folder of an object store; each of several formats has a folder of its own in it.
+        source: A take or its path; or poses (T, 27), joint angles (T, 20) with the wrist at the origin, or
+            poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
+        out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
+            formats has a folder of its own in it.
         formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
-        workers: Processes, all cores when not given; or who else draws the shards.
+        model: The hand of your own poses, or both in the poses' order; drawn people when not given.
+        times: Time of each pose (T,) [s]; poses are no motion without them.
+        people: Who strikes your poses, instead of the model: a number of drawn people, or their hands.
+        person: Number of the person in each pose (T,); distributed at random when not given.
+        glove: Marker layout on the hands of your poses, where they wear gloves; dense19 when not given.
+        camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
+        workers: Number of processes, all cores when not given; or an executor, as Dask's
+            `Client.get_executor()`.
         progress: Called after every shard.
 
     Returns:
@@ -84,40 +85,41 @@ def render_take(
         HandSimError: The take or the settings cannot be drawn, or all frames would be left out; finished
             shards are kept.
     """
+    formats = (formats,) if isinstance(formats, str) else tuple(formats)
+    config = configured(config, camera, None).settled()
     _check_formats(formats, config)
-    if isinstance(out, ObjectFolder) and _RENAMES in formats:
+    place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
+    if not isinstance(place, Path) and _RENAMES in formats:
         raise HandSimError(
             f"{out}: {_RENAMES} renames its pictures at the end, which no object store can; render into a "
             "folder and copy it"
         )
-    executor = executor_of(workers)
-    config = config.settled()
-    take = _load(path, config)
+    kept = source_of(
+        source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
+    )
+    drawing = Drawing(load_subject(kept, seed=config.seed), config)
     if config.background.photo > 0.0:
         photo_files(Path(str(config.background.photos)))
-    shards = _shards(take, config)
-    viewpoints = _viewpoints(take, config)
-    views = viewpoints.num_cameras
-    if config.view.cameras is not None:
-        check_hands_in_view(config.view.cameras, viewpoints.cameras(0), take)
-    settings = _settings(path, take, viewpoints, config) | {"formats": list(formats)}
-    make = functools.partial(_render_shard, path, tuple(formats), config)
-    with open_output(out) as output:
+    drawing.check_view()
+    shards, views = drawing.shards(), drawing.viewpoints.num_cameras
+    make = functools.partial(_render_shard, kept, formats, config)
+    with open_output(place) as output:
+        settings = _settings(drawing) | {"formats": list(formats)}
         output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
-        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], executor, progress)
-        output.collect(INDEX, _LEFT_OUT.format("*"))
+        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], workers, progress)
+        output.fetch(INDEX, _LEFT_OUT.format("*"))
         for name in formats:
             open_writer(name, _folder(output.folder, formats, name)).finish()
         lost = frozenset(left_out_frames(output.folder))
-        kept = [[frame for frame in shard if frame not in lost] for shard in shards]
-        if not any(kept):
+        drawn = [[frame for frame in shard if frame not in lost] for shard in shards]
+        if not any(drawn):
             raise HandSimError(
                 f"{out}: no pictures: in all {len(lost)} frames a camera would be inside a hand or an "
                 "object; give another placement, distance or seed"
             )
-        _write_sheet(output.folder, take, config, kept)
+        _write_sheet(output.folder, drawing, drawn)
         output.publish(SHEET)
-    return views * sum(map(len, kept))
+    return views * sum(map(len, drawn))
 
 
 def _draw_shards(
@@ -125,60 +127,43 @@ def _draw_shards(
     formats: Sequence[str],
     make: Make,
     counts: Sequence[int],
-    executor: Executor,
+    workers: int | Executor,
     progress: Progress | None,
 ) -> None:
     """Have the shards drawn that are not there; each has a count of pictures."""
-    done, total = _finished(output, formats), sum(counts)
+    output.fetch(INDEX, names_of=[f"*{TAR}"])
+    done, total = _finished(output.folder, formats), sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
     try:
-        for drawn, number in enumerate(executor.run(output.job(make), todo)):
+        job = output.job(make, last=[INDEX, f"*{TAR}"])
+        for drawn, number in enumerate(run_jobs(job, todo, workers)):
             count += counts[number]
             if progress is not None:
                 progress(count, total)
-            if drawn == 0 and isinstance(output, FolderOutput):
+            if drawn == 0 and output.is_here:
                 _check_space(output.folder, len(done) + 1, len(todo) - 1)
     except KeyboardInterrupt as stop:
-        remove_leftovers(output.folder)  # of workers that had no time to
         drawn_so_far = f"{count} of {total} images are in {output}, and the same command goes on after them"
         raise Stopped.again(stop, drawn_so_far) from stop
 
 
-def _load(path: Path | PoseFile, config: RenderConfig) -> ShownTake:
-    """A take, or poses that are drawn like one."""
-    if not isinstance(path, PoseFile):
-        return load_shown_take(path)
-    take = load_poses(path, seed=config.seed)
-    if config.shutter is not None and not take.is_motion:
-        raise HandSimError(f"{path.path}: poses without times have no motion to blur; add the array times")
-    return take
-
-
-def _settings(
-    path: Path | PoseFile, take: ShownTake, viewpoints: Viewpoints, config: RenderConfig
-) -> dict[str, Any]:
-    """What decides the pictures, as JSON; files that others write count by their content."""
-    name = path.path.name if isinstance(path, PoseFile) else path.name
-    settings: dict[str, Any] = {"take": name, "frames": take.num_frames} | dataclasses.asdict(config)
-    if config.view.cameras is None:
+def _settings(drawing: Drawing) -> dict[str, Any]:
+    """What decides the pictures, as JSON; what is not a take's file counts by its content."""
+    subject = drawing.subject
+    settings: dict[str, Any] = {"take": subject.name, "frames": subject.take.num_frames}
+    settings |= dataclasses.asdict(drawing.config)
+    if drawing.config.view.cameras is None:
         del settings["view"]["cameras"]
     else:
-        settings["view"]["cameras"] = [camera.record() for camera in viewpoints.cameras(0)]
-    if isinstance(path, PoseFile):
-        settings["poses"] = {
-            "sha256": checksum(path.path),
-            "sides": list(path.sides),
-            "people": path.people,
-            "glove": path.glove,
-        }
-    return settings
+        settings["view"]["cameras"] = [camera.record() for camera in drawing.viewpoints.cameras(0)]
+    return settings if subject.poses is None else settings | {"poses": subject.poses}
 
 
-def left_out_frames(out: Path | ObjectFolder) -> list[int]:
+def left_out_frames(out: str | Place) -> list[int]:
     """Numbers of the frames that a rendering left out: a camera would be inside a hand or an object."""
     with open_output(out) as output:
-        output.collect(_LEFT_OUT.format("*"))
+        output.fetch(_LEFT_OUT.format("*"))
         files = sorted(output.folder.glob(_LEFT_OUT.format("*")))
         return sorted(frame for file in files for frame in load_json(file)["frames"])
 
@@ -203,47 +188,31 @@ def _folder(out: Path, formats: Sequence[str], name: str) -> Path:
     return out if len(formats) == 1 else out / name
 
 
-def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
-    if not isinstance(output, FolderOutput):
-        return frozenset(output.receipts)
-    done = [open_writer(name, _folder(output.folder, formats, name)).done() for name in formats]
+def _finished(folder: Path, formats: Sequence[str]) -> frozenset[int]:
+    done = [open_writer(name, _folder(folder, formats, name)).done() for name in formats]
     return frozenset.intersection(*done)
 
 
-def _shards(take: ShownTake, config: RenderConfig) -> list[list[int]]:
-    """Frames of each shard; frames without a hand are left out."""
-    present = np.isfinite(take.wrists()[..., 0]).any(axis=1)
-    frames = [frame for frame in range(0, take.num_frames, config.every) if present[frame]]
-    size = config.frames_per_shard
-    return [frames[first : first + size] for first in range(0, len(frames), size)]
-
-
-def _viewpoints(take: ShownTake, config: RenderConfig) -> Viewpoints:
-    rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(_PATHS,)))
-    return Viewpoints(config.view, take, rng=rng)
-
-
 @functools.lru_cache(maxsize=1)
-def _opened(path: Path | PoseFile, config: RenderConfig) -> tuple[ShownTake, Viewpoints]:
-    """A take and its cameras; cached, because a worker draws many of its shards."""
+def _opened(source: Source, config: RenderConfig) -> Drawing:
+    """What is drawn; cached, because a worker draws many of its shards."""
     cv2.setNumThreads(1)  # there is one process per core
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)  # told once, before the work
-        take = _load(path, config)
-    return take, _viewpoints(take, config)
+        return Drawing(load_subject(source, seed=config.seed), config)
 
 
 def _render_shard(
-    path: Path | PoseFile, formats: tuple[str, ...], config: RenderConfig, out: Path, shard: int
+    source: Source, formats: tuple[str, ...], config: RenderConfig, out: Path, shard: int
 ) -> int:
-    take, viewpoints = _opened(path, config)
+    drawing = _opened(source, config)
     lost: list[int] = []
 
     def leave_out(frame: int) -> None:
         lost.append(frame)  # on the disk before the shard is, so that no kill loses it
         save_json(out / _LEFT_OUT.format(f"{shard:05d}"), {"frames": lost})
 
-    frames = draw_shard(take, viewpoints, config, shard, _shards(take, config)[shard], leave_out=leave_out)
+    frames = drawing.frames(shard, enumerate(drawing.shards()[shard]), leave_out=leave_out)
     kept = list(frames) if len(formats) > 1 else frames
     for name in formats:
         writer = open_writer(name, _folder(out, formats, name))
@@ -252,118 +221,17 @@ def _render_shard(
     return shard
 
 
-def draw_frames(
-    take: Take | ShownTake, config: RenderConfig, frames: Sequence[int], *, shard: int = 0
-) -> Iterator[RenderedFrame]:
-    """Some frames of a take, seen by all its cameras.
-
-    Args:
-        take: A simulated take, whose truth is drawn, or a tracked one.
-        config: What to draw.
-        frames: Numbers of frames in the take.
-        shard: Number of the shard; people change with it, as does all else that does not vary by frame.
-
-    Yields:
-        Each frame once per camera, with pictures (H, W, 3), depth (H, W) [m], and the truth of every hand in
-        the world [m] and in the picture [px].
-
-    Raises:
-        HandSimError: A camera stands in a hand or an object.
-    """
-    shown = take if isinstance(take, ShownTake) else show_take(take)
-    return draw_shard(shown, _viewpoints(shown, config), config, shard, frames)
-
-
-def draw_shard(
-    take: ShownTake,
-    viewpoints: Viewpoints,
-    config: RenderConfig,
-    shard: int,
-    frames: Sequence[int],
-    *,
-    leave_out: Callable[[int], None] | None = None,
-) -> Iterator[RenderedFrame]:
-    """Some frames of a take, seen by all its cameras, with the people of this shard.
-
-    Args:
-        take: The take.
-        viewpoints: Its cameras.
-        config: What to draw.
-        shard: Number of the shard.
-        frames: Numbers of the frames.
-        leave_out: Told of a frame with a camera inside a hand or an object, which no camera draws then;
-            without it such a frame is an error.
-    """
-    seeds = np.random.SeedSequence(config.seed, spawn_key=(_SHARDS, shard)).spawn(1 + len(frames))
-    around = viewpoints.positions() if viewpoints.num_cameras > 1 else None
-    rng = np.random.default_rng(seeds[0])
-    studio = _studio(take, config, rng) if take.cast is None else None
-    kept: dict[int, FrameChoices] = {}
-    for frame, seed in zip(frames, seeds[1:], strict=True):
-        person = 0 if take.cast is None else take.cast.person_in(frame, shard)
-        if take.cast is not None:
-            studio = _studio_of(take, config, person)
-            rng = np.random.default_rng(seeds[0])  # all people of a shard are in one place
-        assert studio is not None
-        own = np.random.default_rng(seed)
-        if config.vary == "frame":
-            chosen = _choices(config, studio.skin, around, own)
-        else:
-            if person not in kept:
-                kept[person] = _choices(config, studio.skin, around, rng)
-            chosen = kept[person]
-        cameras = viewpoints.cameras(frame)
-        if leave_out is not None and not studio.is_clear(frame, cameras):
-            leave_out(frame)
-            continue
-        for camera in cameras:
-            fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
-            yield studio.photograph(frame, camera, fresh)
-
-
-def _studio(take: ShownTake, config: RenderConfig, rng: np.random.Generator) -> Studio:
-    """The hands and bodies of a take, on people drawn by a generator."""
-    people = sample_people(len(take.hands), config.dress == "glove", tones=config.tones, rng=rng)
-    colors = [tuple(rng.uniform(0.05, 0.9, 3).tolist()) for _ in take.bodies]
-    painter = choose_painter(config.with_chosen_painter().painter)
-    return Studio(take, people, colors, config.passes, painter=painter)
-
-
-@functools.lru_cache(maxsize=_MOST_STUDIOS)
-def _studio_of(take: ShownTake, config: RenderConfig, person: int) -> Studio:
-    """The hands of one of the cast, with a skin of their own; cached, because they come back."""
-    assert take.cast is not None
-    return _studio(take.of_person(person), config, take.cast.rng(person))
-
-
-def _choices(
-    config: RenderConfig, skin: SkinLook | None, around: NDArray[np.float64] | None, rng: np.random.Generator
-) -> FrameChoices:
-    """Random choices; a background that several cameras share is around these positions (N, 3) [m]."""
-    background, lighting = sample_surroundings(config.background, skin, rng=rng)
-    sensor = config.chosen_depth_sensor
-    return FrameChoices(
-        lighting=lighting,
-        background=background,
-        exposure=None if config.color_sensor is None else sample_exposure(config.color_sensor, rng=rng),
-        shutter=None if config.shutter is None else sample_shutter(config.shutter, rng=rng),
-        depth_noise=None if sensor is None else sample_depth_noise(sensor, rng=rng),
-        seed=0,
-        enclosure=None if around is None else enclose(around, background.seed),
-    )
-
-
-def _write_sheet(out: Path, take: ShownTake, config: RenderConfig, shards: list[list[int]]) -> None:
+def _write_sheet(out: Path, drawing: Drawing, shards: list[list[int]]) -> None:
     """Write a few of the pictures on one sheet."""
-    if not {"rgb", "depth"} & set(config.passes):
+    if not {"rgb", "depth"} & set(drawing.config.passes):
         return
-    viewpoints, frames = _viewpoints(take, config), []
+    frames: list[RenderedFrame] = []
     filled = [number for number, shard in enumerate(shards) if shard]
     for shard in np.array(filled)[np.unique(np.linspace(0, len(filled) - 1, _ON_SHEET).round().astype(int))]:
-        chosen_frames = (
+        chosen = (
             shards[shard][:1]
             if len(filled) >= _ON_SHEET
             else shards[shard][:: max(1, len(shards[shard]) // 3)][:3]
         )
-        frames += list(draw_shard(take, viewpoints, config, int(shard), chosen_frames))
+        frames += list(drawing.frames(int(shard), enumerate(chosen)))
     write_png(out / SHEET, contact_sheet(frames[:_ON_SHEET]))

@@ -5,18 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
 from handsim.cli.simulate import simulate
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel
+from render import RenderConfig, draw
 from render.cameras.viewpoints import ViewConfig
-from render.session import RenderConfig, draw_frames
-from render.shown_take import load_shown_take
 from track.capture_tracking import track_capture
-from track.evaluation.take_evaluation import true_users
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0
@@ -36,7 +33,7 @@ def tracked(truth):
     """Tracked from the file of points alone."""
     take, folder = truth
     capture = read_capture(folder / "take.c3d")
-    result = track_capture(capture, Tracker(true_users(take), load_labeler("dense19")))
+    result = track_capture(capture, hands=true_users(take), labeler="dense19")
     result.save(folder / "tracked.npz")
     return load_take(folder / "tracked.npz"), folder
 
@@ -58,15 +55,14 @@ def test_hands_are_tracked_to_a_millimeter(truth, tracked):
 
 def test_pictures_of_tracked_hands_have_their_keypoints_where_the_truth_is(truth, tracked):
     take, folder = truth
-    shown = load_shown_take(folder / "tracked.npz")
     config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("rgb", "depth", "ids"))
     off = []
-    for frame in draw_frames(shown, config, range(10, FRAMES, 20)):
+    for frame in draw(folder / "tracked.npz", config=config, frames=range(10, FRAMES, 20)):
         assert frame.camera.size == (640, 480) and len(frame.hands) == 2
         for hand in frame.hands:
             true = next(one for one in take.moving_hands() if one.shape.side == hand.shape.side)
             points = hand_keypoints(HandModel(true.shape), true.qpos[frame.number : frame.number + 1])[0]
-            off.append(np.linalg.norm(frame.camera.project(points) - hand.pixels, axis=-1))
+            off.append(np.linalg.norm(frame.camera.project(points) - hand.keypoints, axis=-1))
     assert np.mean(off) <= MOST_PIXELS
 
 

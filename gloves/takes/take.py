@@ -32,6 +32,7 @@ from gloves.takes.columns import (
     stacked_frames,
 )
 from gloves.takes.formats import motion_format
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, choices
 from handsim.hand.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
@@ -526,8 +527,10 @@ def load_take(path: str | Path) -> Take:
         Times (T,) [s], poses (T, H, 27) [m, rad], points (T, N, 3) [m] and their labels (T, N).
 
     Raises:
+        ArgumentError: It is no path.
         CaptureError: No such file, of another kind or schema, or damaged.
     """
+    check_type("path", path, (str, Path), "the path of a take")
     return read_archive(path, unpack_take)
 
 

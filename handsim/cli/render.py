@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal, cast
 
 import tyro
 from rich.console import Console
 
-from handsim.app.executors.executor import choose_executor
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
+from handsim.app.output import place_of
 from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimError, choices
-from handsim.files.object_folder import folder_or_objects
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from render.cameras.viewpoints import ViewConfig
+from render.cameras.viewpoints import Placement, ViewConfig
 from render.config import RenderConfig
 from render.formats.merging import merge_renderings
-from render.own_poses import PoseFile
 from render.painting.painter import PainterChoice
 from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind
 from render.scenery.photographs import photo_files
@@ -29,19 +28,34 @@ from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
 from render.session import SHEET, left_out_frames, render_take
 from render.skin.look import ALL_TONES, TONES, named_tones
+from render.subject import PoseFile
 
 _NO_SENSOR: Final = "none"
 _AUTO_SENSOR: Final = "auto"
 _DEFAULT: Final = RenderConfig()
-_AS_IN_CONFIG: Final = ("passes", "view", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
+_VIEW: Final = ViewConfig()
+_AS_IN_VIEW: Final = ("placement", "camera", "views", "distance", "rig", "cameras")
+_AS_IN_CONFIG: Final = ("passes", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
 
 
 @dataclass(frozen=True, slots=True)
 class RenderOptions:
     """`RenderConfig` as the options of the command name it."""
 
-    view: Annotated[ViewConfig, tyro.conf.arg(name="")] = field(default_factory=ViewConfig)
-    """Cameras, and where they stand."""
+    placement: Placement = _VIEW.placement
+    """Position of the cameras. still: in front of the hands. orbit: around them. head: at the user's eyes.
+    anywhere: at another position in every frame. rig: at the cameras of a rig."""
+    camera: str = _VIEW.camera
+    """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
+    views: int = _VIEW.views
+    """Number of cameras; a rig has its own number."""
+    distance: tuple[float, float] = _VIEW.distance
+    """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
+    rig: str = _VIEW.rig
+    """Rig for the placement rig: a shipped name or the path of a .toml file."""
+    cameras: str | None = None
+    """File of your own cameras, instead of all these: ours (.toml), OpenCV's (.yml, .json), or COLMAP's (the
+    folder of cameras.txt and images.txt)."""
     passes: tuple[str, ...] = _DEFAULT.passes
     """Pictures to draw: rgb, depth, normals, ids."""
     dress: Literal["skin", "glove"] = _DEFAULT.dress
@@ -79,6 +93,7 @@ class RenderOptions:
         """
         return RenderConfig(
             **{name: getattr(self, name) for name in _AS_IN_CONFIG},
+            view=ViewConfig(**{name: getattr(self, name) for name in _AS_IN_VIEW}),
             tones=_tone_ranges(self.tones),
             background=_backgrounds(self.background, self.photos),
             depth_sensor=_sensors(self.depth_sensor),
@@ -123,7 +138,7 @@ def render(
     """
     if sum((take is not None, poses is not None, bool(merge))) != 1:
         raise HandSimError("expected a take, --poses or --merge, and one of them alone")
-    place = folder_or_objects(out)
+    place = place_of(out)
     if merge:
         if not isinstance(place, Path):
             raise HandSimError(f"--merge copies into a folder, and {place} is none; copy that folder then")
@@ -136,18 +151,21 @@ def render(
         source: Path | PoseFile = cast("Path", take)
     else:
         source = PoseFile(poses, hands, people, glove)
-    check_outputs((take, poses, options.view.cameras), (place if isinstance(place, Path) else None,))
+    check_outputs((take, poses, options.cameras), (place if isinstance(place, Path) else None,))
     config = options.config()
     start = time.perf_counter()
     if options.photos is not None:
         _print_left_out(options.photos)
-    with progress_bar("images") as (bar, task):
+    with (
+        progress_bar("images") as (bar, task),
+        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+    ):
         count = render_take(
             source,
             place,
             format,
             config,
-            workers=choose_executor(cluster, workers, place, print_above(bar)),
+            workers=chosen,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     seconds = time.perf_counter() - start

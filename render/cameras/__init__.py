@@ -1,6 +1,5 @@
 """The cameras of pictures: where they stand, and what their lenses do to a picture.
 
-- viewpoints: the cameras of each frame of a take (still, orbit, head, anywhere, rig).
-- own_cameras: a check that the cameras of a user's file look at the hands.
+- viewpoints: the cameras of each frame of a take (still, orbit, head, anywhere, rig), or around a hand.
 - warp: pictures through a lens, resampled from pinhole pictures.
 """

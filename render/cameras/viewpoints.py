@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -16,15 +17,17 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from handsim.errors import ArgumentError, choices
-from handsim.space.camera import Camera, preset
-from handsim.space.cameras import load_rig, look_at
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError, HandSimWarning, RigError, choices
+from handsim.hand.keypoints import hand_keypoints
+from handsim.space.camera import Camera, look_at, preset
+from handsim.space.cameras import load_rig
 from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
-from render.shown_take import ShownTake
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 PLACEMENTS: Final[tuple[Placement, ...]] = ("still", "orbit", "head", "anywhere", "rig")
+_CHUNK: Final = 2048  # frames whose keypoints are projected at once
 _HAND_CENTER: Final = 0.08  # [m] from the wrist to the center of the hand
 _EYES: Final = (0.32, 0.38)  # [m] of the head's camera behind and above the hands
 _HEAD_CLEARANCE: Final = np.deg2rad(50.0)  # between a head's line of sight and a forearm, at least
@@ -32,6 +35,9 @@ _HEAD_DELAY: Final = 1.0  # [s] over which a head follows the hands
 _ORBIT_PERIOD: Final = 12.0  # [s] of one revolution of a camera in orbit
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
 _TRIES: Final = 20
+_SKIN_CLEARANCE: Final = 0.08  # [m] between a camera around hands and the nearest keypoint, at least
+_FREE: Final = 0.8  # of the room around hands in a picture, which they are shifted within
+_ROUNDS: Final = 8
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # between a view and a forearm, at least
 
 
@@ -54,15 +60,18 @@ class ViewConfig:
     """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
     rig: str = "six"
     """Rig for the placement rig: a shipped name or the path of a .toml file."""
-    cameras: str | None = None
-    """File of your own cameras, instead of all these: ours (.toml), OpenCV's (.yml, .json), or COLMAP's (the
-    folder of cameras.txt and images.txt)."""
+    cameras: str | tuple[Camera, ...] | None = None
+    """Your own cameras, fixed in the world, instead of all these; or a file of them: ours (.toml), OpenCV's
+    (.yml, .json), or COLMAP's (the folder of cameras.txt and images.txt)."""
 
     def __post_init__(self) -> None:
         if self.cameras is not None and (self.placement, self.camera, self.views) != ("still", "vga", 1):
             raise ArgumentError(
-                f"the cameras are those of {self.cameras}; leave out the placement, the camera and the views"
+                f"the cameras are those of {self.own_cameras}; leave out the placement, the camera and the "
+                "views"
             )
+        if self.cameras == ():
+            raise ArgumentError("cameras is empty, expected at least one camera")
         if self.placement not in PLACEMENTS:
             raise ArgumentError(choices(self.placement, PLACEMENTS, noun="placement"))
         if self.views < 1:
@@ -71,6 +80,13 @@ class ViewConfig:
             raise ArgumentError(
                 f"distances are {self.distance}, expected two of 0.05 to 20 m, the shorter first"
             )
+
+    @property
+    def own_cameras(self) -> str:
+        """What messages call your own cameras: their file, or their names."""
+        if isinstance(self.cameras, tuple):
+            return " ".join(camera.name for camera in self.cameras)
+        return str(self.cameras)
 
 
 class Viewpoints:
@@ -82,9 +98,10 @@ class Viewpoints:
         rng: Source of all random choices.
     """
 
-    def __init__(self, config: ViewConfig, take: ShownTake, *, rng: np.random.Generator) -> None:
+    def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
         if config.cameras is not None:
-            self._cameras = load_cameras(config.cameras)
+            own = config.cameras
+            self._cameras = load_cameras(own) if isinstance(own, str) else own
             self._poses = _kept([camera.T_world_camera for camera in self._cameras], take)
         else:
             self._poses = _PATHS[config.placement](config, take, rng)
@@ -106,9 +123,9 @@ class Viewpoints:
         return [camera.at(path[frame]) for camera, path in zip(self._cameras, self._poses, strict=True)]
 
 
-def hand_centers(take: ShownTake) -> Float[np.ndarray, "T 3"]:
+def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
     """Center of the hands of each frame [m]; interpolated linearly over frames without hands."""
-    middles = take.wrists()[..., :3] + _HAND_CENTER * _along(take)
+    middles = take.qpos[..., :3] + _HAND_CENTER * _along(take)
     there = np.isfinite(middles[..., :1])
     counts = there.sum(axis=1)
     centers = np.where(there, middles, 0.0).sum(axis=1) / np.maximum(counts, 1)
@@ -117,12 +134,12 @@ def hand_centers(take: ShownTake) -> Float[np.ndarray, "T 3"]:
     return np.stack([np.interp(frames, known, centers[known, axis]) for axis in range(3)], axis=1)
 
 
-def _along(take: ShownTake) -> NDArray[np.float64]:
+def _along(take: Take) -> NDArray[np.float64]:
     """Direction (T, H, 3) from each wrist to its fingers; NaN where there is no hand."""
-    return quaternion_matrix(take.wrists()[..., 3:7])[..., 0]
+    return quaternion_matrix(take.qpos[..., 3:7])[..., 0]
 
 
-def _towards_user(take: ShownTake) -> NDArray[np.float64]:
+def _towards_user(take: Take) -> NDArray[np.float64]:
     """Level unit direction (3,) from the hands to the user's body: where the forearms point."""
     level = np.append(np.nanmean(-_along(take)[..., :2].reshape(-1, 2), axis=0), 0.0)
     length = float(np.linalg.norm(level))
@@ -135,12 +152,12 @@ def _spherical(azimuth: float, elevation: float) -> NDArray[np.float64]:
     )
 
 
-def _middle(take: ShownTake) -> NDArray[np.float64]:
+def _middle(take: Take) -> NDArray[np.float64]:
     middle: NDArray[np.float64] = np.median(hand_centers(take), axis=0)
     return middle
 
 
-def _still(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _still(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """In front of the user; several cameras form a fan."""
     middle, user = _middle(take), _towards_user(take)
     front = np.arctan2(-user[1], -user[0])
@@ -153,7 +170,7 @@ def _still(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> lis
     return paths
 
 
-def _orbit(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _orbit(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     middle, paths = _middle(take), []
     for number in range(config.views):
         start = rng.uniform(-np.pi, np.pi) + 2.0 * np.pi * number / config.views
@@ -164,7 +181,7 @@ def _orbit(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> lis
     return paths
 
 
-def _head(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _head(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     """At the eyes, following the hands with a delay; several cameras are side by side, as two eyes are."""
     centers = uniform_filter1d(
         hand_centers(take), max(1, round(_HEAD_DELAY * take.rate)), axis=0, mode="nearest"
@@ -181,7 +198,7 @@ def _head(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list
     return paths
 
 
-def _past_forearms(take: ShownTake, offset: NDArray[np.float64]) -> NDArray[np.float64]:
+def _past_forearms(take: Take, offset: NDArray[np.float64]) -> NDArray[np.float64]:
     """The offset (3,) [m] from the hands, rotated until no forearm usually lies in the line of sight."""
     length = float(np.linalg.norm(offset))
     direction = offset / length
@@ -198,7 +215,7 @@ def _past_forearms(take: ShownTake, offset: NDArray[np.float64]) -> NDArray[np.f
     return length * direction
 
 
-def _anywhere(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _anywhere(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     centers, paths = hand_centers(take), []
     for _ in range(config.views):
         positions = np.empty_like(centers)
@@ -216,21 +233,127 @@ def _anywhere(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> 
     return paths
 
 
-def _behind_arms(take: ShownTake, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _behind_arms(take: Take, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether each frame's position (T, 3) [m] is behind a forearm, from where little but the arm is seen."""
-    away = positions[:, None] - take.wrists()[..., :3]
+    away = positions[:, None] - take.qpos[..., :3]
     cosines = -(away * _along(take)).sum(axis=-1) / np.linalg.norm(away, axis=-1)
     behind: NDArray[np.bool_] = (cosines > np.cos(_ARM_CLEARANCE)).any(axis=1)
     return behind  # NaN, where there is no hand, never is
 
 
-def _rig(config: ViewConfig, take: ShownTake, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _rig(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
     return _kept(load_rig(config.rig).T_world_camera, take)
 
 
-def _kept(poses: Iterable[NDArray[np.float64]], take: ShownTake) -> list[NDArray[np.float64]]:
+def _kept(poses: Iterable[NDArray[np.float64]], take: Take) -> list[NDArray[np.float64]]:
     """Paths of cameras that stay at their poses (4, 4)."""
     return [np.broadcast_to(pose, (take.num_frames, 4, 4)) for pose in poses]
 
 
 _PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "anywhere": _anywhere, "rig": _rig}
+
+
+def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> None:
+    """Refuse cameras that never have a hand in their pictures, and tell of those among them.
+
+    Args:
+        name: Their file or names, for messages.
+        cameras: The cameras.
+        take: The take; keypoints of all frames are projected, and hidden ones count.
+
+    Raises:
+        RigError: No camera has a keypoint in its picture in any frame.
+    """
+    blind = list(cameras)
+    for hand, qpos in zip(take.hands, np.swapaxes(take.qpos, 0, 1), strict=True):
+        there = qpos[np.isfinite(qpos).all(axis=1)]
+        for first in range(0, len(there), _CHUNK):
+            points = hand_keypoints(hand.model, there[first : first + _CHUNK])
+            blind = [camera for camera in blind if not _any_inside(camera, points)]
+            if not blind:
+                return
+    if len(blind) == len(cameras):
+        one = blind[0]
+        middle, place = np.nanmedian(take.qpos[..., :3], axis=(0, 1)), one.T_world_camera[:3, 3]
+        raise RigError(
+            f"{name}: no camera has a hand in its picture in any of {take.num_frames} frames: wrists are "
+            f"around {_shown(middle)} m, and camera '{one.name}' stands at {_shown(place)} m and looks along "
+            f"{_shown(one.T_world_camera[:3, 2])}"
+        )
+    for camera in blind:
+        told = f"{name}: camera '{camera.name}' has no hand in its picture in any frame"
+        warnings.warn(told, HandSimWarning, stacklevel=2)
+
+
+def _any_inside(camera: Camera, points: NDArray[np.float64]) -> bool:
+    pixels = camera.project(points)
+    return bool(((pixels >= 0.0) & (pixels < camera.size)).all(axis=-1).any())  # never so for NaN
+
+
+def _shown(vector: NDArray[np.float64]) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in vector + 0.0) + ")"
+
+
+def around_hands(
+    camera: Camera,
+    keypoints: Float[np.ndarray, "K 3"],
+    qpos: Float[np.ndarray, "H 27"],
+    share: float,
+    *,
+    rng: np.random.Generator,
+) -> Camera:
+    """A camera at a random place around hands, turned at random about its axis.
+
+    Args:
+        camera: Its size, matrix and lens.
+        keypoints: Of all hands, in the world [m].
+        qpos: Their poses; the camera is not behind their forearms.
+        share: Of the picture's shorter side that the keypoints span.
+        rng: Source of the place.
+    """
+    center = 0.5 * (keypoints.min(axis=0) + keypoints.max(axis=0))
+    along = quaternion_matrix(qpos[:, 3:7])[..., 0]
+    for _ in range(_TRIES):
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        if (along @ direction > -np.cos(_ARM_CLEARANCE)).all():
+            break
+    turn = rng.uniform(-np.pi, np.pi)
+    roll = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    pose = look_at(center + direction, center)
+    pose[:3, :3] = pose[:3, :3] @ roll
+    local = (keypoints - center) @ pose[:3, :3]
+    focal, size = camera.K[[0, 1], [0, 1]], np.array(camera.size, dtype=np.float64)
+    nearest = _SKIN_CLEARANCE - float(local[:, 2].min())
+    shift = np.array([0.0, 0.0, 4.0 * nearest])  # of the hands in the camera's axes
+    room = rng.uniform(-0.5, 0.5, 2) * _FREE
+    for _ in range(_ROUNDS):  # perspective widens what is near
+        pixels = focal * (local + shift)[:, :2] / (local + shift)[:, 2:]
+        low, high = pixels.min(axis=0), pixels.max(axis=0)
+        target = 0.5 * size - camera.K[:2, 2] + room * np.maximum(size - (high - low), 0.0)
+        shift[:2] += (target - 0.5 * (low + high)) / focal * shift[2]
+        shift[2] = max(nearest, shift[2] * float((high - low).max()) / (share * float(size.min())))
+    pose[:3, 3] = center - pose[:3, :3] @ shift
+    return camera.at(pose)
+
+
+def crop_around(
+    camera: Camera, keypoints: Float[np.ndarray, "K 3"], share: float, size: int, *, rng: np.random.Generator
+) -> Camera:
+    """A pinhole camera at the same place that sees a square around hands alone.
+
+    Args:
+        camera: A pinhole camera.
+        keypoints: Of all hands, in the world [m].
+        share: Of the square's side that the keypoints span.
+        size: Side of its picture [px].
+        rng: Source of where in the square the hands are.
+    """
+    pixels = camera.project(keypoints)
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    side = float((high - low).max()) / share
+    corner = 0.5 * (low + high - side) + _FREE * rng.uniform(-0.5, 0.5, 2) * (side - (high - low))
+    K = camera.K.copy()
+    K[:2, 2] -= corner
+    K[:2] *= size / side
+    return dataclasses.replace(camera, size=(size, size), K=K)

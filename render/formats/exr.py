@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from handsim.errors import DatasetError, HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.space.camera import Camera, camera_from_record
-from render.frames.frame import Pictures, RenderedFrame
+from render.frames import Pictures, RenderedFrame
 
 _RGB: Final = ("R", "G", "B")
 _NORMALS: Final = ("N.X", "N.Y", "N.Z")

@@ -21,7 +21,7 @@ from render.formats.shards import (
     shard_name,
     shards_in,
 )
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 
 
 class FolderWriter:

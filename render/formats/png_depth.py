@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from handsim.errors import DatasetError, HandSimError
 from render.formats.annotations.common import as_sensed
-from render.frames.frame import Pictures, RenderedFrame
+from render.frames import Pictures, RenderedFrame
 
 METERS_PER_UNIT: Final = 1e-4
 """Unit of a depth picture [m], unless its file contains another."""

@@ -15,7 +15,7 @@ from handsim.errors import HandSimError, choices
 from render.formats.clip_writer import WebdatasetWriter
 from render.formats.folder_writers import CocoWriter, ExrWriter, InterhandWriter, PngWriter
 from render.formats.freihand_writer import FreihandWriter
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 
 
 class FrameWriter(Protocol):

@@ -13,8 +13,7 @@ from jaxtyping import Float
 from handsim.errors import ArgumentError, FileError
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
-from render.illustrations.drawing import render_rgb
-from render.illustrations.scene import Balls, HandScene, PosedHand, View, view_along
+from render.illustrations.scene import Balls, HandScene, PosedHand, View, render_rgb, view_along
 
 SUFFIX: Final = ".mp4"
 _SIZE: Final = (800, 600)  # [px]

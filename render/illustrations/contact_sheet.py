@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from handsim.errors import HandSimError
 from handsim.hand.keypoints import KEYPOINT_DIGITS, SKELETON
 from render.formats.annotations.common import CENTER, as_sensed
-from render.frames.frame import HandTruth, RenderedFrame
+from render.frames import HandTruth, RenderedFrame
 from render.illustrations.captions import pad, side_by_side
 from render.illustrations.palette import BACKGROUND, bone_colors
 
@@ -63,9 +63,10 @@ def draw_keypoints(picture: Picture, hands: Sequence[HandTruth], *, scale: float
     unit = 2**_FRACTION_BITS
     style = {"lineType": cv2.LINE_AA, "shift": _FRACTION_BITS}
     for hand in hands:
-        known = np.isfinite(hand.pixels).all(axis=1) & (np.abs(np.nan_to_num(hand.pixels)) < 1e5).all(axis=1)
+        near = (np.abs(np.nan_to_num(hand.keypoints)) < 1e5).all(axis=1)
+        known = np.isfinite(hand.keypoints).all(axis=1) & near
         pixels = (
-            np.rint(unit * (scale * np.nan_to_num(hand.pixels) - CENTER)).astype(int).clip(-(2**24), 2**24)
+            np.rint(unit * (scale * np.nan_to_num(hand.keypoints) - CENTER)).astype(int).clip(-(2**24), 2**24)
         )
         for start, end in SKELETON:
             if known[start] and known[end]:

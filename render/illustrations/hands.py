@@ -20,7 +20,6 @@ from handsim.space.cameras import CameraRig
 from poses.shapes.library import gesture
 from poses.shapes.validity import make_valid
 from render.illustrations.captions import captioned, pad, side_by_side, titled, with_names
-from render.illustrations.drawing import render_depth, render_rgb, unoccluded
 from render.illustrations.palette import (
     BACKGROUND,
     HIDDEN_COLOR,
@@ -29,7 +28,15 @@ from render.illustrations.palette import (
     Covering,
     bone_colors,
 )
-from render.illustrations.scene import Balls, HandScene, PosedHand, view_along
+from render.illustrations.scene import (
+    Balls,
+    HandScene,
+    PosedHand,
+    render_depth,
+    render_rgb,
+    unoccluded,
+    view_along,
+)
 
 if TYPE_CHECKING:
     from render.illustrations.captions import Picture

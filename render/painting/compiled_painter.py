@@ -18,7 +18,7 @@ from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.rasterizer import nearest_faces, project
 from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, read_texels, shade
-from render.painting.shadow_map import shadow_map
+from render.painting.shadows import shadow_map
 from render.scenery.lights import Lighting
 
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface

@@ -1,20 +1,22 @@
-"""Hands and rigid bodies as surfaces with ids and materials."""
+"""Hands, rigid bodies and balls as surfaces with ids and materials."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+import trimesh
+from jaxtyping import Float, Float32, Int, UInt8
 from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
+from gloves.takes.take import RigidBody
 from handsim.hand.keypoints import keypoint_flesh
 from handsim.hand.skin.surface import vertex_normals
-from render.frames.frame import PARTS_A_HAND
+from render.frames import PARTS_A_HAND
 from render.painting.materials import (
     MARKER_COLOR,
     Material,
@@ -25,16 +27,42 @@ from render.painting.materials import (
     skin_material,
 )
 from render.painting.rasterizer import Triangles
-from render.painting.spheres import SphereSurface, sphere_surface
-from render.shown_take import ShownBody
 from render.skin.forearm import Forearm, sample_forearm
 from render.skin.glove_look import GloveLook, glove_texture, sample_glove_look
 from render.skin.look import SkinLook, sample_skin_look
-from render.skin.mesh import SkinMesh
+from render.skin.mesh import PosableSkin
 from render.skin.texture import skin_texture
 
 _BALL_LEVEL: Final = 2
 _BODY_BALLS: Final = 0.0032  # [m] radius of the markers of rigid bodies, 6.4 mm in diameter (Han et al. 2018)
+
+
+class SphereSurface(NamedTuple):
+    """Balls in a row, each with as many vertices and faces as the next."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    normals: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+
+
+def sphere_surface(centers: Float[np.ndarray, "N 3"], radius: float, *, level: int) -> SphereSurface:
+    """Balls around these centers [m].
+
+    Args:
+        centers: Centers; none of them NaN.
+        radius: Of all of them [m].
+        level: How often an icosahedron is refined: 20 times 4 to this power triangles a ball.
+    """
+    ball = _unit_ball(level)
+    count, each = len(centers), len(ball.vertices)
+    vertices = (centers[:, None] + radius * ball.vertices).reshape(-1, 3)
+    faces = (ball.faces + each * np.arange(count)[:, None, None]).reshape(-1, 3)
+    return SphereSurface(vertices, np.tile(ball.vertices, (count, 1)), faces)
+
+
+@functools.cache
+def _unit_ball(level: int) -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=level)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +115,7 @@ class HandFigure:
     def __init__(self, fit: GloveFit, look: Appearance, *, first_marker: int) -> None:
         self.fit, self.look = fit, look
         bony = look.skin.relief if look.glove is None else 0.0  # cloth levels it
-        self._skin = SkinMesh(fit.model, look.forearm, bony)
+        self._skin = PosableSkin(fit.model, look.forearm, bony)
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
@@ -149,11 +177,12 @@ class BodyFigure:
         color: Color of its surface, sRGB in [0, 1].
     """
 
-    def __init__(self, body: ShownBody, color: tuple[float, float, float]) -> None:
-        self.body = body
+    def __init__(self, body: RigidBody, color: tuple[float, float, float]) -> None:
+        self._thing = body.shape
+        self._markers = body.positions if self._thing is None else self._thing.markers
         self._material = functools.cache(functools.partial(plain_material, color))
-        if body.obj is not None:
-            self._normals = vertex_normals(body.obj.vertices, body.obj.faces)
+        if self._thing is not None:
+            self._normals = vertex_normals(self._thing.vertices, self._thing.faces)
 
     def drawn(self, T_world_body: Float[np.ndarray, "4 4"], instance: int) -> list[Drawn]:
         """Its surface, where that is known, and its markers.
@@ -163,15 +192,15 @@ class BodyFigure:
             instance: Number of the body among the instances of the picture.
         """
         rotation, position, drawn = T_world_body[:3, :3], T_world_body[:3, 3], []
-        thing = self.body.obj
+        thing = self._thing
         if thing is not None:
             ids = [np.full(len(thing.faces), number, dtype=np.uint8) for number in (0, instance, 0)]
             vertices = thing.vertices @ rotation.T + position
             triangles = Triangles(vertices, thing.faces, self._normals @ rotation.T, *ids)
             white = np.ones((len(vertices), 4), dtype=np.float32)
             drawn.append(Drawn(triangles, white, None, self._material))
-        if len(self.body.markers):
-            balls = sphere_surface(self.body.markers @ rotation.T + position, _BODY_BALLS, level=_BALL_LEVEL)
+        if len(self._markers):
+            balls = sphere_surface(self._markers @ rotation.T + position, _BODY_BALLS, level=_BALL_LEVEL)
             zeros = np.zeros(len(balls.faces), dtype=np.uint8)
             drawn.append(_drawn_balls(balls, zeros, zeros + np.uint8(instance), zeros))
         return drawn

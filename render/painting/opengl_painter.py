@@ -7,20 +7,21 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import Material
-from render.painting.opengl_lights import add_lights
 from render.scenery.lights import Lighting
 
 OPENGL_FROM_OPENCV: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns a camera's axes: OpenCV's x right, y down, z ahead into OpenGL's x right, y up, z back."""
 _NEAR, _FAR = 0.01, 30.0  # [m]
 _GL_LINEAR: Final = 0x2601
+_DISTANCE: Final = 300.0  # [m], so far that a lamp's rays are as good as parallel
+_SHADOW_DEPTH: Final = 60.0  # [scene diagonals]
 
 
 def paint_opengl(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -> UInt8[np.ndarray, "H W 4"]:
@@ -79,3 +80,52 @@ def pyrender_material(material: Material) -> Any:
         emissiveFactor=np.sqrt(material.glow * material.color),  # its shader squares it
         **textures,
     )
+
+
+def add_lights(
+    pyrender: Any,
+    scene: Any,
+    lighting: Lighting,
+    T_world_camera: Float[np.ndarray, "4 4"],
+    extent: float | None = None,
+) -> None:
+    """Light a pyrender scene that holds its meshes already.
+
+    Args:
+        pyrender: The module.
+        scene: The scene; its ambient light is replaced.
+        lighting: What to add.
+        T_world_camera: Pose of the camera whose axes the lamps' directions are in.
+        extent: How large the meshes are together, corner to corner [m]; measured unless given.
+    """
+    rotation = T_world_camera[:3, :3]
+    scene.ambient_light = np.array(lighting.ambient)
+    for number, lamp in enumerate(lighting.lamps):
+        towards = rotation @ (np.array(lamp.direction) / np.linalg.norm(lamp.direction))
+        pose = np.eye(4)
+        color, intensity = np.array(lamp.color), np.pi * lamp.strength
+        if number == 0:
+            pose[:3, :3] = frame_with_z(towards)
+            light = pyrender.DirectionalLight(color=color, intensity=intensity)
+            _cast_shadows(pyrender, light, float(scene.scale) if extent is None else extent)
+        else:
+            pose[:3, 3] = T_world_camera[:3, 3] + towards * _DISTANCE
+            light = pyrender.PointLight(color=color, intensity=intensity * _DISTANCE**2)
+        scene.add(light, pose=pose)
+
+
+def _cast_shadows(pyrender: Any, light: Any, extent: float) -> None:
+    # pyrender's shadow bias is a fixed share of this camera's depth, too little for skin; depth adds bias.
+    # Its light stands one scene diagonal away from the middle, so half a diagonal takes in everything.
+    diagonal = max(extent, 1e-3)  # an empty scene has none
+    light._get_shadow_camera = lambda _: pyrender.OrthographicCamera(
+        xmag=0.52 * diagonal, ymag=0.52 * diagonal, znear=0.3 * diagonal, zfar=_SHADOW_DEPTH * diagonal
+    )
+
+
+def frame_with_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Any rotation whose z axis is `direction`."""
+    z = direction / np.linalg.norm(direction)
+    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)

@@ -14,7 +14,7 @@ from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from render.painting.compiled_painter import paint_compiled
 from render.painting.figures import Drawn
-from render.painting.hardware import opengl_has_hardware
+from render.painting.gl import opengl_has_hardware
 from render.painting.opengl_painter import paint_opengl
 from render.painting.rasterizer import NEAR
 from render.scenery.lights import Lighting

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
-from render.frames.frame import Pictures
+from render.frames import Pictures
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
@@ -34,7 +34,7 @@ class Triangles:
     normals: Float[np.ndarray, "V 3"]
     """Unit normals in the world."""
     parts: UInt8[np.ndarray, "F"]
-    """See `render.frames.frame.Pictures`, as the next two."""
+    """See `render.frames.Pictures`, as the next two."""
     instances: UInt8[np.ndarray, "F"]
     markers: UInt8[np.ndarray, "F"]
 

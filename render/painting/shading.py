@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
-from render.painting.shadow_map import lit_share
+from render.painting.shadows import lit_share
 
 GAMMA: Final = 2.2
 _FACING: Final = 0.04  # specular reflectance of dielectrics at normal incidence

@@ -2,9 +2,7 @@
 
 - rooms: ray-cast pictures of random rooms.
 - photographs: a user's own photographs.
-- backdrops: walls and tables close behind the hands, which catch their shadows.
-- backgrounds: plain, gradient, noise, clutter, room and photograph.
+- backgrounds: plain, gradient, noise, clutter, room and photograph, and the backdrops that catch shadows.
 - enclosures: backgrounds with depth, for several cameras.
-- lights: lamps and ambient light.
-- surroundings: a background together with light that has its colors.
+- lights: lamps and ambient light, and a background together with light that has its colors.
 """

@@ -16,14 +16,38 @@ from jaxtyping import Float32
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, choices
-from render.scenery.backdrops import Backdrop, sample_backdrop
 from render.scenery.photographs import draw_photo, pick_photo
 from render.scenery.rooms import draw_room, paint_tint
 
+SHARE: Final = 0.6
+"""Of backgrounds that could have a backdrop, those that do; the others are too far away for a shadow."""
+_GAPS: Final = (0.02, 0.35)  # [m]
+_STEEPEST: Final = 0.35  # slope of a backdrop against the picture's plane
+_SOFTNESS: Final = (0.03, 0.25)  # lamps from a bare bulb to a window
 BackgroundKind = Literal["plain", "gradient", "noise", "clutter", "room", "photo"]
 KINDS: Final[tuple[BackgroundKind, ...]] = ("plain", "gradient", "noise", "clutter", "room", "photo")
 _CLOSE: Final = ("plain", "gradient", "noise", "clutter")  # may be the picture of a wall or a table
 _GAMMA: Final = 2.2
+
+
+@dataclass(frozen=True, slots=True)
+class Backdrop:
+    """A plane behind all of the hands that is in the picture; it catches their shadows."""
+
+    gap: float
+    """Its distance from the nearest point of them [m]."""
+    recedes: tuple[float, float] = (0.0, 0.0)
+    """By how much it recedes to the right and downwards, a length for a length."""
+    softness: float = 0.1
+    """Tangent of half the angle under which it sees the lamp."""
+
+
+def sample_backdrop(*, rng: np.random.Generator) -> Backdrop | None:
+    """A random backdrop, or none."""
+    gap = float(np.exp(rng.uniform(*np.log(_GAPS))))
+    right, down = rng.uniform(-_STEEPEST, _STEEPEST, 2)
+    softness = float(np.exp(rng.uniform(*np.log(_SOFTNESS))))
+    return Backdrop(gap, (float(right), float(down)), softness) if rng.random() < SHARE else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
-from render.frames.frame import Pictures
+from render.frames import Pictures
 from render.scenery.backgrounds import Background, draw_background
 from render.scenery.rooms import RoomLight, cast_room
 

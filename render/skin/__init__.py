@@ -5,8 +5,7 @@
 - flexion: what joints make of the skin around them.
 - mesh: the posed mesh with normals, ambient shade and parts.
 - fields: smooth functions that textures are painted with.
-- texels: the anatomy at each texel.
-- lines: palm lines, finger creases and knuckle wrinkles.
+- texels: the anatomy at each texel, with palm lines, finger creases and knuckle wrinkles.
 - relief: fine relief as a normal map.
 - look: a person's skin in plain values, and its distribution.
 - texture: the painted skin.

@@ -44,7 +44,7 @@ class DrawnSkin:
     """Bone of each triangle, an index of `topology.BONES` or `FOREARM`."""
 
 
-class SkinMesh:
+class PosableSkin:
     """The drawn skin of one person's hand.
 
     Args:

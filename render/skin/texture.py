@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from render.skin.atlas import skin_atlas
 from render.skin.fields import bump, noise, smooth
 from render.skin.forearm import Forearm
-from render.skin.lines import line_depth
 from render.skin.look import SkinLook
 from render.skin.relief import normal_map, relief
-from render.skin.texels import REFERENCE, skin_texels
+from render.skin.texels import REFERENCE, line_depth, skin_texels
 
 if TYPE_CHECKING:
     from handsim.hand.topology import Side

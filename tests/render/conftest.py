@@ -10,9 +10,8 @@ from gloves.layout import load_layout
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
-from handsim.space.camera import Camera, pinhole
-from handsim.space.cameras import look_at
-from render.frames.frame import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
+from handsim.space.camera import Camera, look_at, pinhole
+from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
 
 
 @pytest.fixture(scope="session")
@@ -117,8 +116,8 @@ def _hand(
     return HandTruth(
         shape=model.shape,
         qpos=qpos[0],
-        keypoints=keypoints,
-        pixels=places,
+        keypoints=places,
+        keypoints_world=keypoints,
         visible=inside & (np.arange(21) % 3 > 0),
         box=box,
         vertices=vertices,

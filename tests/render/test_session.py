@@ -15,20 +15,22 @@ import pytest
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from handsim.errors import CaptureError, HandSimError
-from render.cameras.viewpoints import ViewConfig, Viewpoints
+from handsim.space.camera import preset
+from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
+from render.drawing import Drawing, draw
 from render.formats.png_depth import read_depth
 from render.sensors.depth_noise import DepthNoiseConfig
-from render.session import SHEET, draw_frames, draw_shard, left_out_frames, render_take
-from render.shown_take import load_shown_take, show_take
+from render.session import SHEET, left_out_frames, render_take
 from render.skin.look import TONES
-from train.simulation.takes import TakeConfig, simulate_take
+from render.subject import subject_of_take
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     file = tmp_path_factory.mktemp("take") / "take.truth.npz"
-    simulate_take(TakeConfig(kind="hand-controller", num_frames=48)).save(file)
+    simulate_take(kind="hand-controller", num_frames=48).save(file)
     return file
 
 
@@ -39,13 +41,12 @@ PLAIN = RenderConfig(
 
 
 def drawn(path, config):
-    take = load_shown_take(path)
-    viewpoints = Viewpoints(config.view, take, rng=np.random.default_rng(0))
-    return list(draw_shard(take, viewpoints, config, 0, [0, 24]))
+    return list(draw(path, config=config, frames=[0, 24]))
 
 
 @pytest.mark.parametrize("dress", ["skin", "glove"])
 def test_truth_agrees_with_the_pictures(path, dress):
+    own = []
     for frame in drawn(path, dataclasses.replace(PLAIN, dress=dress)):
         pictures = frame.ideal
         assert pictures.rgb.shape == (480, 640, 3) and frame.noisy.rgb is None and frame.noisy.depth is None
@@ -55,10 +56,10 @@ def test_truth_agrees_with_the_pictures(path, dress):
         np.testing.assert_allclose(np.linalg.norm(pictures.normals, axis=-1), 1.0, atol=1e-5)
         assert set(np.unique(pictures.instances)) <= {0, 1, 2, 3}
         for number, hand in enumerate(frame.hands):
-            columns, rows = hand.pixels[hand.visible].astype(int).T
+            columns, rows = hand.keypoints[hand.visible].astype(int).T
             shown = pictures.instances[rows, columns]
-            assert (shown == number + 1).mean() > 0.9, "but for those at the border of the hand"
-            depth = frame.camera.local(hand.keypoints[hand.visible])[:, 2]
+            own.extend(shown == number + 1)
+            depth = frame.camera.local(hand.keypoints_world[hand.visible])[:, 2]
             assert (
                 pictures.depth[rows, columns][(shown > 0) & (shown != number + 1)]
                 > depth[(shown > 0) & (shown != number + 1)]
@@ -67,6 +68,7 @@ def test_truth_agrees_with_the_pictures(path, dress):
         if dress == "glove":
             check_markers(frame)
         json.dumps(frame.choices)
+    assert np.mean(own) > 0.9, "but for those at the border of the hand"
     assert np.ptp(pictures.rgb.reshape(-1, 3).astype(int), axis=0).min() > 30, "a picture shows something"
 
 
@@ -109,14 +111,10 @@ def reaching_the_eyes(path, folder, config):
     """A copy of the take whose left hand is at the camera in frames 24 and 25."""
     take = load_take(path)
     middle = take.hands[1].model.skin(take.qpos[24:25, 1])[0].mean(axis=0)
-    eye = Viewpoints(config.view, show_take(take), rng=_path_rng(config)).cameras(24)[0].T_world_camera[:3, 3]
+    eye = Drawing(subject_of_take(take), config).viewpoints.cameras(24)[0].T_world_camera[:3, 3]
     take.qpos[24:26, 1, :3] += eye - middle
     take.save(folder / "reaching.truth.npz")
     return folder / "reaching.truth.npz"
-
-
-def _path_rng(config):
-    return np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=(1,)))
 
 
 def test_frames_with_a_camera_in_a_hand_are_left_out_and_told(path, tmp_path, capsys):
@@ -137,24 +135,16 @@ def test_frames_with_a_camera_in_a_hand_are_left_out_and_told(path, tmp_path, ca
     monkey = tmp_path / "only"
     assert render_take(take, monkey, ["png"], only, workers=1) == 2, "an empty shard is finished too"
     with pytest.raises(HandSimError, match=r"in frame 24"):
-        list(draw_frames(load_take(take), config, [24]))
+        list(draw(take, config=config, frames=[24]))
 
 
 def test_a_rendering_without_any_frame_is_told(path, tmp_path):
     config = dataclasses.replace(PLAIN, view=ViewConfig("head"), every=1)
     take = load_take(reaching_the_eyes(path, tmp_path, config))
-    hands = tuple(dataclasses.replace(hand, qpos=hand.qpos.copy()) for hand in take.moving_hands())
-    for hand in hands:
-        hand.qpos[[*range(24), *range(26, 48)]] = np.nan
-    shown = dataclasses.replace(show_take(take), hands=hands)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("render.session.load_shown_take", lambda _: shown)
-        viewpoints = Viewpoints(config.view, show_take(take), rng=_path_rng(config))
-        patch.setattr("render.session._viewpoints", lambda *_: viewpoints)
-        with pytest.raises(
-            HandSimError, match="no pictures: in all 2 frames a camera would be inside a hand"
-        ):
-            render_take(path, tmp_path / "out", ["png"], config, workers=1)
+    eye = Drawing(subject_of_take(take), config).viewpoints.cameras(24)[0]
+    models = tuple(hand.model for hand in take.hands)
+    with pytest.raises(HandSimError, match="no pictures: in all 2 frames a camera would be inside a hand"):
+        render_take(take.qpos[24:26], tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
 
 
 def test_depth_sensors_see_hands_of_all_tones_alike(path):
@@ -245,10 +235,7 @@ def test_what_cannot_be_drawn_is_said_in_a_sentence(path, tmp_path):
 
 
 def test_a_camera_inside_a_hand_is_refused(path):
-    take = load_shown_take(path)
-    config = dataclasses.replace(PLAIN, view=ViewConfig(distance=(0.05, 0.05)))
-    inside = Viewpoints(config.view, take, rng=np.random.default_rng(0))
-    inside._poses[0] = np.broadcast_to(np.eye(4), (48, 4, 4)).copy()
-    inside._poses[0][:, :3, 3] = take.hands[0].fit.model.skin(take.hands[0].qpos)[:, 100] + 0.002
+    take, pose = load_take(path), np.eye(4)
+    pose[:3, 3] = take.hands[0].model.skin(take.qpos[:1, 0])[0, 100] + 0.002
     with pytest.raises(HandSimError, match="mm from a hand or object in frame 0"):
-        list(draw_shard(take, inside, config, 0, [0]))
+        list(draw(path, config=PLAIN, frames=[0], camera=preset("vga").at(pose)))

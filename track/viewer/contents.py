@@ -60,14 +60,16 @@ class Content(NamedTuple):
     """Its frames, where there are some."""
 
 
-def open_content(name: str, *, out: Path | None = None, size: str = "M", rig: str | None = None) -> Content:
+def open_content(
+    name: str, *, out: Path | None = None, size: str = "M", rig: CameraRig | str | None = None
+) -> Content:
     """Read what shall be shown.
 
     Args:
         name: A path, or the name of a shipped layout or rig.
         out: Where a changed layout is saved; a new name beside it when None.
         size: Size of the hand that wears a layout.
-        rig: Cameras of a capture or take: a shipped name or the path of a .toml file.
+        rig: Cameras of a capture or take: a rig, a shipped name or the path of a .toml file.
 
     Raises:
         ArgumentError: It is nothing that can be viewed, or an option is for something else.
@@ -133,9 +135,8 @@ def _rig(name: str | Path) -> Content:
     def show(server: ViserServer) -> Run:
         show_rig(server, rig)
         show_volume(server, rig)
-        degrees = np.rad2deg(rig.field_of_view)
         server.gui.add_markdown(
-            f"**{rig.name}**: {len(rig.positions)} cameras of {degrees:.0f}° and {rig.resolution} px. "
+            f"**{rig.name}**: {len(rig.cameras)} cameras of {rig.pictures()}. "
             "Dots are seen by two cameras or more, blue ones by all. The green cube is where wrists move in "
             "training sets."
         )

@@ -16,7 +16,7 @@ from handsim._version import __version__
 from handsim.hand.keypoints import KEYPOINT_NAMES, SKELETON
 from handsim.space.camera import Camera
 from render.formats.annotations.common import CENTER, hand_mask, is_seen, rounded, run_lengths
-from render.frames.frame import HandTruth, RenderedFrame
+from render.frames import HandTruth, RenderedFrame
 
 INFO: Final[dict[str, Any]] = {
     "description": "Hands drawn by handsim; keypoints count pixels from the first one's center",
@@ -72,7 +72,7 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         "area": float(hand.box[2] * hand.box[3]) if mask is None else int(mask.sum()),
         "iscrowd": 0,
         "side": hand.shape.side,
-        "xyz": rounded(frame.camera.local(hand.keypoints), 9),
+        "xyz": rounded(frame.camera.local(hand.keypoints_world), 9),
     }
     if mask is not None:
         record["segmentation"] = {"size": list(mask.shape), "counts": run_lengths(mask)}
@@ -81,9 +81,9 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
 
 def _keypoints(camera: Camera, hand: HandTruth) -> tuple[list[float], int]:
     """COCO's 21 x (u, v, flag): 0 outside the picture, 1 hidden, 2 seen; and how many are not 0."""
-    inside = np.all((hand.pixels >= 0.0) & (hand.pixels < camera.size), axis=1)  # never so for NaN
+    inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < camera.size), axis=1)  # never so for NaN
     flags = np.where(inside, np.where(hand.visible, 2, 1), 0)
-    pixels = np.where(inside[:, None], hand.pixels - CENTER, 0.0)
+    pixels = np.where(inside[:, None], hand.keypoints - CENTER, 0.0)
     rows = zip(rounded(pixels, 5), flags.tolist(), strict=True)
     return [value for (u, v), flag in rows for value in (u, v, flag)], int(inside.sum())
 

@@ -20,7 +20,7 @@ from handsim.hand.shape import HandShape
 from handsim.hand.topology import Side
 from handsim.space.camera import Camera
 from handsim.space.transforms import rotation_quaternions
-from render.frames.frame import PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
+from render.frames import PARTS_A_HAND, HandTruth, Pictures, RenderedFrame
 from render.skin.forearm import FOREARM
 
 CENTER: Final = 0.5

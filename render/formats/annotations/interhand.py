@@ -20,7 +20,7 @@ from handsim.hand.topology import DIGITS, SIDES, Side
 from handsim.space.camera import Camera
 from render.formats.annotations.common import by_side, centered_K, is_seen, rounded, to_json
 from render.formats.annotations.joint_orders import to_order
-from render.frames.frame import HandTruth, RenderedFrame
+from render.frames import HandTruth, RenderedFrame
 
 SPLIT: Final = "train"
 CAPTURE: Final = 0
@@ -146,7 +146,7 @@ def _joints(hands: dict[Side, HandTruth]) -> tuple[list[list[float]], list[int]]
     for number, side in enumerate(_ORDER):
         if side in hands:
             rows = slice(NUM_KEYPOINTS * number, NUM_KEYPOINTS * (number + 1))
-            joints[rows], valid[rows] = 1e3 * to_order(hands[side].keypoints, "interhand"), 1
+            joints[rows], valid[rows] = 1e3 * to_order(hands[side].keypoints_world, "interhand"), 1
     return rounded(joints, 6), valid.tolist()
 
 

@@ -7,16 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim.errors import ArgumentError
+from gloves.takes.take import LOST, Take
+from handsim.errors import ArgumentError, HandSimWarning, RigError
+from handsim.space.camera import look_at, pinhole
 from handsim.space.transforms import quaternion_matrix
-from render.cameras.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, hand_centers
-from render.shown_take import ShownTake, show_take
-from train.simulation.takes import TakeConfig, simulate_take
+from render.cameras.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, check_hands_in_view, hand_centers
+from render.subject import subject_of_poses
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
-def take() -> ShownTake:
-    return show_take(simulate_take(TakeConfig(kind="hand-controller", num_frames=60)))
+def take() -> Take:
+    return simulate_take(kind="hand-controller", num_frames=60)
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -49,7 +51,7 @@ def test_cameras_anywhere_keep_their_distance(take):
 
 def test_cameras_anywhere_keep_clear_of_arms(take):
     viewpoints = Viewpoints(ViewConfig("anywhere", views=8), take, rng=np.random.default_rng(3))
-    poses = take.wrists()
+    poses = take.qpos
     for frame in range(take.num_frames):
         for qpos in poses[frame][np.isfinite(poses[frame, :, 0])]:
             arm = qpos[:3] - np.linspace(0.0, 0.5, 51)[:, None] * quaternion_matrix(qpos[None, 3:7])[0, :, 0]
@@ -58,12 +60,9 @@ def test_cameras_anywhere_keep_clear_of_arms(take):
 
 
 def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
-    hands = []
-    for hand in take.hands:
-        qpos = hand.qpos.copy()
-        qpos[20:30] = np.nan
-        hands.append(dataclasses.replace(hand, qpos=qpos))
-    centers = hand_centers(dataclasses.replace(take, hands=tuple(hands)))
+    qpos, status = take.qpos.copy(), take.status.copy()
+    qpos[20:30], status[20:30] = np.nan, LOST
+    centers = hand_centers(dataclasses.replace(take, qpos=qpos, status=status))
     assert np.isfinite(centers).all()
     assert np.linalg.norm(centers[25] - hand_centers(take)[25]) < 0.1
 
@@ -79,3 +78,15 @@ def test_a_lost_hand_is_aimed_at_where_it_was_between(take):
 def test_what_is_no_view_is_refused(wrong, said):
     with pytest.raises(ArgumentError, match=said):
         ViewConfig(**wrong)
+
+
+def test_cameras_must_look_at_the_hands():
+    take = subject_of_poses(np.zeros((3, 20)), model="M").take
+    eye = np.array([0.0, -0.6, 0.0])
+    seeing = pinhole("seeing", (640, 480), 600.0).at(look_at(eye, np.zeros(3)))
+    blind = pinhole("blind", (640, 480), 600.0).at(look_at(eye, 2 * eye))
+    check_hands_in_view("c.toml", [seeing], take)
+    with pytest.warns(HandSimWarning, match="camera 'blind' has no hand"):
+        check_hands_in_view("c.toml", [seeing, blind], take)
+    with pytest.raises(RigError, match="no camera has a hand in its picture in any of 3 frames"):
+        check_hands_in_view("c.toml", [blind], take)

@@ -10,7 +10,7 @@ from handsim.errors import DatasetError, HandSimError
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
 from render.formats.exr import linear_light, read_exr, srgb, write_exr
-from render.frames.frame import Pictures
+from render.frames import Pictures
 
 
 def same(first: Pictures, second: Pictures) -> None:

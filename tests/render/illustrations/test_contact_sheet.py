@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import HandSimError
-from render.frames.frame import Pictures
+from render.frames import Pictures
 from render.illustrations.contact_sheet import colored_depth, contact_sheet, draw_keypoints
 
 
@@ -25,15 +25,15 @@ def test_the_sheet_has_a_place_for_every_frame(make_frame) -> None:
 def test_keypoints_are_where_they_are(make_frame) -> None:
     frame = make_frame()
     black = np.zeros((72, 96, 3), np.uint8)
-    hand = dataclasses.replace(frame.hands[0], pixels=np.full((21, 2), np.nan))
+    hand = dataclasses.replace(frame.hands[0], keypoints=np.full((21, 2), np.nan))
     assert not draw_keypoints(black, [hand]).any()
     pixels = np.full((21, 2), np.nan)
     pixels[8] = (30.5, 20.5)
-    drawn = draw_keypoints(black, [dataclasses.replace(hand, pixels=pixels, visible=np.ones(21, bool))])
+    drawn = draw_keypoints(black, [dataclasses.replace(hand, keypoints=pixels, visible=np.ones(21, bool))])
     rows, columns = np.nonzero(drawn.any(axis=-1))
     assert (rows.mean(), columns.mean()) == pytest.approx((20.0, 30.0), abs=0.05)
     twice = draw_keypoints(
-        np.zeros((144, 192, 3), np.uint8), [dataclasses.replace(hand, pixels=pixels)], scale=2
+        np.zeros((144, 192, 3), np.uint8), [dataclasses.replace(hand, keypoints=pixels)], scale=2
     )
     rows, columns = np.nonzero(twice.any(axis=-1))
     assert (rows.mean(), columns.mean()) == pytest.approx((40.5, 60.5), abs=0.3)

@@ -1,3 +1,5 @@
+"""Lamps as they are drawn, and light from all around against its integral."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -5,9 +7,21 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from handsim.errors import HandSimError
-from render.scenery.lights import Lamp, Lighting, sample_lighting
+from render.scenery.backgrounds import BackgroundConfig
+from render.scenery.lights import (
+    Lamp,
+    Lighting,
+    expose_for,
+    irradiance,
+    sample_lighting,
+    sample_surroundings,
+    surround,
+)
+from render.skin.look import SkinLook
 
 
 def test_lightings_are_plain_values_and_repeat() -> None:
@@ -28,3 +42,72 @@ def test_lightings_neither_blind_nor_leave_in_the_dark(rng: np.random.Generator)
 def test_too_many_lamps_are_told() -> None:
     with pytest.raises(HandSimError, match="6 lamps"):
         Lighting((Lamp((0.0, 0.0, -1.0), 1.0),) * 6, (0.0, 0.0, 0.0))
+
+
+def sent_back(rows: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    x, y, z = normals.T
+    return np.stack([np.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1], 1) @ rows
+
+
+def around(count: int, rng: np.random.Generator) -> np.ndarray:
+    normals = rng.normal(size=(count, 3))
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_an_even_picture_lights_evenly(red: float, green: float, blue: float) -> None:
+    rows = irradiance(np.full((12, 16, 3), (red, green, blue)))
+    shown = sent_back(rows, around(50, np.random.default_rng(0)))
+    np.testing.assert_allclose(shown, np.broadcast_to((red, green, blue), shown.shape), atol=0.005)
+
+
+def test_a_picture_lights_as_the_integral_over_it_says(rng: np.random.Generator) -> None:
+    height, width = 48, 64
+    down, across = np.mgrid[0:height, 0:width]
+    picture = np.stack([down / height, across / width, 0.5 + 0.0 * down], axis=-1)
+    directions = around(200_000, rng)
+    away = np.arccos(np.abs(directions[:, 2])) / (np.pi / 2)
+    aside = directions[:, :2] / np.linalg.norm(directions[:, :2], axis=1, keepdims=True)
+    column, row = ((0.5 + 0.5 * away[:, None] * aside) * (width, height)).astype(int).T
+    light = picture[np.minimum(row, height - 1), np.minimum(column, width - 1)]
+    for normal in around(12, rng):
+        cosines = np.maximum(directions @ normal, 0.0)
+        wanted = 4.0 * (light * cosines[:, None]).mean(axis=0)  # over pi, times the sphere's 4 pi
+        np.testing.assert_allclose(sent_back(irradiance(picture), normal[None])[0], wanted, atol=0.02)
+
+
+def test_light_keeps_its_strength_and_takes_the_pictures_colors(rng: np.random.Generator) -> None:
+    lighting = sample_lighting(rng=rng)
+    red = np.zeros((12, 16, 3)) + (0.8, 0.1, 0.1)
+    lit = surround(lighting, red, 0.5)
+    weights = np.array([0.2126, 0.7152, 0.0722])
+    assert np.array(lit.ambient) @ weights == pytest.approx(np.array(lighting.ambient) @ weights, rel=0.01)
+    assert lit.ambient[0] > lighting.ambient[0] and lit.ambient[1] < lighting.ambient[1]
+    assert lit.lamps == lighting.lamps and lit.surroundings[0] == lit.ambient
+    with pytest.raises(HandSimError, match="3 rows of light"):
+        Lighting((), (0.1, 0.1, 0.1), ((0.0, 0.0, 0.0),) * 3)
+
+
+def test_a_dark_picture_gives_no_light_that_is_none() -> None:
+    lighting = sample_lighting(rng=np.random.default_rng(0))
+    lit = surround(lighting, np.zeros((12, 16, 3)), 0.5)
+    assert np.isfinite(lit.surroundings).all() and min(lit.ambient) > 0.0
+
+
+def test_surroundings_repeat() -> None:
+    first, again = (
+        sample_surroundings(BackgroundConfig(), None, rng=np.random.default_rng(3)) for _ in range(2)
+    )
+    assert first == again and len(first[1].surroundings) == 9
+
+
+def test_pictures_are_exposed_for_the_hand() -> None:
+    lighting = surround(sample_lighting(rng=np.random.default_rng(0)), np.full((4, 4, 3), 0.3), 0.5)
+    dark, light = (
+        expose_for(lighting, SkinLook(lightness=level, palm_lightness=66.0)) for level in (35.0, 75.0)
+    )
+    gain = np.array(dark.ambient) / light.ambient
+    np.testing.assert_allclose(gain, (((75 + 16) / (35 + 16)) ** 3) ** 0.5)  # half of what they differ by
+    np.testing.assert_allclose(dark.lamps[0].strength / light.lamps[0].strength, gain[0])
+    np.testing.assert_allclose(np.array(dark.surroundings), gain[0] * np.array(light.surroundings))

@@ -10,12 +10,12 @@ from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import JOINT_NAMES, SIDES, Side
 from handsim.space.transforms import MIRROR
 from render.skin.flexion import Flexion
-from render.skin.mesh import SkinMesh
+from render.skin.mesh import PosableSkin
 
 
-def rises(side: Side, **degrees: float) -> tuple[SkinMesh, np.ndarray]:
+def rises(side: Side, **degrees: float) -> tuple[PosableSkin, np.ndarray]:
     """How far each vertex at rest moves outwards [m], the ulna's head aside."""
-    mesh = SkinMesh(HandModel.named("M", side=side))
+    mesh = PosableSkin(HandModel.named("M", side=side))
     normals = vertex_normals(mesh.rest, mesh.faces)
     flexion = Flexion(mesh.model, mesh.rest, normals, 1.0)
     angles = np.zeros(20)
@@ -26,7 +26,7 @@ def rises(side: Side, **degrees: float) -> tuple[SkinMesh, np.ndarray]:
 
 
 def test_no_bones_are_the_models_own_skin() -> None:
-    mesh = SkinMesh(HandModel.named("M"))
+    mesh = PosableSkin(HandModel.named("M"))
     flexion = Flexion(mesh.model, mesh.rest, vertex_normals(mesh.rest, mesh.faces), 0.0)
     np.testing.assert_array_equal(flexion.shaped(mesh.rest, np.full(20, 0.5)), mesh.rest)
 
@@ -51,7 +51,7 @@ def test_shapes_grow_with_the_angle_and_never_jump() -> None:
 
 def test_both_hands_are_mirror_images(rng: np.random.Generator) -> None:
     angles = rng.uniform(0.0, 1.2, 20)
-    right, left = (SkinMesh(HandModel.named("M", side=side), bony=1.3) for side in SIDES[::-1])
+    right, left = (PosableSkin(HandModel.named("M", side=side), bony=1.3) for side in SIDES[::-1])
     shaped = [one._flexion.shaped(one.rest, angles) for one in (right, left)]
     np.testing.assert_allclose(shaped[1], shaped[0] @ MIRROR, atol=1e-9)
 

@@ -13,13 +13,13 @@ from handsim.space.transforms import MIRROR
 from poses.shapes.library import gesture
 from render.skin.atlas import skin_atlas
 from render.skin.forearm import FOREARM, Forearm, sample_forearm
-from render.skin.mesh import SkinMesh, face_parts
+from render.skin.mesh import PosableSkin, face_parts
 
 
 @pytest.mark.parametrize("side", SIDES)
 def test_drawn_skin_is_closed_and_faces_outwards(side: Side, rng: np.random.Generator) -> None:
     for _ in range(3):
-        mesh = SkinMesh(HandModel(sample_shape(side=side, rng=rng)), sample_forearm(rng=rng))
+        mesh = PosableSkin(HandModel(sample_shape(side=side, rng=rng)), sample_forearm(rng=rng))
         solid = trimesh.Trimesh(mesh.rest, mesh.faces, process=False)
         assert solid.is_watertight
         assert solid.is_winding_consistent
@@ -28,7 +28,7 @@ def test_drawn_skin_is_closed_and_faces_outwards(side: Side, rng: np.random.Gene
 
 def test_the_hands_own_vertices_are_the_models(model: HandModel) -> None:
     qpos = join_qpos(gesture("ok")[None], position=np.array([0.3, 0.1, 1.0]))[0]
-    mesh, atlas = SkinMesh(model), skin_atlas()
+    mesh, atlas = PosableSkin(model), skin_atlas()
     drawn = mesh.posed(qpos)
     skin = model.skin(qpos[None])[0][atlas.used]
     np.testing.assert_array_equal(mesh.merged(model.forward_kinematics(qpos[None]))[: len(skin)], skin)
@@ -40,14 +40,14 @@ def test_the_hands_own_vertices_are_the_models(model: HandModel) -> None:
 
 
 def test_drawn_faces_are_the_closed_surfaces_own(model: HandModel) -> None:
-    mesh, atlas = SkinMesh(model), skin_atlas()
+    mesh, atlas = PosableSkin(model), skin_atlas()
     drawn = mesh.posed(join_qpos(gesture("flat")[None])[0])
     np.testing.assert_array_equal(atlas.corners[drawn.faces], mesh.faces)
     assert len(drawn.faces) == len(drawn.parts) < 20_000  # two hands stay below 40 000
 
 
 def test_normals_are_the_meshs_and_are_shared_across_seams(model: HandModel) -> None:
-    mesh, atlas = SkinMesh(model), skin_atlas()
+    mesh, atlas = PosableSkin(model), skin_atlas()
     qpos = join_qpos(gesture("flat")[None])
     drawn = mesh.posed(qpos[0])
     normals = vertex_normals(mesh.merged(model.forward_kinematics(qpos)), mesh.faces)
@@ -68,7 +68,7 @@ def test_parts_follow_the_weights(model: HandModel) -> None:
     uniform = (strongest[np.minimum(atlas.faces, atlas.num_hand - 1)] == parts[:, None]).all(axis=1)
     assert uniform[~on_arm].mean() > 0.9
     # a part's middle lies along its bone
-    rest, middles = model.rest_transforms, SkinMesh(model).rest[atlas.faces].mean(axis=1)
+    rest, middles = model.rest_transforms, PosableSkin(model).rest[atlas.faces].mean(axis=1)
     for number, bone in enumerate(BONES):
         if bone.digit > 0:
             local = (middles[parts == number].mean(axis=0) - rest[number, :3, 3]) @ rest[number, :3, :3]
@@ -77,14 +77,14 @@ def test_parts_follow_the_weights(model: HandModel) -> None:
 
 
 def test_left_hand_is_the_mirror_image() -> None:
-    right, left = (SkinMesh(HandModel.named("M", side=side), Forearm(flexion=0.2)) for side in SIDES[::-1])
+    right, left = (PosableSkin(HandModel.named("M", side=side), Forearm(flexion=0.2)) for side in SIDES[::-1])
     np.testing.assert_allclose(left.rest, right.rest @ MIRROR, atol=1e-9)
     qpos = join_qpos(gesture("pinch_index")[None])[0]
     np.testing.assert_allclose(left.posed(qpos).shade, right.posed(qpos).shade, atol=1e-5)
 
 
 def test_folds_are_darker_than_what_lies_open(model: HandModel) -> None:
-    mesh, parts = SkinMesh(model), face_parts()
+    mesh, parts = PosableSkin(model), face_parts()
     flat, fist = (mesh.posed(join_qpos(gesture(name)[None])[0]) for name in ("spread", "fist"))
     assert flat.shade.min() >= 0.0
     assert fist.shade.max() <= 1.0
@@ -98,7 +98,7 @@ def test_folds_are_darker_than_what_lies_open(model: HandModel) -> None:
 def test_a_bent_wrist_has_the_arm_come_from_the_palms_side() -> None:
     model = HandModel.named("M")
     straight, bent, aside = (
-        SkinMesh(model, Forearm(length=0.2, flexion=flexion, deviation=deviation)).rest[-1]
+        PosableSkin(model, Forearm(length=0.2, flexion=flexion, deviation=deviation)).rest[-1]
         for flexion, deviation in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.3))
     )
     assert straight[0] < -0.19
@@ -108,12 +108,14 @@ def test_a_bent_wrist_has_the_arm_come_from_the_palms_side() -> None:
 
 def test_arms_are_as_thick_as_people_are() -> None:
     model, atlas = HandModel.named("L"), skin_atlas()
-    rings = SkinMesh(model, Forearm(length=0.22)).rest[atlas.num_hand : -1].reshape(-1, len(atlas.wrist), 3)
+    rings = (
+        PosableSkin(model, Forearm(length=0.22)).rest[atlas.num_hand : -1].reshape(-1, len(atlas.wrist), 3)
+    )
     girths = np.linalg.norm(rings - np.roll(rings, 1, axis=1), axis=-1).sum(axis=1)
     assert 0.150 < girths.min() < 0.180  # [m]: men's wrists, ANSUR II
     assert 0.24 < girths.max() < 0.30
     assert (np.diff(girths[: girths.argmax()])[3:] > 0.0).all()
-    arm = SkinMesh(model, Forearm(length=0.7)).rest[atlas.num_hand : -1].reshape(-1, len(atlas.wrist), 3)
+    arm = PosableSkin(model, Forearm(length=0.7)).rest[atlas.num_hand : -1].reshape(-1, len(atlas.wrist), 3)
     girths = np.linalg.norm(arm - np.roll(arm, 1, axis=1), axis=-1).sum(axis=1)
     behind = -arm[..., 0].mean(axis=1)
     elbow = (behind > 0.24) & (behind < 0.31)

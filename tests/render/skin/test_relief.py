@@ -9,11 +9,10 @@ from poses.shapes.library import gesture
 from render.illustrations.scene import view_along
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.materials import skin_material
-from render.painting.opengl_lights import add_lights
-from render.painting.opengl_painter import OPENGL_FROM_OPENCV, pyrender_material
+from render.painting.opengl_painter import OPENGL_FROM_OPENCV, add_lights, pyrender_material
 from render.scenery.lights import Lamp, Lighting
 from render.skin.atlas import skin_atlas
-from render.skin.mesh import SkinMesh
+from render.skin.mesh import PosableSkin
 from render.skin.relief import normal_map, relief
 from render.skin.texels import skin_texels
 from render.skin.texture import SkinTexture
@@ -57,7 +56,7 @@ def test_ridges_are_bright_on_the_side_of_the_light(side: Side, axis: int) -> No
     gray = np.full((rows, width, 3), 150, dtype=np.uint8)
     texture = SkinTexture(gray, np.full((rows, width), 255, dtype=np.uint8), normal_map(height, side))
     plain = texture._replace(normals=normal_map(0.0 * height, side))
-    skin = SkinMesh(model).posed(join_qpos(gesture("flat")[None])[0])
+    skin = PosableSkin(model).posed(join_qpos(gesture("flat")[None])[0])
     view = view_along(np.array([0, 0, -1.0]), np.array([1.0, 0, 0]), skin.vertices, SIZE)
     lamp = Lamp((-1.0, 0.0, -1.0) if axis == 1 else (0.0, -1.0, -1.0), 1.0)
     drawn = []

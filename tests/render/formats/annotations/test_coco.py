@@ -10,7 +10,7 @@ import pytest
 from handsim.hand.keypoints import KEYPOINT_NAMES
 from render.formats.annotations.common import hand_mask
 from render.formats.writer import open_writer
-from render.frames.frame import RenderedFrame
+from render.frames import RenderedFrame
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def test_projections_agree(folder: Path, frames: list[RenderedFrame]) -> None:
         np.testing.assert_allclose((uvw[:, :2] / uvw[:, 2:])[known], np.stack([u, v], 1)[known], atol=1e-4)
         np.testing.assert_array_equal(flags == 2, hand.visible)
         np.testing.assert_array_equal(np.stack([u, v], 1)[~known], 0.0)
-        np.testing.assert_allclose(np.stack([u, v], 1)[known] + 0.5, hand.pixels[known], atol=1e-4)
+        np.testing.assert_allclose(np.stack([u, v], 1)[known] + 0.5, hand.keypoints[known], atol=1e-4)
 
 
 def test_pycocotools_loads_it(folder: Path, frames: list[RenderedFrame]) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from render.formats.annotations.common import hand_mask, run_lengths, to_json
-from render.frames.frame import PARTS_A_HAND
+from render.frames import PARTS_A_HAND
 from render.skin.forearm import FOREARM
 
 

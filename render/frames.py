@@ -1,0 +1,121 @@
+"""`RenderedFrame`: the pictures of one camera at one time, and their ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from handsim.hand.shape import HandShape
+from handsim.space.camera import Camera
+
+PASSES: Final = ("rgb", "depth", "normals", "ids")
+"""Kinds of pictures that can be asked for."""
+PARTS_A_HAND: Final = 32
+"""Part numbers per hand: a pixel of bone b of hand h has part 1 + b + 32 h; 0 is not a hand."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pictures:
+    """The pictures of one frame; those that were not requested are None."""
+
+    rgb: UInt8[np.ndarray, "H W 3"] | None = None
+    """sRGB."""
+    depth: Float32[np.ndarray, "H W"] | None = None
+    """Distance along the camera's axis at each pixel's center [m]; 0 where there is nothing."""
+    normals: Float32[np.ndarray, "H W 3"] | None = None
+    """Unit normals of the surface in the camera's axes; 0 where there is nothing."""
+    parts: UInt8[np.ndarray, "H W"] | None = None
+    """Bone of each pixel's hand, see `PARTS_A_HAND`."""
+    instances: UInt8[np.ndarray, "H W"] | None = None
+    """1, 2, ... for the hands in their order, then the bodies; 0 for the background.
+
+    A hand's forearm and markers have the number of the hand.
+    """
+    markers: UInt8[np.ndarray, "H W"] | None = None
+    """1 + marker of each pixel, counted over all hands; 0 for no marker."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandTruth:
+    """One hand of a frame."""
+
+    shape: HandShape
+    """Shape and side of the hand."""
+    qpos: Float[np.ndarray, "27"]
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]."""
+    keypoints: Float[np.ndarray, "21 2"]
+    """Keypoints in the picture or beside it [px], see `handsim.hand.keypoints`; NaN where the lens cannot see
+    them."""
+    keypoints_world: Float[np.ndarray, "21 3"]
+    """The same keypoints in the world [m]; `frame.camera.local` gives them in the camera's axes."""
+    visible: Bool[np.ndarray, "21"]
+    """Whether each keypoint is in the picture, with nothing in front of it but the flesh around it."""
+    box: Float[np.ndarray, "4"]
+    """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
+    vertices: Float32[np.ndarray, "V 3"]
+    """`HandModel.skin` in the world [m]; on pictures of bare hands joints shape it further."""
+    marker_names: tuple[str, ...] = ()
+    markers: Float[np.ndarray, "M 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    """Centers of the glove's markers as the pose has them, in the world [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyTruth:
+    """One rigid body of a frame."""
+
+    name: str
+    T_world_body: Float[np.ndarray, "4 4"]
+    """Pose in the world [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedFrame:
+    """Pictures of one camera at one time, and their ground truth."""
+
+    number: int
+    """Number of the frame in the take."""
+    time: float
+    """Time in the take [s]."""
+    camera: Camera
+    hands: tuple[HandTruth, ...]
+    bodies: tuple[BodyTruth, ...]
+    ideal: Pictures
+    """Pictures of a perfect sensor."""
+    noisy: Pictures
+    """Colors and depth of the simulated sensors; None for those without noise."""
+    points: Float[np.ndarray, "N 3"]
+    """Points that the optical system saw, in the world [m]."""
+    labels: Int[np.ndarray, "N"]
+    """Index of each point's label in `label_names`; -1 for a ghost."""
+    label_names: tuple[str, ...]
+    choices: Mapping[str, Any]
+    """Every random choice that made the pictures, as JSON."""
+
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "H W 3"] | None:
+        """The perfect color picture (sRGB); `noisy.rgb` is the simulated sensor's."""
+        return self.ideal.rgb
+
+    @property
+    def depth(self) -> Float32[np.ndarray, "H W"] | None:
+        """The true depth [m]; `noisy.depth` is the simulated sensor's."""
+        return self.ideal.depth
+
+    @property
+    def normals(self) -> Float32[np.ndarray, "H W 3"] | None:
+        """The true normals."""
+        return self.ideal.normals
+
+    @property
+    def ids(self) -> UInt8[np.ndarray, "H W"] | None:
+        """Number of the hand or body in each pixel, 0 for the background: `ideal.instances`."""
+        return self.ideal.instances
+
+    @property
+    def key(self) -> str:
+        """Name of the frame in files: camera and number."""
+        return f"{self.camera.name}_{self.number:06d}"

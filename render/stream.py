@@ -1,0 +1,313 @@
+"""`PictureStream`, pictures without end for a training loop of torch, drawn as they are asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch.utils.data import IterableDataset, get_worker_info
+
+from gloves.layout import MarkerLayout
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError, choices
+from handsim.hand.keypoints import NUM_KEYPOINTS, hand_keypoints
+from handsim.hand.model import HandModel
+from handsim.hand.records import pack_hand
+from handsim.hand.shape import HandShape, sample_shape
+from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES, Side
+from handsim.space.camera import Camera, preset
+from poses import PoseSampler, sample_poses
+from poses.shapes.sampling import load_sampler, mixed_angles
+from render.cameras.viewpoints import around_hands, crop_around
+from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
+from render.drawing import open_studio, sample_choices
+from render.frames import HandTruth, RenderedFrame
+from render.sensors.depth_noise import DepthNoiseConfig
+from render.studio import Moment, Studio
+from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
+
+_PICTURE, _PERSON = 0, 1  # what a stream's spawn key goes on with
+_CROPPED: Final = 0.5  # of the share that hands have of a crop: what they have of the picture it is cut from
+_TRIES: Final = 20  # of a viewpoint that is outside of hands and objects
+_SIDE_CHOICES: Final = (*SIDES, "either")
+
+TakeSource = Take | str | Path
+
+
+class _Sitting(NamedTuple):
+    """One person and what is drawn of him or her."""
+
+    studio: Studio
+    subject: Subject
+    frames: NDArray[np.int64]
+    """Of the take, in the order in which they are drawn."""
+
+
+class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
+    """Random pictures of hands with their truth, without end.
+
+    Picture k depends on the seed and k alone. A few people take turns, each for a while: `people` of them are
+    about at a time, picture k shows number k modulo `people`, and each is replaced by somebody new after
+    `sitting` pictures. Light, background, viewpoint and sensors change with every picture.
+
+    It yields dicts of tensors, which the default collate of a `DataLoader` stacks:
+
+    | key | shape and type | what |
+    |---|---|---|
+    | `rgb`, `noisy_rgb` | (3, H, W) uint8 | sRGB: perfect, and from the simulated sensor |
+    | `depth`, `noisy_depth` | (H, W) float32 | along the camera's axis [m], 0: nothing |
+    | `normals` | (3, H, W) float32 | in the camera's axes, 0: nothing |
+    | `ids`, `parts`, `markers` | (H, W) uint8 | hand or body, bone, marker; see `RenderedFrame` |
+    | `keypoints` | (21, 2) float32 | [px] from the picture's corner, in the picture or not |
+    | `keypoints_camera` | (21, 3) float32 | in the camera's axes [m] |
+    | `visible` | (21,) bool | whether nothing hides them |
+    | `box` | (4,) float32 | left, top, width, height of what is seen [px]; NaN: nothing |
+    | `qpos` | (27,) float32 | wrist in the world [m], wxyz; joint angles [rad] |
+    | `shape` | (67,) float32 | the numbers of `HandShape`, lengths in [m] |
+    | `side` | () int64 | 0 left, 1 right |
+    | `K`, `T_world_camera` | (3, 3), (4, 4) float32 | of the camera |
+    | `number` | () int64 | k |
+
+    Pictures of two hands have an axis of hands in the place of the dots: `keypoints` is (2, 21, 2), and so on
+    for all that belongs to a hand. The hands are in the order of the poses or the take; one that is absent is
+    NaN, and not visible.
+
+    Args:
+        sampler: Draws joint angles (T, 20) [rad], which are made valid, or poses (T, 27), or poses of two
+            hands (T, 2, 27); a function like `PoseSampler`, or its `module:name`. By default handsim's own.
+        poses: Poses to draw from at random instead, as `render.draw` takes them.
+        takes: Takes to draw frames from at random instead, or their paths.
+        model: The hand, or both; another adult with every person when not given. Takes have their own.
+        side: Which hand pictures of one hand show, where no model says it: left, right or either.
+        config: What is drawn. Of its view only the name of the camera counts; people and light change as
+            told above; a depth sensor `auto` is a D435, as hands are near.
+        camera: Camera of your own, whose lens, matrix and size count and which is placed around the hand; or
+            the name of a preset.
+        crop: Size of the picture in pixels [px]: a square around the hand, cut out of what the camera sees by
+            a camera of its own, without resampling. The whole picture when not given.
+        fill: Least and greatest share of the picture's shorter side that the hand's keypoints span.
+        people: Number of people who are about at a time.
+        sitting: Pictures of one person.
+        glove: Marker layout on the hands, where the config dresses them in gloves.
+        batch: Number of pictures in a row that one worker draws. The batches of a `DataLoader` of this batch
+            size are then the same with any number of workers; else it is the pictures, in another order.
+        start: Number of the first picture.
+        seed: Seed of all random choices; the config's when not given.
+
+    Raises:
+        HandSimError: The arguments do not fit together, a take cannot be drawn, or a sampler returned
+            something else than poses.
+    """
+
+    def __init__(
+        self,
+        *,
+        sampler: PoseSampler | str | None = None,
+        poses: ArrayLike | None = None,
+        takes: TakeSource | Sequence[TakeSource] | None = None,
+        model: Model | tuple[Model, Model] | None = None,
+        side: Literal["left", "right", "either"] = "either",
+        config: RenderConfig | None = None,
+        camera: Camera | str | None = None,
+        crop: int | None = None,
+        fill: tuple[float, float] = (0.35, 0.75),
+        people: int = 16,
+        sitting: int = 128,
+        glove: MarkerLayout | str = "dense19",
+        batch: int = 1,
+        start: int = 0,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__()
+        if sum(given is not None for given in (sampler, poses, takes)) > 1:
+            raise ArgumentError("expected one of sampler, poses and takes")
+        if side not in _SIDE_CHOICES:
+            raise ArgumentError(choices(side, _SIDE_CHOICES, noun="side"))
+        if min(people, sitting, batch, start + 1) < 1 or not 0.05 <= fill[0] <= fill[1] <= 1.0:
+            raise ArgumentError(
+                f"people is {people}, sitting {sitting}, batch {batch}, start {start} and fill {fill}, "
+                "expected numbers of at least 1, a start of at least 0, and two shares of 0.05 to 1"
+            )
+        self.config = _settled(RenderConfig() if config is None else config)
+        self.seed = self.config.seed if seed is None else seed
+        self._camera = _camera(self.config.view.camera if camera is None else camera, crop)
+        self._crop, self._fill = crop, fill
+        self._people, self._sitting, self._batch, self._start = people, sitting, batch, start
+        self._model, self._side, self._glove = model, side, glove
+        self._sampler = load_sampler(sampler) if isinstance(sampler, str) else sampler
+        self._poses = None if poses is None else np.asarray(poses, dtype=np.float64)
+        given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
+        self._takes = [load_subject(source_of(take, model=model), seed=self.seed) for take in given]
+        if len({len(one.take.hands) for one in self._takes}) > 1:
+            raise ArgumentError("the takes have different numbers of hands, expected the same in all")
+        if self.config.shutter is not None and not self._takes:
+            raise ArgumentError("poses without times have no motion to blur; leave out the shutter")
+        cv2.setNumThreads(1)  # forked workers would wait for the threads of this process forever
+
+    def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
+        worker = get_worker_info()
+        mine, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        if cv2.getNumThreads() > 1:  # of a worker that was spawned
+            cv2.setNumThreads(1)
+        sitting: dict[int, tuple[int, _Sitting]] = {}
+        first = self._start + mine * self._batch
+        while True:
+            for number in range(first, first + self._batch):
+                place, turn = number % self._people, number // self._people
+                # Not all at once: each of them begins at another point of a sitting.
+                turn += place * self._sitting // self._people
+                person, rank = divmod(turn, self._sitting)
+                if place not in sitting or sitting[place][0] != person:
+                    sitting[place] = person, self._new_sitting(person * self._people + place)
+                yield self._picture(number, sitting[place][1], rank)
+            first += workers * self._batch
+
+    def _new_sitting(self, person: int) -> _Sitting:
+        """Somebody new, with poses for all of his or her pictures."""
+        rng = SpawnKey.STREAM.rng(self.seed, _PERSON, person)
+        if self._takes:
+            subject = self._takes[rng.integers(len(self._takes))]
+            frames = np.flatnonzero(np.isfinite(subject.take.qpos[..., 0]).any(axis=1))
+            frames = rng.choice(frames, self._sitting)
+        else:
+            subject, frames = self._posed(rng), np.arange(self._sitting)
+        studio = open_studio(subject.take.hands, self.config, bodies=subject.take.bodies, rng=rng)
+        return _Sitting(studio, subject, frames)
+
+    def _posed(self, rng: np.random.Generator) -> Subject:
+        """A person's poses."""
+        side: Side = SIDES[rng.integers(2)] if self._side == "either" else self._side
+        shape = sample_shape(side=side, rng=rng)
+        model: Model | tuple[Model, Model] = HandModel(shape) if self._model is None else self._model
+        if self._poses is not None:
+            qpos = self._poses[rng.integers(len(self._poses), size=self._sitting)]
+        else:
+            qpos = self._sampled(models_of(model, 2 if isinstance(model, tuple) else 1)[0], rng)
+        if qpos.ndim == 3 and self._model is None:
+            model = (HandModel(shape.with_side("right")), HandModel(shape.with_side("left")))
+        return subject_of_poses(qpos, model=model, glove=self._glove)
+
+    def _sampled(self, model: HandModel, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Poses by the sampler."""
+        sampler = mixed_angles if self._sampler is None else self._sampler
+        drawn = np.asarray(sampler(model, self._sitting, rng=rng), dtype=np.float64)
+        if drawn.shape == (self._sitting, NUM_JOINTS):
+            return sample_poses(model, self._sitting, lambda *_, **__: drawn, rng=rng)
+        if drawn.shape not in {(self._sitting, NUM_QPOS), (self._sitting, 2, NUM_QPOS)}:
+            raise ArgumentError(
+                f"the sampler returned an array of shape {drawn.shape} for {self._sitting} poses, expected "
+                f"({self._sitting}, {NUM_JOINTS}), ({self._sitting}, {NUM_QPOS}) or ({self._sitting}, 2, "
+                f"{NUM_QPOS})"
+            )
+        return drawn
+
+    def _picture(self, number: int, sitting: _Sitting, rank: int) -> dict[str, torch.Tensor]:
+        rng = SpawnKey.STREAM.rng(self.seed, _PICTURE, number)
+        take = sitting.subject.take
+        moment = Moment(take, int(sitting.frames[rank]))
+        poses = {n: moment.hand(n) for n in range(len(take.hands))}
+        there = {n: pose for n, pose in poses.items() if pose is not None}
+        keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
+        camera = self._placed(sitting.studio, moment, keypoints, list(there.values()), rng)
+        chosen = sample_choices(self.config, sitting.studio.skin, rng)
+        fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
+        frame = sitting.studio.photograph(moment, camera, fresh)
+        truth = dict(zip(there, frame.hands, strict=True))
+        hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(take.hands)]
+        merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}
+        if len(hands) == 1:
+            merged = {name: array[0] for name, array in merged.items()}
+        arrays = (
+            _picture_arrays(frame)
+            | merged
+            | {
+                "K": camera.K.astype(np.float32),
+                "T_world_camera": camera.T_world_camera.astype(np.float32),
+                "number": np.int64(number),
+            }
+        )
+        return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+
+    def _placed(
+        self,
+        studio: Studio,
+        moment: Moment,
+        keypoints: Sequence[NDArray[np.float64]],
+        qpos: Sequence[NDArray[np.float64]],
+        rng: np.random.Generator,
+    ) -> Camera:
+        """The camera somewhere around the hands, outside of all surfaces."""
+        points, wrists = np.concatenate(keypoints), np.stack(qpos)
+        for _ in range(_TRIES):
+            share = float(rng.uniform(*self._fill))
+            if self._crop is None:
+                camera = around_hands(self._camera, points, wrists, share, rng=rng)
+            else:
+                wide = around_hands(self._camera, points, wrists, share * _CROPPED, rng=rng)
+                camera = crop_around(wide, points, share, self._crop, rng=rng)
+            if studio.is_clear(moment, [camera]):
+                break
+        return camera
+
+
+def _settled(config: RenderConfig) -> RenderConfig:
+    """The configuration with a painter, and with a depth sensor that measures near hands."""
+    if config.depth_sensor == "auto":
+        config = dataclasses.replace(config, depth_sensor=DepthNoiseConfig((NEAR_SENSOR,)))
+    return config.settled()
+
+
+def _camera(camera: Camera | str, crop: int | None) -> Camera:
+    """The camera that is placed around hands."""
+    found = preset(camera) if isinstance(camera, str) else camera
+    if not isinstance(found, Camera):
+        raise ArgumentError(f"camera is {camera!r}, expected a Camera or the name of a preset")
+    if crop is not None and (crop < 16 or found.lens.kind != "pinhole"):
+        raise ArgumentError(
+            f"crop is {crop} and the camera's lens '{found.lens.kind}', expected 16 pixels or more of a "
+            "pinhole camera"
+        )
+    return found
+
+
+def _picture_arrays(frame: RenderedFrame) -> dict[str, NDArray[np.generic]]:
+    """The pictures of a frame that there are, colors and normals with their channels first."""
+    ideal, noisy = frame.ideal, frame.noisy
+    arrays = {
+        "rgb": ideal.rgb,
+        "noisy_rgb": noisy.rgb,
+        "depth": ideal.depth,
+        "noisy_depth": noisy.depth,
+        "normals": ideal.normals,
+        "ids": ideal.instances,
+        "parts": ideal.parts,
+        "markers": ideal.markers,
+    }
+    return {
+        name: np.moveaxis(array, 2, 0) if array.ndim == 3 else array
+        for name, array in arrays.items()
+        if array is not None
+    }
+
+
+def _hand_arrays(hand: HandTruth | None, camera: Camera, shape: HandShape) -> dict[str, NDArray[np.generic]]:
+    """What belongs to a hand; NaN of one that is absent."""
+    numbers = np.concatenate([np.ravel(value) for value in pack_hand(shape)[1:]])
+    nothing = np.full((NUM_KEYPOINTS, 3), np.nan, dtype=np.float32)
+    return {
+        "keypoints": nothing[:, :2] if hand is None else hand.keypoints.astype(np.float32),
+        "keypoints_camera": nothing
+        if hand is None
+        else camera.local(hand.keypoints_world).astype(np.float32),
+        "visible": np.zeros(NUM_KEYPOINTS, dtype=bool) if hand is None else hand.visible,
+        "box": np.full(4, np.nan, dtype=np.float32) if hand is None else hand.box.astype(np.float32),
+        "qpos": np.full(NUM_QPOS, np.nan, np.float32) if hand is None else hand.qpos.astype(np.float32),
+        "shape": numbers.astype(np.float32),
+        "side": np.array(SIDES.index(shape.side)),
+    }

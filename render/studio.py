@@ -1,0 +1,343 @@
+"""`Studio`, which draws single moments of a take for one camera, with their ground truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, UInt8
+from numpy.typing import NDArray
+
+from gloves.fit import GloveFit
+from gloves.takes.take import RigidBody, Take
+from handsim.errors import HandSimError
+from handsim.space.camera import Camera
+from handsim.space.transforms import pose_matrices
+from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
+from render.frames import PASSES, BodyTruth, Pictures, RenderedFrame
+from render.hand_truth import hand_truth
+from render.painting.figures import Appearance, BodyFigure, Drawn, HandFigure
+from render.painting.painter import Painter, paint, put_before
+from render.painting.rasterizer import NEAR, join, rasterize
+from render.painting.shading import GAMMA
+from render.painting.shadows import light_behind
+from render.scenery.backgrounds import Background, draw_background
+from render.scenery.enclosures import Enclosure, draw_surroundings
+from render.scenery.lights import Lighting
+from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
+from render.sensors.exposure import Exposure, expose, linear_of
+from render.sensors.shutter import Shutter, combine, shutter_times
+from render.skin.look import SkinLook
+
+
+@dataclass(frozen=True, slots=True)
+class FrameChoices:
+    """Random choices of one picture, apart from people and camera."""
+
+    lighting: Lighting
+    background: Background
+    exposure: Exposure | None
+    """None for a perfect color sensor."""
+    shutter: Shutter | None
+    """None for a picture of a moment."""
+    depth_noise: DepthNoise | None
+    """None for a perfect depth sensor."""
+    seed: int
+    """Seed of the sensors' noise."""
+    enclosure: Enclosure | None = None
+    """The box whose walls have the background, for several cameras; None: a picture without depth."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """One frame of a take, and the time around it, which shutters blur."""
+
+    take: Take
+    frame: int
+    person: Int[np.ndarray, "T"] | None = None
+    """Who is in each frame, where that changes: the time around a frame ends where another person comes."""
+
+    def hand(self, number: int, shift: float = 0.0) -> Float[np.ndarray, "27"] | None:
+        """Pose of a hand `shift` seconds after the frame; None where the frame has none."""
+        rows = self.take.qpos[:, number]
+        if not np.isfinite(rows[self.frame]).all():
+            return None
+        (before, after), share = self._around(rows, shift)
+        if before[3:7] @ after[3:7] < 0.0:
+            after = np.concatenate([after[:3], -after[3:7], after[7:]])
+        pose: NDArray[np.float64] = before + share * (after - before)
+        pose[3:7] /= np.linalg.norm(pose[3:7])
+        return pose
+
+    def body(self, number: int, shift: float = 0.0) -> Float[np.ndarray, "4 4"] | None:
+        """Pose of a rigid body `shift` seconds after the frame; None where the frame has none."""
+        rows = self.take.body_poses[:, number]
+        if not np.isfinite(rows[self.frame]).all():
+            return None
+        poses, share = self._around(rows, shift)
+        before, after = pose_matrices(poses)
+        T_world_body: NDArray[np.float64] = before + share * (after - before)
+        left, _, right = np.linalg.svd(T_world_body[:3, :3])
+        T_world_body[:3, :3] = left @ right
+        return T_world_body
+
+    def _around(self, rows: Float[np.ndarray, "T ..."], shift: float) -> tuple[NDArray[np.float64], float]:
+        """The rows before and after a time, and the share of the way between them.
+
+        Rows without numbers, and those of others than the frame's person, count as the frame's own.
+        """
+        frames = shift * self.take.rate
+        step = int(np.floor(frames))
+        indices = np.clip([self.frame + step, self.frame + step + 1], 0, len(rows) - 1)
+        others = [self.person is not None and self.person[i] != self.person[self.frame] for i in indices]
+        kept = [
+            self.frame if other or not np.isfinite(rows[index]).all() else index
+            for index, other in zip(indices, others, strict=True)
+        ]
+        return rows[kept], frames - step
+
+
+class Studio:
+    """Draws moments of the same people and rigid bodies.
+
+    Args:
+        hands: The hands, in the order of the takes.
+        people: Appearance of each hand.
+        bodies: The rigid bodies, in the order of the takes.
+        body_colors: Color of each of them, sRGB in [0, 1].
+        passes: Some of `PASSES`.
+        painter: What paints colors.
+    """
+
+    def __init__(
+        self,
+        hands: Sequence[GloveFit],
+        people: Sequence[Appearance],
+        bodies: Sequence[RigidBody] = (),
+        body_colors: Sequence[tuple[float, float, float]] = (),
+        passes: Sequence[str] = PASSES,
+        painter: Painter = "compiled",
+    ) -> None:
+        self.passes, self.painter = tuple(passes), painter
+        self._people = tuple(people)
+        self._looks = [dataclasses.asdict(look) for look in people]
+        first = np.cumsum([0, *(len(fit.attachment.points) for fit in hands)])
+        self._hands = [
+            HandFigure(fit, look, first_marker=int(number))
+            for fit, look, number in zip(hands, people, first, strict=False)
+        ]
+        self._bodies = [BodyFigure(body, color) for body, color in zip(bodies, body_colors, strict=True)]
+        self._colors = tuple(body_colors)
+        self._posed: tuple[Moment, list[Drawn]] | None = None  # the last moment's, seen by several cameras
+
+    @property
+    def skin(self) -> SkinLook | None:
+        """The people's skin; None where gloves hide it."""
+        return self._people[0].skin if self._people[0].glove is None else None
+
+    def photograph(self, moment: Moment, camera: Camera, choices: FrameChoices) -> RenderedFrame:
+        """Draw one moment.
+
+        Args:
+            moment: Poses of the studio's hands and bodies.
+            camera: The camera.
+            choices: All other choices.
+
+        Raises:
+            HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
+        """
+        take, frame, rng = moment.take, moment.frame, np.random.default_rng(choices.seed)
+        drawn = self._still(moment)
+        _check_outside(camera, drawn, frame)
+        present = [number for number in range(len(self._hands)) if moment.hand(number) is not None]
+        noisy = "depth" in self.passes and choices.depth_noise is not None
+        truth = self._geometry(camera, drawn, with_normals=noisy or "normals" in self.passes)
+        rgb = noisy_rgb = noisy_depth = None
+        if "rgb" in self.passes:
+            rgb = self._colors_of(camera, drawn, choices)
+            noisy_rgb = self._exposed(moment, camera, rgb, choices, rng)
+        seen = truth
+        if choices.enclosure is not None:
+            seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
+        if noisy and seen.depth is not None:
+            light, sensor = self._infrared(seen, rgb, present), choices.depth_noise
+            noisy_depth = apply_depth_noise(
+                seen.depth, seen.normals, sensor, camera=camera, reflectance=light, rng=rng
+            )
+        hands = tuple(
+            hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth)
+            for index, number in enumerate(present)
+        )
+        bodies = tuple(
+            BodyTruth(body.name, T_world_body)
+            for body, T_world_body in zip(take.bodies, pose_matrices(take.body_poses[frame]), strict=True)
+            if np.isfinite(T_world_body).all()
+        )
+        known = np.isfinite(take.points[frame, :, 0])
+        return RenderedFrame(
+            number=frame,
+            time=float(take.times[frame]),
+            camera=camera,
+            hands=hands,
+            bodies=bodies,
+            ideal=self._requested(seen, rgb),
+            noisy=Pictures(rgb=noisy_rgb, depth=noisy_depth),
+            points=take.points[frame, known],
+            labels=take.labels[frame, known],
+            label_names=take.label_names,
+            choices=self._record(choices),
+        )
+
+    def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
+        """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
+        drawn = self._still(moment)
+        return all(_clearance(camera, drawn) >= 2.0 * NEAR for camera in cameras)
+
+    def _still(self, moment: Moment) -> list[Drawn]:
+        """Surfaces of a moment."""
+        if self._posed is None or self._posed[0] is not moment:
+            self._posed = moment, self._drawn(moment, 0.0)
+        return self._posed[1]
+
+    def _drawn(self, moment: Moment, shift: float) -> list[Drawn]:
+        """Surfaces of the hands and bodies that are there, `shift` seconds later."""
+        drawn: list[Drawn] = []
+        number = 0
+        for index, hand in enumerate(self._hands):
+            pose = moment.hand(index, shift)
+            if pose is not None:
+                drawn += hand.drawn(pose, number)
+                number += 1
+        for index, body in enumerate(self._bodies):
+            T_world_body = moment.body(index, shift)
+            if T_world_body is not None:
+                number += 1
+                drawn += body.drawn(T_world_body, number)
+        return drawn
+
+    def _geometry(self, camera: Camera, drawn: Sequence[Drawn], *, with_normals: bool) -> Pictures:
+        """Depth, normals and ids through the camera's lens."""
+        surface = join([one.triangles for one in drawn]) if drawn else None
+        width, height = camera.size
+        if surface is None:
+            flat = np.zeros((height, width), dtype=np.uint8)
+            bare = np.zeros((height, width, 3), dtype=np.float32)
+            return Pictures(None, flat.astype(np.float32), bare, flat, flat, flat)
+        faces = [rasterize(face, surface, with_normals=with_normals) for face in faces_for(camera)]
+        if camera.lens.kind == "pinhole":
+            return faces[0]
+        normals = [face.normals for face in faces if face.normals is not None]
+        ids = (
+            warp(camera, [getattr(face, name) for face in faces], "nearest")
+            for name in ("parts", "instances", "markers")
+        )
+        return Pictures(
+            None,
+            warp_depth(camera, [face.depth for face in faces if face.depth is not None]),
+            warp_normals(camera, normals) if normals else None,
+            *ids,
+        )
+
+    def _infrared(
+        self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]
+    ) -> Float32[np.ndarray, "H W"]:
+        """Infrared reflectance of each pixel, from its color; bare skin has its own."""
+        assert truth.instances is not None
+        shape = truth.instances.shape
+        infrared = np.ones(shape, dtype=np.float32) if rgb is None else reflectance_of(rgb)
+        for index, number in enumerate(present):
+            if self._people[number].glove is None:
+                infrared[truth.instances == index + 1] = self._people[number].skin.infrared
+        return infrared
+
+    def _colors_of(
+        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """The perfect color picture."""
+        painted = [paint(face, drawn, choices.lighting, self.painter) for face in faces_for(camera)]
+        whole = painted[0] if camera.lens.kind == "pinhole" else warp(camera, painted, "linear")
+        if choices.enclosure is None:
+            return put_before(whole, self._behind(camera, drawn, choices))
+        behind = draw_surroundings(choices.background, choices.enclosure, camera)
+        return put_before(whole, behind.rgb.astype(np.float32))
+
+    def _behind(
+        self, camera: Camera, drawn: Sequence[Drawn], choices: FrameChoices
+    ) -> Float32[np.ndarray, "H W 3"]:
+        """The background with what shadows fall on it, sRGB from 0 to 255."""
+        plain, backdrop = _background(choices.background, camera.size), choices.background.backdrop
+        if backdrop is None or camera.lens.kind != "pinhole":
+            return plain
+        light = light_behind(camera, drawn, choices.lighting, backdrop)
+        if light is None:
+            return plain
+        lit: NDArray[np.float32] = cv2.multiply(plain, cv2.merge([cv2.pow(light, 1.0 / GAMMA)] * 3))
+        return lit
+
+    def _exposed(
+        self,
+        moment: Moment,
+        camera: Camera,
+        rgb: NDArray[np.uint8],
+        choices: FrameChoices,
+        rng: np.random.Generator,
+    ) -> UInt8[np.ndarray, "H W 3"] | None:
+        """The color picture of shutter and sensor; None when they change nothing."""
+        if choices.exposure is None and choices.shutter is None:
+            return None
+        if choices.shutter is None:
+            light = linear_of(rgb)
+        else:
+            one = choices.shutter
+            times, weights = shutter_times(one.exposure, one.readout, one.sub_frames, camera.size[1])
+            moments = (self._colors_of(camera, self._drawn(moment, time), choices) for time in times)
+            light = combine(moments, weights)
+        return expose(light, choices.exposure or Exposure(), rng=rng)
+
+    def _requested(self, truth: Pictures, rgb: NDArray[np.uint8] | None) -> Pictures:
+        ids = "ids" in self.passes
+        return Pictures(
+            rgb,
+            truth.depth if "depth" in self.passes else None,
+            truth.normals if "normals" in self.passes else None,
+            truth.parts if ids else None,
+            truth.instances if ids else None,
+            truth.markers if ids else None,
+        )
+
+    def _record(self, choices: FrameChoices) -> dict[str, Any]:
+        noise = choices.depth_noise
+        kind = {} if noise is None else {"depth_sensor": type(noise).__name__}
+        chosen = dataclasses.asdict(choices)
+        if choices.enclosure is None:
+            del chosen["enclosure"]
+        return {"people": self._looks, "body_colors": self._colors, **kind, **chosen}
+
+
+def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
+    """Distance of a camera from the nearest vertex [m]."""
+    center = camera.T_world_camera[:3, 3]
+    distances = (np.linalg.norm(one.triangles.vertices - center, axis=1).min() for one in drawn)
+    return float(min(distances, default=np.inf))
+
+
+def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
+    nearest = _clearance(camera, drawn)
+    if nearest < 2.0 * NEAR:
+        raise HandSimError(
+            f"camera '{camera.name}' is {1e3 * nearest:.0f} mm from a hand or object in frame {frame}, "
+            f"expected {2e3 * NEAR:.0f} mm or more; place it elsewhere"
+        )
+
+
+@functools.lru_cache(maxsize=2)
+def _background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
+    """SRGB from 0 to 255."""
+    display = cv2.pow(draw_background(background, size), 1.0 / GAMMA)
+    drawn: NDArray[np.float32] = np.multiply(display, np.float32(255.0), out=display)
+    return drawn

@@ -1,0 +1,39 @@
+"""What users give: a capture, a glove or a labeler as objects, or by their names and paths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture
+from gloves.layout import MarkerLayout
+from gloves.takes.take import Take, load_take
+from train.labelers.protocol import Labeler
+
+AnyCapture = Capture | Take | str | Path
+"""A capture, or a take, of which only the points are used; or the path of one."""
+AnyGlove = MarkerLayout | str | Path
+AnyLabeler = Labeler | str | Path | None
+"""A labeler, what `load_labeler` reads, or None for the one of the glove."""
+
+
+def capture_of(capture: AnyCapture) -> Capture:
+    """The points of a capture or a take, without labels.
+
+    Raises:
+        CaptureError: The file is missing, damaged or of another kind.
+    """
+    if isinstance(capture, str | Path):
+        capture = read_points(capture)
+    return capture if isinstance(capture, Capture) else capture.capture()
+
+
+def read_points(path: str | Path) -> Capture | Take:
+    """The capture or take of a file.
+
+    Raises:
+        CaptureError: The file is missing, damaged or of another kind.
+    """
+    if str(path).lower().endswith((".npz", ".npz.part")):
+        return load_take(path)
+    return read_capture(path)
