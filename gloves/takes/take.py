@@ -524,7 +524,7 @@ def load_take(path: str | Path) -> Take:
         path: The file.
 
     Returns:
-        Points (T, N, 3) [m] with IDs and labels, and the hands' poses (T, H, 27) [m, rad].
+        Times (T,) [s], poses (T, H, 27) [m, rad], points (T, N, 3) [m] and their labels (T, N).
 
     Raises:
         ArgumentError: It is no path.
