@@ -5,6 +5,7 @@ The sentences are a golden file; HANDSIM_RENEW_GOLDEN=1 pytest tests/test_bad_in
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -77,10 +78,11 @@ def folder(tmp_path, monkeypatch):
     }
     for name, content in files.items():
         (tmp_path / name).write_text(content)
-    write_archive(tmp_path / "tracked.npz", "tracked take", 1, {}, {})
-    write_archive(tmp_path / "newer.npz", "tracked take", 99, {}, {})
+    write_archive(tmp_path / "older.npz", {"kind": "tracked take", "schema": 2}, {})
+    write_archive(tmp_path / "newer.npz", {"kind": "take", "schema": 99}, {})
     take = simulate_take(num_frames=2)
     take.save(tmp_path / "good.truth.npz")
+    dataclasses.replace(take, settings={"tracker": {}}).save(tmp_path / "tracked.npz")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "broken.jpg").write_text("no picture")
     save_layout(tmp_path / "copy.toml", load_layout("dense19"))
@@ -121,6 +123,7 @@ CASES = {
     "a damaged ONNX file": ["label", "good.trc", "--labeler", "damaged.onnx", "--out", "out.trc"],
     "an export to another kind of file": ["export", "dense19", "--out", "out.pt"],
     "motion in another kind of file": ["export", "good.truth.npz", "--out", "out.fbx"],
+    "motion of a take of before": ["export", "older.npz", "--out", "out.glb"],
     "motion of a damaged take": ["export", "damaged.truth.npz", "--out", "out.glb"],
     "a size and a take": ["hand", "--size", "M", "--take", "good.truth.npz", "--out", "out.xml"],
     "an export of an unknown labeler": ["export", "dense91", "--out", "out.onnx"],

@@ -70,8 +70,9 @@ def evaluate_labeler(
     given: list[Any] = list(truth) if several else [truth]  # type: ignore[arg-type]
     count, takes = LabelingCount(network), [one for one in given if _is_take(one)]
     if len(takes) < len(given) and takes:
-        shown = takes[0] if isinstance(takes[0], str | Path) else "a take"
-        raise CaptureError(f"given {shown} and other kinds of truth, expected one kind; evaluate each alone")
+        raise CaptureError(
+            f"given {_shown(takes[0])} and other kinds of truth, expected one kind; evaluate each alone"
+        )
     if takes and (corruption != CLEAN or every > 1):
         raise CaptureError(
             "a simulated take is counted whole, with its own gaps and ghosts: leave out --occlude, --ghosts "
@@ -79,6 +80,8 @@ def evaluate_labeler(
         )
     for one in takes:
         take = one if isinstance(one, Take) else load_take(one)
+        if take.is_tracked:
+            raise CaptureError(f"{_shown(one)}: a tracked take, expected the truth of a simulated capture")
         for hand in take.hands:
             _check_markers("the take's glove", hand.layout.names, network.marker_names)
         count.add_take(take)
@@ -91,6 +94,11 @@ def evaluate_labeler(
             "captures"
         )
     return report
+
+
+def _shown(take: Any) -> str:
+    """A take as sentences name it."""
+    return str(take) if isinstance(take, str | Path) else "the take"
 
 
 def _is_take(truth: Any) -> bool:

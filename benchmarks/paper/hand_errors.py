@@ -20,6 +20,7 @@ from gloves.fit import GloveFit
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import PALM
+from handsim.space.transforms import rigid_fit
 
 
 class HandErrors(NamedTuple):
@@ -50,9 +51,7 @@ def hand_errors(found: GloveFit, true: GloveFit) -> HandErrors:
     bones = true.attachment.main_bones
     off = _on_bones(found.model, found.attachment, bones) - _on_bones(true.model, true.attachment, bones)
     wrist_positions = np.linalg.norm(off, axis=1)
-    rotation, translation = _align_rigid(
-        found.model.skeleton.offsets[1::3], true.model.skeleton.offsets[1::3]
-    )
+    rotation, translation = rigid_fit(found.model.skeleton.offsets[1::3], true.model.skeleton.offsets[1::3])
     palm = bones == PALM
     off[palm] = found.attachment.points[palm] @ rotation.T + translation - true.attachment.points[palm]
     lengths = found.model.shape.bone_lengths / true.model.shape.bone_lengths - 1.0
@@ -64,12 +63,3 @@ def _on_bones(model: HandModel, worn: Attachment, bones: NDArray[np.int64]) -> N
     rest = model.rest_transforms[bones]
     local: NDArray[np.float64] = np.einsum("mji,mj->mi", rest[:, :3, :3], worn.points - rest[:, :3, 3])
     return local
-
-
-def _align_rigid(source: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Rotation (3, 3) and translation (3,) that align points (P, 3) with others (Kabsch 1976)."""
-    center, target_center = source.mean(axis=0), target.mean(axis=0)
-    left, _, right = np.linalg.svd((target - target_center).T @ (source - center))
-    reflection = np.diag([1.0, 1.0, np.linalg.det(left @ right)])
-    rotation = left @ reflection @ right
-    return rotation, target_center - rotation @ center

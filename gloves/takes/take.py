@@ -277,6 +277,11 @@ class Take:
         return len(self.times)
 
     @property
+    def is_tracked(self) -> bool:
+        """Whether a tracker made it, whose labels may be wrong; its settings are among those of the take."""
+        return "tracker" in self.settings
+
+    @property
     def sides(self) -> tuple[Side, ...]:
         """Sides of the hands, in their order."""
         return tuple(hand.side for hand in self.hands)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -124,19 +125,23 @@ def _live(rank: int, job: Job, rendezvous: Path, channels: list[Connection]) -> 
     if rank:
         warnings.simplefilter("ignore")  # the first one tells
 
+    def tell(is_last: bool, word: Any) -> None:
+        with contextlib.suppress(OSError):  # nobody is there to hear it
+            channels[rank].send((is_last, word))
+
     def report(done: int, expected: int, loss: float) -> None:
-        channels[rank].send((False, (done, expected, loss)))
+        tell(False, (done, expected, loss))
 
     try:
         with signals_raise():
             if hasattr(signal, "pthread_sigmask"):  # the parent's death sends one, too
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGHUP})
-            channels[rank].send((True, job(progress=report)))
+            tell(True, job(progress=report))
             return
     except KeyboardInterrupt as stop:
         word: Exception | Stopped = stop if isinstance(stop, Stopped) else Stopped()
     except Exception as error:
         error.add_note(traceback.format_exc())
         word = portable(error)
-    channels[rank].send((True, word))
+    tell(True, word)
     sys.exit(1)

@@ -145,6 +145,7 @@ def test_trials_are_made_of_takes_that_are_long_enough(monkeypatch):
     ]
 
 
+@pytest.mark.slow
 def test_a_body_that_is_followed_must_have_its_labels():
     labeler = load_labeler("dense19")
     take = simulate_take(kind="hand-controller", num_frames=20)

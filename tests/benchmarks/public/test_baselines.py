@@ -30,6 +30,7 @@ def test_a_baseline_writes_results_that_can_be_scored(tracker, benchmark, tmp_pa
     assert json.loads((tmp_path / "results" / ABOUT).read_text())["tracker"] == tracker
 
 
+@pytest.mark.slow
 def test_the_size_of_the_hands_is_measured(benchmark, tmp_path, capsys):
     out = tmp_path / "results"
     assert command(["run", str(benchmark.folder), "--out", str(out)]) == 0

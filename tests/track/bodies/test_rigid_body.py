@@ -14,7 +14,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
-from track.bodies.body_pose import predict_pose, transform_markers, velocity_between
+from track.bodies.constellation import predict_pose, transform_markers, velocity_between
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate
 from track.tracked_frame import Status
 from train.simulation.takes import simulate_take
