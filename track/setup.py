@@ -12,17 +12,18 @@ from typing import Any, Final, Literal, Self, get_args
 import numpy as np
 
 from gloves.fit import GloveFit
-from gloves.layout import MarkerLayout
+from gloves.layout import MarkerLayout, load_layout
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from track.bodies.body_file import AnyBody, load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.calibration.hand_size import fit_size, sample_frames
 from track.config import TrackerConfig
-from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, glove_of, labeler_of
+from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
 from track.user import User, check_sides, load_user, nominal_user
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 Size = Literal["auto", "XS", "S", "M", "L", "XL"]
@@ -73,7 +74,7 @@ class TrackerSetup:
         """
         user, is_measured = choose_user(glove, hands, size)
         templates = load_bodies(bodies)
-        network = labeler_of(user.layout, labeler)
+        network = load_labeler(user.layout, labeler)
         name = user.layout.name if glove is None or not isinstance(glove, str | Path) else str(glove)
         settings = {"glove": name, "user": user.notes or str(user), "labeler": _name_of(labeler, name)}
         return cls(user, is_measured, network, templates, config, settings)
@@ -122,9 +123,9 @@ def measure_hands(
         WeightsError: The labeler is unknown, or knows other markers.
     """
     check_sides(hands)
-    layout = glove_of(glove)
+    layout = load_layout(glove)
     frames = checked_frames(capture_of(capture))
-    return measured_user(sample_frames(frames), layout, hands, labeler_of(layout, labeler))
+    return measured_user(sample_frames(frames), layout, hands, load_labeler(layout, labeler))
 
 
 def measured_user(
@@ -194,7 +195,7 @@ def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[Us
         fits = tuple(hand for hand in hands if isinstance(hand, GloveFit))
         return _in_glove(User(fits), glove, size), False
     check_sides(sides)
-    layout = glove_of(USUAL_GLOVE if glove is None else glove)
+    layout = load_layout(USUAL_GLOVE if glove is None else glove)
     return nominal_user(layout, USUAL_SIZE if size == "auto" else size, sides), size == "auto"
 
 
@@ -204,7 +205,7 @@ def _in_glove(user: User, glove: AnyGlove | None, size: Size) -> User:
         raise ArgumentError(f"given size {size} and hands as they are, expected one of them")
     if glove is None:
         return user
-    names, expected = user.layout.names, glove_of(glove).names
+    names, expected = user.layout.names, load_layout(glove).names
     if names != expected:
         name = glove if isinstance(glove, str | Path) else glove.name
         raise ArgumentError(
