@@ -3,7 +3,7 @@
     python -m benchmarks.keypoint_network OUT --photos FOLDER --reference FILE [--variants ours plain ...]
         [--pictures 12000 --samples 240000 --seed 0]
 
-Trains the network of examples/14_train_a_keypoint_network.py once for each variant of the pictures, from
+Trains the network of `keypoint_training.py` once for each variant of the pictures, from
 equal poses and views, and prints the share of keypoints within a tenth of the box of the hand (PCK@0.1): on
 1,000 pictures that it learned from, on drawn hands of `ours` that it has not seen, and on photographs where
 the reference is sure. Variants:
@@ -24,12 +24,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import runpy
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from types import SimpleNamespace
 from typing import Any, Final
 from unittest.mock import patch
 
@@ -37,23 +34,18 @@ import cv2
 import numpy as np
 import torch
 import trimesh
-from render.own_poses import PoseFile, load_poses
 
+from benchmarks import keypoint_training as training
 from benchmarks.record import Figures, add_save, describe, save_figures
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
-from handsim.hand.topology import SIDES
-from render.cameras.viewpoints import Viewpoints
 from render.config import RenderConfig
 from render.frames import RenderedFrame
 from render.painting.figures import Appearance, sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.scenery.backgrounds import BackgroundConfig
-from render.session import draw_shard
 
-ROOT: Final = Path(__file__).resolve().parents[1]
-EXAMPLE: Final = SimpleNamespace(**runpy.run_path(str(ROOT / "examples" / "14_train_a_keypoint_network.py")))
 FEW_BACKGROUNDS: Final = BackgroundConfig(plain=1, gradient=1, noise=0, clutter=0, room=0)
 LEARNED, HELD_OUT = 1, 2  # seeds of the pictures
 SKINS: Final = (
@@ -74,15 +66,15 @@ LIMBS: Final = (
 
 
 def draw_ours(count: int, seed: int) -> Any:
-    return EXAMPLE.draw(count, seed)
+    return training.draw(count, seed)
 
 
 def draw_no_backgrounds(count: int, seed: int) -> Any:
-    return EXAMPLE.draw(count, seed, replace(EXAMPLE.CONFIG, background=FEW_BACKGROUNDS))
+    return training.draw(count, seed, replace(training.CONFIG, background=FEW_BACKGROUNDS))
 
 
 def draw_no_sensor(count: int, seed: int) -> Any:
-    return EXAMPLE.draw(count, seed, replace(EXAMPLE.CONFIG, color_sensor=None))
+    return training.draw(count, seed, replace(training.CONFIG, color_sensor=None))
 
 
 def draw_no_relief(count: int, seed: int) -> Any:
@@ -90,32 +82,24 @@ def draw_no_relief(count: int, seed: int) -> Any:
         people = sample_people(*args, **options)
         return tuple(replace(one, skin=replace(one.skin, relief=0.0, creases=0.0)) for one in people)
 
-    with patch("render.session.sample_people", smooth_people):
-        return EXAMPLE.draw(count, seed)
+    with patch("render.drawing.sample_people", smooth_people):
+        return training.draw(count, seed)
 
 
 def draw_no_shadows(count: int, seed: int) -> Any:
     with patch("render.studio.light_behind", return_value=None):
-        return EXAMPLE.draw(count, seed)
+        return training.draw(count, seed)
 
 
 def draw_plain(count: int, seed: int) -> Any:
     """Pictures by pyrender alone; poses, cameras and cuts are drawn as those of `draw_ours`."""
     rng, found = np.random.default_rng(seed), []
-    config: RenderConfig = replace(EXAMPLE.CONFIG, passes=("ids",), seed=seed)
+    config: RenderConfig = replace(training.CONFIG, passes=("ids",), seed=seed)
     renderer = offscreen_renderer(640, 480)
-    with TemporaryDirectory() as name:
-        for side in SIDES:
-            path = Path(name) / f"{side}.npz"
-            EXAMPLE.write_poses(path, count // 2, rng)
-            take = load_poses(PoseFile(path, sides=(side,)), seed=seed)
-            step, view = config.frames_per_shard, Viewpoints(config.view, take, rng=rng)
-            for shard in range(count // 2 // step):
-                frames = range(step * shard, step * shard + step)
-                for frame in draw_shard(take, view, config, shard, frames):
-                    picture = plain_picture(frame, renderer, rng)
-                    found.append(EXAMPLE.cut_out(picture, frame.hands[0].keypoints, rng))
-    return EXAMPLE.Pictures(*(np.stack(values) for values in zip(*found, strict=True)))
+    for frame in training.frames(count, rng, config):
+        picture = plain_picture(frame, renderer, rng)
+        found.append(training.cut_out(picture, frame.hands[0].keypoints, rng))
+    return training.Pictures(*(np.stack(values) for values in zip(*found, strict=True)))
 
 
 def plain_picture(frame: RenderedFrame, renderer: Any, rng: np.random.Generator) -> np.ndarray:
@@ -155,23 +139,23 @@ def pictures_of(variant: str, count: int, seed: int, out: Path) -> Any:
         with atomic_write(path) as temporary:
             np.savez(temporary, **cut._asdict())
     with np.load(path, allow_pickle=False) as arrays:
-        return EXAMPLE.Pictures(*(arrays[name] for name in EXAMPLE.Pictures._fields))
+        return training.Pictures(*(arrays[name] for name in training.Pictures._fields))
 
 
 def learned_by(variant: str, options: argparse.Namespace) -> Any:
     """1,000 of the pictures that a variant's network learned from."""
     cut = pictures_of(variant, options.pictures, LEARNED, options.out)
-    return EXAMPLE.middle_of(EXAMPLE.Pictures(*(values[:1000] for values in cut)))
+    return training.middle_of(training.Pictures(*(values[:1000] for values in cut)))
 
 
 def network_of(variant: str, options: argparse.Namespace) -> torch.nn.Module:
     """The network that has seen a variant, trained or from the folder."""
     trained_from = f"{options.pictures}-{options.samples}-{options.seed}"
     path = options.out / f"{variant.replace(' ', '_')}-{trained_from}.pt"
-    network = EXAMPLE.KeypointNetwork()
+    network = training.KeypointNetwork()
     if not path.exists():
         cut = pictures_of(variant, options.pictures, LEARNED, options.out)
-        trained = EXAMPLE.train(cut, options.samples, seed=options.seed)
+        trained = training.train(cut, options.samples, seed=options.seed)
         with atomic_write(path) as temporary:
             torch.save(trained.state_dict(), temporary)
     network.load_state_dict(torch.load(path, weights_only=True))
@@ -182,7 +166,7 @@ def page(network: torch.nn.Module, photos: Any, path: Path, count: int = 50) -> 
     """Photographs, evenly taken from all, with the keypoints found in them."""
     chosen = np.linspace(0, len(photos.crops) - 1, count).round().astype(int)
     tiles = []
-    for image, points in zip(photos.crops[chosen], EXAMPLE.find(network, photos.crops[chosen]), strict=True):
+    for image, points in zip(photos.crops[chosen], training.find(network, photos.crops[chosen]), strict=True):
         tile = np.ascontiguousarray(image)
         for number, limb in enumerate(LIMBS):
             color = tuple(
@@ -210,8 +194,8 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     print(describe())
-    photos = EXAMPLE.load_photos(options.photos, options.reference)
-    held_out = EXAMPLE.middle_of(pictures_of("ours", 1000, HELD_OUT, options.out))
+    photos = training.load_photos(options.photos, options.reference)
+    held_out = training.middle_of(pictures_of("ours", 1000, HELD_OUT, options.out))
     print(f"{options.pictures} pictures, {options.samples} samples; {len(photos.crops)} photographs")
     result = {}
     figures: Figures = {
@@ -220,7 +204,7 @@ def main() -> None:
     for variant in options.variants:
         network = network_of(variant, options)
         sets = {"learned": learned_by(variant, options), "drawn": held_out, "photographs": photos}
-        found = result[variant] = {name: 100 * EXAMPLE.pck(network, one) for name, one in sets.items()}
+        found = result[variant] = {name: 100 * training.pck(network, one) for name, one in sets.items()}
         shares = "  ".join(f"{name} {share:5.1f}" for name, share in found.items())
         print(f"{variant:15s} {shares}", flush=True)
         key, sets_of = variant.replace(" ", "_"), "pictures learned from | other drawn hands | photographs"

@@ -26,11 +26,10 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from render.shown_take import ShownTake
 
-from gloves.fit import GlovedHand, attach
+from gloves.fit import attach
 from gloves.layout import load_layout
-from gloves.takes.take import load_take
+from gloves.takes.take import Take, load_take
 from handsim.errors import PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
@@ -45,7 +44,7 @@ from render.scenery.backgrounds import Background, BackgroundConfig
 from render.scenery.lights import Lighting, expose_for, sample_surroundings
 from render.sensors.exposure import ExposureConfig, sample_exposure
 from render.skin.look import TONES
-from render.studio import FrameChoices, Studio
+from render.studio import FrameChoices, Moment, Studio
 
 POSES: Final[dict[str, tuple[str, ...]]] = {
     "open": ("flat", "spread", "stretched", "four", "asl_b", "count_thumb_5"),
@@ -172,14 +171,14 @@ def photograph(
 ) -> RenderedFrame:
     """A picture of the hand, or of what is behind it."""
     qpos = case.qpos[None] if shown else np.full((1, len(case.qpos)), np.nan)
-    hand = GlovedHand(attach(load_layout("dense19"), case.model), qpos)
-    nothing = np.empty((1, 0, 3)), np.empty((1, 0), dtype=np.int64), ()
+    hand = attach(load_layout("dense19"), case.model)
     people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
-    studio = Studio(ShownTake(60.0, np.zeros(1), (hand,), (), *nothing), people, [], ("rgb", "ids", "depth"))
+    studio = Studio([hand], people, passes=("rgb", "ids", "depth"))
+    moment = Moment(Take.of_poses([hand], qpos[:, None], rate=60.0), 0)
     exposure = sample_exposure(ExposureConfig(), rng=rng)
     lighting = expose_for(lighting, people[0].skin)
     choices = FrameChoices(lighting, background, exposure, None, None, int(rng.integers(2**31)))
-    return dataclasses.replace(studio.photograph(0, case.camera, choices), number=number)
+    return dataclasses.replace(studio.photograph(moment, case.camera, choices), number=number)
 
 
 def frames_of(

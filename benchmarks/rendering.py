@@ -27,21 +27,22 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
-from render.shown_take import ShownTake, show_take
 
 from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves.takes.take import Take
 from handsim.app.workers import run_jobs
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig
+from render.drawing import Drawing
 from render.formats.writer import open_writer
 from render.frames import RenderedFrame
 from render.painting.figures import sample_people
 from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
-from render.session import draw_frames
 from render.skin.look import ALL_TONES
-from render.studio import Studio
+from render.studio import Moment, Studio
+from render.subject import subject_of_take
 from train.simulation.takes import simulate_take
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
@@ -57,13 +58,14 @@ KINDS: Final = {
 
 
 @functools.lru_cache(maxsize=1)
-def a_take(frames: int) -> ShownTake:
-    return show_take(simulate_take(kind="hand-hand", num_frames=frames))
+def a_take(frames: int) -> Take:
+    return simulate_take(kind="hand-hand", num_frames=frames)
 
 
 def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:
     """One worker's share."""
-    return draw_frames(a_take(frames), config, range(frames), shard=shard)
+    drawing = Drawing(subject_of_take(a_take(frames)), config)
+    return drawing.frames(shard, enumerate(range(frames)))
 
 
 def draw(config: RenderConfig, frames: int, shard: int) -> int:
@@ -97,35 +99,33 @@ def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> flo
     return (len(steady) - 1) * frames / (steady[-1] - steady[0])
 
 
-def plain_pyrender(take: ShownTake, color: bool) -> None:
+def plain_pyrender(take: Take, color: bool) -> None:
     """What a user would write: one scene per frame, skinned meshes, one light."""
     pyrender = load_pyrender()
     view = Viewpoints(PLAIN.view, take, rng=np.random.default_rng(0))
     renderer = offscreen_renderer(640, 480)
     for frame in range(take.num_frames):
         scene, camera = pyrender.Scene(), view.cameras(frame)[0]
-        for hand in take.hands:
-            skin = hand.fit.model.skin(hand.qpos[frame : frame + 1])[0]
-            scene.add(
-                pyrender.Mesh.from_trimesh(trimesh.Trimesh(skin, hand.fit.model.surface.faces, process=False))
-            )
+        for number, hand in enumerate(take.hands):
+            skin = hand.model.skin(take.qpos[frame : frame + 1, number])[0]
+            mesh = trimesh.Trimesh(skin, hand.model.surface.faces, process=False)
+            scene.add(pyrender.Mesh.from_trimesh(mesh))
         pose = camera.T_world_camera @ OPENGL_FROM_OPENCV
         scene.add(pyrender.IntrinsicsCamera(600.0, 600.0, 320.0, 240.0), pose=pose)
         scene.add(pyrender.DirectionalLight(intensity=3.0), pose=pose)
         renderer.render(scene, flags=pyrender.RenderFlags.NONE if color else pyrender.RenderFlags.DEPTH_ONLY)
 
 
-def mujoco_loop(take: ShownTake, color: bool) -> None:
+def mujoco_loop(take: Take, color: bool) -> None:
     """MuJoCo's renderer on one hand's capsules; it needs MUJOCO_GL=egl where there is no screen."""
-    hand = take.hands[0]
-    model = hand.fit.model.mj_model
+    model = take.hands[0].model.mj_model
     data = mujoco.MjData(model)
     with mujoco.Renderer(model, 480, 640) as renderer:
         if not color:
             renderer.enable_depth_rendering()
         camera = mujoco.MjvCamera()
         camera.distance = 0.6
-        for qpos in hand.qpos:
+        for qpos in take.qpos[:, 0]:
             data.qpos[:] = qpos
             mujoco.mj_kinematics(model, data)
             camera.lookat[:] = qpos[:3]
@@ -166,7 +166,7 @@ def accuracy(frames: int) -> Figures:
     off, agree = [], []
     for frame in np.linspace(0, take.num_frames - 1, 8).astype(int):
         camera = view.cameras(frame)[0]
-        surface = join([one.triangles for one in studio._drawn(int(frame), 0.0)])
+        surface = join([one.triangles for one in studio._drawn(Moment(take, int(frame)), 0.0)])
         mine = rasterize(camera, surface)
         vertices = np.asarray(surface.vertices, dtype=np.float64)
         caster = RayMeshIntersector(trimesh.Trimesh(vertices, surface.faces, process=False))
@@ -191,9 +191,9 @@ def accuracy(frames: int) -> Figures:
     }
 
 
-def bare_studio(take: ShownTake) -> Studio:
+def bare_studio(take: Take) -> Studio:
     rng = np.random.default_rng(0)
-    return Studio(take, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng), [])
+    return Studio(take.hands, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng))
 
 
 def memory(images: int) -> Figures:

@@ -24,7 +24,7 @@ def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
     camera: Camera = frame.camera
     for hand, true in zip(frame.hands, truth.hands, strict=True):
         off = np.linalg.norm(hand.keypoints - camera.project(true.keypoints_world), axis=1)[hand.visible]
-        shown = frame.ideal.depth[frame.ideal.depth > 0]
+        shown = frame.depth[frame.depth > 0]
         print(
             f"{frame.key}, {hand.shape.side}: {hand.visible.sum()} of 21 keypoints visible, "
             f"{np.mean(off):.1f} px off, hands at {1e3 * np.median(shown):.0f} mm"
@@ -38,12 +38,11 @@ def main() -> None:
     config = RenderConfig(
         view=ViewConfig("orbit"), passes=("rgb", "depth"), tones=(tone - 5.0, tone + 5.0), every=40, seed=1
     )
-    drawn = draw(tracked, config=config, frames=[0, 40, 80])
-    for pair in zip(drawn, draw(truth, config=config, frames=[0, 40, 80]), strict=True):
+    drawn, true = draw(tracked, config=config), draw(truth, config=config)  # every 40th frame
+    for pair in zip(drawn, true, strict=True):
         compare(*pair)
     with TemporaryDirectory() as folder:
-        tracked.save(Path(folder) / "tracked.npz")
-        count = render_take(Path(folder) / "tracked.npz", Path(folder) / "out", ["coco"], config, workers=1)
+        count = render_take(tracked, Path(folder) / "out", "coco", config, workers=1)
         coco = json.loads((Path(folder) / "out" / "annotations.json").read_text())
     print(f"{count} pictures, {len(coco['annotations'])} annotated hands")
 

@@ -1,8 +1,8 @@
-"""Draw your own poses through your own cameras, twice, and merge the pictures.
+"""Draw your own poses before your own cameras: in memory, and into files, which are merged.
 
     python examples/10_draw_your_own_poses.py
 
-The same on the command line (docs/rendering.md has the formats of both files):
+On the command line poses and cameras are files (docs/rendering.md):
 `handsim render --poses poses.npz --cameras cameras.toml --hands right --out pictures --format coco`.
 """
 
@@ -14,48 +14,37 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from handsim import HandModel
+from handsim import Camera, HandModel, look_at
 from poses import sample_poses
-from render import PoseFile, RenderConfig, ViewConfig, merge_renderings, render_take
+from render import RenderConfig, draw, merge_renderings, render_take
 
-CAMERAS = """
-[[camera]]
-name = "front"
-size = [320, 240]
-focal = [300.0, 300.0]
-lens = "brown"
-coefficients = [-0.2, 0.05, 0.001, 0.0, 0.0]
-position = [0.1, -0.5, 0.1]
-target = [0.08, 0.0, 0.0]
+K = np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]])
 
-[[camera]]
-name = "above"
-size = [320, 240]
-focal = [300.0, 300.0]
-position = [0.1, -0.1, 0.5]
-target = [0.08, 0.0, 0.0]
-"""
+
+def camera(name: str, position: tuple[float, float, float]) -> Camera:
+    """A camera at a position [m] that looks at the hand."""
+    return Camera(name, (320, 240), K, look_at(np.array(position), np.array([0.08, 0.0, 0.0])))
 
 
 def main() -> None:
+    model = HandModel.named("M")
+    qpos = sample_poses(model, 6, rng=np.random.default_rng(0))  # (6, 27)
+    cameras = [camera("front", (0.1, -0.5, 0.1)), camera("above", (0.1, -0.1, 0.5))]
+    for frame in draw(qpos, model=model, camera=cameras, frames=[0], seed=0):
+        keypoint = np.round(frame.hands[0].keypoints[8])
+        print(f"{frame.key}: colors {frame.rgb.shape}, the index finger's tip at {keypoint} px")
     with TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "cameras.toml").write_text(CAMERAS)
-        qpos = sample_poses(HandModel.named("M"), 6, rng=np.random.default_rng(0))  # (6, 27)
-        hand_size = np.array([[0.19, 0.085], [0.17, 0.076]])  # length and breadth of two people [m]
-        np.savez(folder / "poses.npz", qpos=qpos, person=[0, 0, 0, 1, 1, 1], hand_size=hand_size)
-        view = ViewConfig(cameras=str(folder / "cameras.toml"))
         for seed in (0, 1):  # other light, backgrounds and skins
-            config = RenderConfig(view=view, passes=("rgb", "ids"), seed=seed)
-            render_take(PoseFile(folder / "poses.npz"), folder / f"run{seed}", ["coco"], config, workers=1)
+            config = RenderConfig(passes=("rgb", "ids"), seed=seed)
+            out, person = folder / f"run{seed}", [0, 0, 0, 1, 1, 1]
+            render_take(
+                qpos, out, "coco", config, people=["L", "S"], person=person, camera=cameras, workers=1
+            )
         merge_renderings([folder / "run0", folder / "run1"], folder / "both")
         coco = json.loads((folder / "both" / "annotations.json").read_text())
-    names = sorted({image["camera"] for image in coco["images"]})
     ids = {image["id"] for image in coco["images"]}
-    print(f"{len(coco['images'])} pictures of the cameras {' and '.join(names)}, {len(ids)} ids")
-    print(
-        f"{len(coco['annotations'])} hands, keypoints of the first: {coco['annotations'][0]['keypoints'][:6]}"
-    )
+    print(f"{len(coco['images'])} pictures, {len(ids)} ids, {len(coco['annotations'])} hands")
 
 
 if __name__ == "__main__":

@@ -1,264 +1,64 @@
-"""Train a network that finds 21 keypoints of a hand on drawn pictures alone, and look at photographs with it.
+"""Train a network that finds 21 keypoints of a hand on pictures that are drawn while it learns.
 
-    python examples/14_train_a_keypoint_network.py            # seconds, too little to learn anything
-    python examples/14_train_a_keypoint_network.py --pictures 12000 --samples 240000 --out network.pt \
-        --photos Dataset --reference reference.json          # hours on two cores
+    python examples/14_train_a_keypoint_network.py [STEPS]     # 20 by default, too few to learn much
 
-The photographs may be any pictures of single hands; the reference holds keypoints for some of them, by file:
-{"3/IMG_4509.JPG": {"points": [[x, y], ...21], "score": 0.98}} in pixels, from people or from a detector.
-PCK@0.1 is the share of keypoints that are found within a tenth of the longer side of their hand's box.
+No picture touches the disk. `benchmarks/keypoint_network.py` trains for hours and looks at photographs.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import NamedTuple
+import itertools
+import sys
 
-import cv2
-import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.nn import functional
+from torch.utils.data import DataLoader
 
-from handsim import HandModel
-from poses import load_gestures, sample_poses
-from render import PoseFile, RenderConfig, ViewConfig, render_take
+from render import PictureStream, RenderConfig
 
-SIZE = 128  # of a crop [px]
-HEAT = 16  # cells of a heat map, each way
-SPREAD = 0.06  # of the heat around a keypoint [share of the side]
-BF16 = bool(torch.cpu.get_capabilities().get("amx_bf16", False))  # three times as fast where there are AMX
-VIEW = ViewConfig(placement="anywhere", distance=(0.45, 0.8))
-CONFIG = RenderConfig(passes=("rgb", "ids"), view=VIEW, vary="frame", frames_per_shard=8)
+SIZE, BATCH = 64, 16  # pixels of a picture each way, pictures of a step
 
 
-class Pictures(NamedTuple):
-    """Square crops around hands, and the keypoints in them."""
-
-    crops: np.ndarray
-    """(N, 160, 160, 3) sRGB, as `draw` cuts them: wider than the network sees."""
-    points: np.ndarray
-    """(N, 21, 2) [px]."""
-    sizes: np.ndarray
-    """Longer side of each hand's box (N,) [px]."""
+def pictures(seed: int, workers: int) -> DataLoader[dict[str, torch.Tensor]]:
+    """Batches without end: another person, light, background and view in every picture."""
+    stream = PictureStream(config=RenderConfig(passes=("rgb",)), crop=SIZE, batch=BATCH, seed=seed)
+    return DataLoader(stream, batch_size=BATCH, num_workers=workers)
 
 
-WIDE = 160  # of a stored crop [px]
+def network() -> nn.Module:
+    """From pictures (B, 3, 64, 64) to heat maps (B, 21, 16, 16)."""
+    widths, layers = (3, 32, 64, 128), []
+    for number, (inside, outside) in enumerate(itertools.pairwise(widths)):
+        stride = 2 if number < 2 else 1
+        layers += [nn.Conv2d(inside, outside, 5, stride, 2), nn.BatchNorm2d(outside), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Conv2d(widths[-1], 21, 5, 1, 2))
 
 
-def write_poses(path: Path, count: int, rng: np.random.Generator) -> None:
-    """A pose file: half random poses, half named gestures, a little changed; fingers point up mostly."""
-    model = HandModel.named("M")
-    qpos = sample_poses(model, count, rng=rng)
-    gestures = list(load_gestures().values())
-    for row in np.flatnonzero(rng.random(count) < 0.5):
-        angles = gestures[rng.integers(len(gestures))] + rng.normal(0.0, np.deg2rad(4.0), 20)
-        qpos[row, 7:] = np.clip(angles, *model.skeleton.ranges.T)
-    up = Rotation.from_euler("y", -90.0, degrees=True)  # fingers lie along the wrist's x
-    tilt = Rotation.from_rotvec(np.deg2rad(30.0) * rng.normal(size=(count, 3)) * [1.0, 1.0, 0.0])
-    turned = Rotation.from_euler("z", rng.uniform(0.0, 360.0, (count, 1)), degrees=True) * tilt * up
-    qpos[:, :3] = 0.0
-    qpos[:, 3:7] = turned.as_quat()[:, [3, 0, 1, 2]]
-    np.savez(path, qpos=qpos)
-
-
-def draw(count: int, seed: int, config: RenderConfig = CONFIG) -> Pictures:
-    """Draw hands of many people from everywhere, and cut them out."""
-    rng = np.random.default_rng(seed)
-    found = []
-    with TemporaryDirectory() as name:
-        for side in ("right", "left"):
-            path, out = Path(name) / f"{side}.npz", Path(name) / side
-            write_poses(path, count // 2, rng)
-            render_take(PoseFile(path, sides=(side,)), out, ["coco"], replace(config, seed=seed))
-            coco = json.loads((out / "annotations.json").read_text())
-            files = {image["id"]: out / "images" / image["file_name"] for image in coco["images"]}
-            for hand in coco["annotations"]:
-                pixels = np.array(hand["keypoints"]).reshape(21, 3)[:, :2]
-                found.append(cut_out(cv2.imread(str(files[hand["image_id"]]))[..., ::-1], pixels, rng))
-    return Pictures(*(np.stack(values) for values in zip(*found, strict=True)))
-
-
-def cut_out(picture: np.ndarray, pixels: np.ndarray, rng: np.random.Generator) -> tuple:
-    """A square around a hand with room for shifts and turns."""
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    side = (high - low).max() * rng.uniform(1.5, 2.4)
-    scale = WIDE / side
-    matrix = np.array([[scale, 0.0, 0.0], [0.0, scale, 0.0]])
-    matrix[:, 2] = WIDE / 2 - scale * (low + high) / 2
-    crop = cv2.warpAffine(np.ascontiguousarray(picture), matrix, (WIDE, WIDE), borderMode=cv2.BORDER_REFLECT)
-    points = pixels @ matrix[:, :2].T + matrix[:, 2]
-    return crop, points, float(np.ptp(points, axis=0).max())
-
-
-def batches(pictures: Pictures, size: int, rng: np.random.Generator) -> Iterator[tuple]:
-    """Endless batches: turned, shifted, scaled, mirrored, in other colors."""
-    while True:
-        images, targets = [], []
-        for number in rng.integers(len(pictures.crops), size=size):
-            turn, scale = rng.uniform(-40.0, 40.0), rng.uniform(0.75, 1.15)
-            matrix = cv2.getRotationMatrix2D((WIDE / 2, WIDE / 2), turn, scale)
-            matrix[:, 2] += rng.uniform(-10.0, 10.0, 2) - (WIDE - SIZE) / 2
-            image = cv2.warpAffine(
-                pictures.crops[number], matrix, (SIZE, SIZE), borderMode=cv2.BORDER_REFLECT
-            )
-            points = pictures.points[number] @ matrix[:, :2].T + matrix[:, 2]
-            if rng.random() < 0.5:
-                image, points = image[:, ::-1], [SIZE - 1, 0] + points * [-1, 1]
-            image = image * rng.uniform(0.7, 1.3, 3) * rng.uniform(0.8, 1.2) + rng.uniform(-15.0, 15.0)
-            if rng.random() < 0.5:
-                image = cv2.GaussianBlur(np.ascontiguousarray(image), (5, 5), rng.uniform(0.3, 1.5))
-            images.append(np.clip(image, 0.0, 255.0))
-            targets.append(points)
-        yield to_input(np.stack(images)), torch.from_numpy(np.stack(targets).astype(np.float32)) / SIZE
-
-
-def to_input(images: np.ndarray) -> torch.Tensor:
-    """Pictures (B, 128, 128, 3) as a tensor (B, 3, 128, 128), each of mean 0 and deviation 1."""
-    tensor = torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2), dtype=np.float32))
-    tensor = (tensor - tensor.mean((1, 2, 3), keepdim=True)) / (tensor.std((1, 2, 3), keepdim=True) + 1.0)
-    return tensor.to(memory_format=torch.channels_last)
-
-
-class Residual(nn.Module):
-    """Two convolutions beside the way past them (He et al. 2016)."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            *convolution(width, width), nn.Conv2d(width, width, 3, 1, 1, bias=False), nn.BatchNorm2d(width)
-        )
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Features in, features out."""
-        return functional.relu(x + self.layers(x))
-
-
-def convolution(inside: int, outside: int, stride: int = 1) -> list[nn.Module]:
-    """A convolution, its normalization and its ReLU."""
-    return [nn.Conv2d(inside, outside, 3, stride, 1, bias=False), nn.BatchNorm2d(outside), nn.ReLU()]
-
-
-class KeypointNetwork(nn.Module):
-    """Heat maps of 21 keypoints; a keypoint is the mean place of its map."""
-
-    def __init__(self, width: int = 32) -> None:
-        super().__init__()
-        w = width
-        self.fine = nn.Sequential(
-            *(nn.Conv2d(3, w, 8, 4, 2, bias=False), nn.BatchNorm2d(w), nn.ReLU(), Residual(w)),
-            *(*convolution(w, 2 * w, 2), Residual(2 * w), Residual(2 * w)),
-        )
-        self.coarse = nn.Sequential(
-            *(*convolution(2 * w, 4 * w, 2), Residual(4 * w), Residual(4 * w)),
-            *(*convolution(4 * w, 8 * w, 2), Residual(8 * w), Residual(8 * w)),
-            nn.Conv2d(8 * w, 2 * w, 1),
-        )
-        self.head = nn.Sequential(*convolution(4 * w, 4 * w), Residual(4 * w), nn.Conv2d(4 * w, 21, 1))
-        at = (torch.arange(HEAT) + 0.5) / HEAT
-        self.register_buffer(
-            "places", torch.stack(torch.meshgrid(at, at, indexing="xy"), dim=-1).reshape(-1, 2)
-        )
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """Keypoints (B, 21, 2) of pictures (B, 3, 128, 128), shares of the side."""
-        return self.heat(x).softmax(dim=2) @ self.places
-
-    def loss(self, x: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """How little of the heat is near the keypoints, and how far its mean is from them."""
-        heat = self.heat(x)
-        near = torch.exp(-(torch.cdist(points, self.places.expand(len(x), -1, -1)) ** 2) / (2 * SPREAD**2))
-        near = near / near.sum(dim=2, keepdim=True).clamp(min=1e-6)
-        found = heat.softmax(dim=2) @ self.places
-        return -(near * heat.log_softmax(dim=2)).sum(dim=2).mean() + 10.0 * (found - points).abs().mean()
-
-    def heat(self, x: torch.Tensor) -> torch.Tensor:
-        """Heat (B, 21, cells) before it is made a share of 1."""
-        with torch.autocast("cpu", torch.bfloat16, enabled=BF16):
-            fine = self.fine(x)
-            coarse = functional.interpolate(self.coarse(fine), size=HEAT, mode="bilinear")
-            heat = self.head(torch.cat([fine, coarse], dim=1))
-        return heat.flatten(2).float()
-
-
-def train(pictures: Pictures, samples: int, seed: int = 0, batch: int = 64) -> KeypointNetwork:
-    """Train a network on pictures."""
-    torch.manual_seed(seed)
-    network = KeypointNetwork().to(memory_format=torch.channels_last)
-    steps = max(1, samples // batch)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3, weight_decay=0.01, fused=True)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps + 1)
-    source, start, mean = batches(pictures, batch, np.random.default_rng(seed)), time.time(), 0.0
-    for step in range(1, steps + 1):
-        images, targets = next(source)
-        loss = network.loss(images, targets)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        mean += (loss.item() - mean) / min(step, 200)
-        if step % max(1, steps // 10) == 0:
-            seconds = time.time() - start
-            print(f"{step * batch} samples, loss {mean:.2f}, {seconds:.0f} s")
-    return network.eval()
-
-
-@torch.inference_mode()
-def find(network: KeypointNetwork, pictures: np.ndarray) -> np.ndarray:
-    """Keypoints (N, 21, 2) in pictures (N, 128, 128, 3) [px]."""
-    parts = [pictures[first : first + 64] for first in range(0, len(pictures), 64)]
-    return SIZE * np.concatenate([network(to_input(part)).numpy() for part in parts])
-
-
-def load_photos(folder: Path, reference: Path) -> Pictures:
-    """Photographs that the reference is sure of, as the network sees them."""
-    entries = {name: one for name, one in json.loads(reference.read_text()).items() if one["score"] > 0.9}
-    crops, points, sizes = [], [], []
-    for name, one in entries.items():
-        image = cv2.imread(str(folder / name))[..., ::-1]
-        scale = SIZE / max(image.shape[:2])
-        crops.append(cv2.resize(np.ascontiguousarray(image), (SIZE, SIZE), interpolation=cv2.INTER_CUBIC))
-        points.append(scale * np.array(one["points"]))
-        sizes.append(np.ptp(points[-1], axis=0).max())
-    return Pictures(np.stack(crops), np.stack(points), np.array(sizes))
-
-
-def pck(network: KeypointNetwork, pictures: Pictures) -> float:
-    """PCK@0.1."""
-    off = np.linalg.norm(find(network, pictures.crops) - pictures.points, axis=2)
-    return float((off < 0.1 * pictures.sizes[:, None]).mean())
-
-
-def middle_of(pictures: Pictures) -> Pictures:
-    """What the network sees of stored crops."""
-    edge = (WIDE - SIZE) // 2
-    return Pictures(pictures.crops[:, edge:-edge, edge:-edge], pictures.points - edge, pictures.sizes)
+def find(model: nn.Module, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Keypoints (B, 21, 2) [px]: the mean place of each heat map."""
+    heat = model(batch["noisy_rgb"].float() / 255.0 - 0.5)
+    share = functional.softmax(heat.flatten(2), dim=2).unflatten(2, heat.shape[2:])
+    at = (torch.arange(heat.shape[3]) + 0.5) * (SIZE / heat.shape[3])
+    return torch.stack([(share.sum(2) * at).sum(2), (share.sum(3) * at).sum(2)], dim=2)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--pictures", type=int, default=16)
-    parser.add_argument("--samples", type=int, default=64)
-    parser.add_argument("--out", type=Path)
-    parser.add_argument("--photos", type=Path)
-    parser.add_argument("--reference", type=Path)
-    options = parser.parse_args()
-    pictures, held_out = draw(options.pictures, seed=1), draw(max(8, options.pictures // 20), seed=2)
-    print(f"{len(pictures.crops)} pictures to learn from, {len(held_out.crops)} others")
-    network = train(pictures, options.samples)
-    print(f"drawn hands: PCK@0.1 {100 * pck(network, middle_of(held_out)):.1f} %")
-    if options.photos is not None and options.reference is not None:
-        photos = load_photos(options.photos, options.reference)
-        print(f"{len(photos.crops)} photographs: PCK@0.1 {100 * pck(network, photos):.1f} %")
-    if options.out is not None:
-        torch.save(network.state_dict(), options.out)
+    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 20
+    torch.manual_seed(0)
+    model = network()
+    optimizer = torch.optim.AdamW(model.parameters(), lr=2e-3)
+    for step, batch in enumerate(itertools.islice(pictures(seed=0, workers=2), steps), start=1):
+        loss = functional.smooth_l1_loss(find(model, batch), batch["keypoints"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if step % max(1, steps // 4) == 0:
+            print(f"{step * BATCH} pictures, loss {loss.item():.2f}")
+    others = next(iter(pictures(seed=1, workers=0)))
+    with torch.inference_mode():
+        off = (find(model.eval(), others) - others["keypoints"]).norm(dim=2)
+    print(f"keypoints of other hands: {off.mean():.1f} of {SIZE} px off")
 
 
 if __name__ == "__main__":

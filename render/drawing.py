@@ -81,8 +81,9 @@ def configured(config: RenderConfig | None, camera: Cameras | None, seed: int | 
         return config
     if isinstance(camera, str):
         return dataclasses.replace(config, view=dataclasses.replace(config.view, camera=camera))
-    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
-    if not all(isinstance(one, Camera) for one in cameras):
+    given = (camera,) if isinstance(camera, Camera) else camera
+    cameras = tuple(given) if isinstance(given, Iterable) else ()
+    if not cameras or not all(isinstance(one, Camera) for one in cameras):
         raise ArgumentError(f"camera is {camera!r}, expected a Camera, several, or the name of a preset")
     return dataclasses.replace(config, view=ViewConfig(cameras=cameras))
 

@@ -148,11 +148,12 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             raise ArgumentError("the takes have different numbers of hands, expected the same in all")
         if self.config.shutter is not None and not self._takes:
             raise ArgumentError("poses without times have no motion to blur; leave out the shutter")
+        cv2.setNumThreads(1)  # forked workers would wait for the threads of this process forever
 
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
         worker = get_worker_info()
         mine, workers = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        if worker is not None:
+        if cv2.getNumThreads() > 1:  # of a worker that was spawned
             cv2.setNumThreads(1)
         sitting: dict[int, tuple[int, _Sitting]] = {}
         first = self._start + mine * self._batch

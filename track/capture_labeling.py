@@ -10,14 +10,16 @@ import numpy as np
 
 from gloves.captures.capture import Capture
 from gloves.captures.markers import labeled_capture, unlabeled_frames
+from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
 from handsim.hand.topology import NUM_QPOS
 from track.finder.frame_hands import HandFinder
 from track.finder.labeling import label_hands
-from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, glove_of, labeler_of
+from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.setup import BOTH, USUAL_SIZE
 from track.user import nominal_user
+from train.glove_labeler import load_labeler
 
 
 def label_capture(
@@ -47,8 +49,8 @@ def label_capture(
         LayoutError: The glove is unknown.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    layout = glove_of(glove)
-    network = labeler_of(layout, labeler)
+    layout = load_layout(glove)
+    network = load_labeler(layout, labeler)
     source = capture_of(capture)
     finder, done = HandFinder(network, layout, rng=np.random.default_rng(0)), 0
 

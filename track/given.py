@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from gloves.captures.capture import Capture
-from gloves.captures.formats import read_capture
-from gloves.layout import MarkerLayout, load_layout
+from gloves.captures.formats import READABLE, read_capture
+from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take, load_take
-from handsim._checks import shown_value
-from handsim.errors import ArgumentError, WeightsError
-from train.glove_labeler import load_labeler
+from handsim._checks import check_type
 from train.labelers.protocol import Labeler
 
 AnyCapture = Capture | Take | str | Path
@@ -26,6 +24,8 @@ def capture_of(capture: AnyCapture) -> Capture:
     Raises:
         CaptureError: The file is missing, damaged or of another kind.
     """
+    kinds = (Capture, Take, str, Path)
+    check_type("capture", capture, kinds, "a Capture, a Take, or the path of a file", (*READABLE, ".npz"))
     if isinstance(capture, str | Path):
         capture = read_points(capture)
     return capture if isinstance(capture, Capture) else capture.capture()
@@ -42,31 +42,9 @@ def read_points(path: str | Path) -> Capture | Take:
     return read_capture(path)
 
 
-def glove_of(glove: AnyGlove) -> MarkerLayout:
-    """A marker layout.
-
-    Raises:
-        LayoutError: There is no such layout, or its file is wrong.
-    """
-    return glove if isinstance(glove, MarkerLayout) else load_layout(glove)
-
-
-def labeler_of(glove: MarkerLayout, labeler: AnyLabeler) -> Labeler:
-    """A labeler of a glove's markers.
-
-    Raises:
-        ArgumentError: It is something else.
-        WeightsError: The labeler is unknown, damaged, or knows other markers.
-    """
-    if labeler is None or isinstance(labeler, str | Path):
-        return load_labeler(glove, labeler)
-    if not callable(getattr(labeler, "label_frames", None)):
-        raise ArgumentError(
-            f"labeler is {shown_value(labeler)}, expected a Labeler, or the name or path of one"
-        )
-    if labeler.marker_names != glove.names:
-        raise WeightsError(
-            f"the labeler knows markers {', '.join(labeler.marker_names)}, but glove '{glove.name}' has "
-            f"{', '.join(glove.names)}"
-        )
-    return labeler
+def designed_glove(worn: MarkerLayout) -> MarkerLayout:
+    """The shipped layout of a glove as it is worn, whose markers may have slipped: labelers know that one."""
+    if worn.name not in list_layouts():
+        return worn
+    designed = load_layout(worn.name)
+    return designed if designed.names == worn.names else worn

@@ -28,6 +28,7 @@ from gloves.takes.take import (
     usual_rate,
     worn_arrays,
 )
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
@@ -122,6 +123,8 @@ class Recorder:
     def __init__(
         self, path: str | Path, tracker: Tracker, settings: Mapping[str, Any] = MappingProxyType({})
     ) -> None:
+        check_type("path", path, (str, Path), "the path of a take's file, .npz")
+        check_type("tracker", tracker, Tracker, "the Tracker whose frames are recorded")
         out = Path(path)
         if out.suffix.lower() != ".npz":
             raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")

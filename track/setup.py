@@ -12,17 +12,19 @@ from typing import Any, Final, Literal, Self, get_args
 import numpy as np
 
 from gloves.fit import GloveFit
-from gloves.layout import MarkerLayout
+from gloves.layout import MarkerLayout, load_layout
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimWarning, choices
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from track.bodies.body_file import AnyBody, load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.calibration.hand_size import fit_size, sample_frames
 from track.config import TrackerConfig
-from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, glove_of, labeler_of
+from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
-from track.user import User, check_sides, load_user, nominal_user
+from track.user import User, checked_sides, load_user, nominal_user
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
 Size = Literal["auto", "XS", "S", "M", "L", "XL"]
@@ -32,6 +34,7 @@ BOTH: Final[tuple[Side, ...]] = ("right", "left")
 USUAL_GLOVE: Final = "dense19"
 USUAL_SIZE: Final = "M"
 """The size of hands that could not be measured."""
+_HANDS: Final = "a User, GloveFits, the path of a user's file, or sides"
 _SHOWN: Final = 0.8  # share of one hand's markers in a frame in which its size can be measured
 _HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
 _UNSURE_EXTENT: Final = 0.12  # of clouds that no labeler is sure of [m]
@@ -73,7 +76,7 @@ class TrackerSetup:
         """
         user, is_measured = choose_user(glove, hands, size)
         templates = load_bodies(bodies)
-        network = labeler_of(user.layout, labeler)
+        network = load_labeler(designed_glove(user.layout), labeler)
         name = user.layout.name if glove is None or not isinstance(glove, str | Path) else str(glove)
         settings = {"glove": name, "user": user.notes or str(user), "labeler": _name_of(labeler, name)}
         return cls(user, is_measured, network, templates, config, settings)
@@ -101,7 +104,7 @@ def measure_hands(
     glove: AnyGlove = "dense19",
     *,
     labeler: AnyLabeler = None,
-    hands: Sequence[Side] = BOTH,
+    hands: Side | Sequence[Side] = BOTH,
 ) -> User:
     """The hands of a capture with their size and proportions measured; a `Tracker` takes them.
 
@@ -121,10 +124,10 @@ def measure_hands(
         LayoutError: The glove is unknown, or does not fit a hand.
         WeightsError: The labeler is unknown, or knows other markers.
     """
-    check_sides(hands)
-    layout = glove_of(glove)
+    sides = checked_sides(hands)
+    layout = load_layout(glove)
     frames = checked_frames(capture_of(capture))
-    return measured_user(sample_frames(frames), layout, hands, labeler_of(layout, labeler))
+    return measured_user(sample_frames(frames), layout, sides, load_labeler(layout, labeler))
 
 
 def measured_user(
@@ -182,6 +185,7 @@ def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[Us
     """
     if size not in get_args(Size):
         raise ArgumentError(choices(str(size), get_args(Size), noun="size"))
+    check_type("hands", hands, (Sequence, Path), _HANDS)
     if isinstance(hands, str) and hands in SIDES:
         hands = (hands,)
     if isinstance(hands, str | Path):
@@ -189,12 +193,13 @@ def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[Us
         return _in_glove(known, glove, size), False
     if isinstance(hands, User):
         return _in_glove(hands, glove, size), False
+    for hand in hands:
+        check_type("one of hands", hand, (GloveFit, str), _HANDS)
     sides = [hand for hand in hands if not isinstance(hand, GloveFit)]
     if not sides and hands:
         fits = tuple(hand for hand in hands if isinstance(hand, GloveFit))
         return _in_glove(User(fits), glove, size), False
-    check_sides(sides)
-    layout = glove_of(USUAL_GLOVE if glove is None else glove)
+    layout = load_layout(USUAL_GLOVE if glove is None else glove)
     return nominal_user(layout, USUAL_SIZE if size == "auto" else size, sides), size == "auto"
 
 
@@ -204,7 +209,7 @@ def _in_glove(user: User, glove: AnyGlove | None, size: Size) -> User:
         raise ArgumentError(f"given size {size} and hands as they are, expected one of them")
     if glove is None:
         return user
-    names, expected = user.layout.names, glove_of(glove).names
+    names, expected = user.layout.names, load_layout(glove).names
     if names != expected:
         name = glove if isinstance(glove, str | Path) else glove.name
         raise ArgumentError(

@@ -30,9 +30,10 @@ from track.association.labeler_review import LabelerReview
 from track.association.point_linking import PointHistory
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
-from track.given import AnyLabeler, labeler_of
+from track.given import AnyLabeler, designed_glove
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+from train.glove_labeler import load_labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
 _MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost
@@ -76,7 +77,7 @@ class Tracker:
         self.hands = _checked_hands(hands)
         self.bodies = tuple(bodies)
         self.config = config
-        asked = labeler_of(self.hands[0].layout, labeler)
+        asked = load_labeler(designed_glove(self.hands[0].layout), labeler)
         self._intake = Intake(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
         self._states = [HandState(hand, config) for hand in self.hands]

@@ -7,13 +7,14 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, overload
+from typing import Any, Final, cast, overload
 
 import numpy as np
 
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, stored_layout
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, FileError, HandSimError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
@@ -57,7 +58,10 @@ class User(Sequence[GloveFit]):
     """How `calibrate` found each hand, and how well it fits frames that were held out; not in a file."""
 
     def __post_init__(self) -> None:
+        check_type("hands", self.hands, Sequence, "a left hand, a right hand, or one of each in its glove")
         object.__setattr__(self, "hands", tuple(self.hands))
+        for hand in self.hands:
+            check_type("one of hands", hand, GloveFit, "a GloveFit, a hand in its glove")
         sides = [hand.side for hand in self.hands]
         if not sides or len(set(sides)) < len(sides):
             raise ArgumentError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
@@ -136,18 +140,21 @@ def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User
         ArgumentError: There is no such size, a side is named twice, or none is.
         LayoutError: The glove is for the other hand.
     """
-    check_sides(sides)
+    sides = checked_sides(sides)
     return User(tuple(nominal_fit(layout, size, side) for side in sides), size)
 
 
-def check_sides(sides: Sequence[str]) -> None:
-    """Refuse anything but one side, or both.
+def checked_sides(sides: str | Sequence[str]) -> tuple[Side, ...]:
+    """One side, or both.
 
     Raises:
         ArgumentError: It is something else.
     """
+    check_type("hands", sides, Sequence, "right, left, or one of each")
+    sides = (sides,) if isinstance(sides, str) else tuple(map(str, sides))
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):
         raise ArgumentError(f"hands are '{' '.join(sides)}', expected right, left, or one of each")
+    return cast("tuple[Side, ...]", sides)
 
 
 def load_user(path: str | Path) -> User:
@@ -162,6 +169,7 @@ def load_user(path: str | Path) -> User:
     Raises:
         UserError: The file does not exist, is not a user's file, has another schema, or is damaged.
     """
+    check_type("path", path, (str, Path), "the path of a user's file, .json")
     path = Path(path)
     try:
         content = json.loads(read_bytes(path, error=UserError, most=_MOST))

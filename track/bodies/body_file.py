@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, numbers, quoted, tables_of, text_of, written
@@ -19,6 +20,7 @@ from track.bodies.rigid_body import RigidTemplate
 SUFFIX: Final = ".toml"
 AnyBody = RigidTemplate | str | Path
 """A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
+_EXPECTED: Final = "RigidTemplates, names of handsim's objects, or paths of .toml files"
 _BODY_KEYS: Final = ("name", "description", "marker")
 _MARKER_KEYS: Final = ("name", "place_mm")
 
@@ -37,6 +39,7 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
         BodyError: There is no such file, or it does not describe a body that can be tracked; the sentence
             names the file.
     """
+    check_type("body", name_or_path, (RigidTemplate, str, Path), _EXPECTED)
     if isinstance(name_or_path, RigidTemplate):
         return name_or_path
     path = Path(name_or_path)
@@ -53,13 +56,16 @@ def load_body(name_or_path: AnyBody) -> RigidTemplate:
         raise BodyError(f"{path}: {error}") from error
 
 
-def load_bodies(names_or_paths: Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
-    """Bodies that are tracked together.
+def load_bodies(names_or_paths: AnyBody | Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
+    """Bodies that are tracked together, or one.
 
     Raises:
         ArgumentError: An object is unknown, or a body has the name of another body or of a hand.
         BodyError: A file cannot be loaded.
     """
+    if isinstance(names_or_paths, AnyBody):
+        names_or_paths = (names_or_paths,)
+    check_type("bodies", names_or_paths, Iterable, _EXPECTED)
     bodies: list[RigidTemplate] = []
     for name_or_path in names_or_paths:
         body = load_body(name_or_path)

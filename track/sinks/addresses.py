@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from gloves.fit import GloveFit
+from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError, HandSimWarning
 from track.bodies.rigid_body import RigidTemplate
@@ -114,16 +115,18 @@ class SinkGroup:
             )
 
 
-def open_sinks(addresses: Sequence[str]) -> SinkGroup:
+def open_sinks(addresses: str | Sequence[str]) -> SinkGroup:
     """Open a sink for each address, which gets positions in [m] and angles in [rad].
 
     Args:
-        addresses: Each as in `VALID`; `udp://` and `ws://` take `?format=json`, `?format=msgpack` and
-            `?points=yes`.
+        addresses: One, or several, each as in `VALID`; `udp://` and `ws://` take `?format=json`,
+            `?format=msgpack` and `?points=yes`.
 
     Raises:
         ArgumentError: An address is invalid or is given twice, a package is missing, or a port is taken.
     """
+    addresses = (addresses,) if isinstance(addresses, str) else addresses
+    check_type("addresses", addresses, Sequence, f"a list of {', '.join(VALID)}")
     sinks: dict[str, LiveSink] = {}
     with ExitStack() as stack:
         for address in addresses:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError
 from track.network_address import split_address
@@ -35,6 +36,7 @@ def open_source(
         ArgumentError: The address is invalid, or there is no such source.
         CaptureError: No server answers.
     """
+    check_type("address", address, str, f"one of {', '.join(VALID)}")
     scheme = address.partition("://")[0] if "://" in address else ""
     if scheme == "natnet":
         return LiveStream(open_stream(address, silence=silence, ended=ended))

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.optics.identities import number_runs
+from handsim._checks import check_type
 from handsim.errors import CaptureError, choices
 from track.given import read_points
 from track.streams import natnet
@@ -202,6 +203,8 @@ def _point_frames(
     """Points [m], IDs and rate [Hz] of what is to be played."""
     if isinstance(source, str | Path):
         source = read_points(source)
+    if not all(hasattr(source, name) for name in ("rate", "ids")):
+        check_type("source", source, Capture, "a Capture, a Take, or the path of a file")
     if isinstance(source, Capture):
         return source.positions, number_runs(np.isfinite(source.positions[..., 0])), source.rate
     return source.points, source.ids, source.rate

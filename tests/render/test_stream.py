@@ -1,0 +1,106 @@
+"""Pictures for training loops: their truth, their order and their people."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from handsim.errors import HandSimError
+from handsim.hand.model import HandModel, join_qpos
+from render import PictureStream, RenderConfig
+from render.sensors.shutter import ShutterConfig
+from train.simulation.takes import TakeConfig, simulate_take
+
+BARE = RenderConfig(passes=("depth", "ids"), depth_sensor=None)
+
+
+def fists(model, num_poses, *, rng):
+    low, high = model.skeleton.ranges.T
+    return low + (high - low) * rng.beta(4, 2, (num_poses, 20))
+
+
+def taken(count, **options):
+    return list(itertools.islice(PictureStream(**({"config": BARE} | options)), count))
+
+
+@pytest.mark.parametrize("crop", [None, 96])
+def test_the_truth_fits_the_pictures(crop):
+    share = (0.4, 0.6)
+    for number, one in enumerate(taken(8, sampler=fists, crop=crop, fill=share, people=4)):
+        height, width = one["depth"].shape
+        assert (height, width) == ((480, 640) if crop is None else (crop, crop)) and one["number"] == number
+        keypoints = one["keypoints"].numpy()
+        projected = one["keypoints_camera"].numpy() @ one["K"].numpy().T
+        np.testing.assert_allclose(projected[:, :2] / projected[:, 2:], keypoints, atol=0.01)
+        assert ((keypoints > 0) & (keypoints < (width, height))).all(), "the hand is in the picture"
+        assert share[0] - 0.1 < np.ptp(keypoints, axis=0).max() / min(width, height) < share[1] + 0.1
+        seen = one["visible"].numpy()
+        columns, rows = keypoints[seen].astype(int).T
+        ahead = one["keypoints_camera"].numpy()[seen, 2] - one["depth"].numpy()[rows, columns]
+        assert np.median(np.abs(ahead)) < 0.02 and (one["ids"].numpy()[rows, columns] == 1).mean() > 0.7
+
+
+def test_batches_are_the_same_with_any_number_of_workers():
+    def batches(workers):
+        stream = PictureStream(config=BARE, crop=48, batch=3, people=4, sitting=5, seed=3)
+        return list(itertools.islice(DataLoader(stream, batch_size=3, num_workers=workers), 9))
+
+    alone = batches(0)
+    assert [batch["number"].tolist() for batch in alone[:2]] == [[0, 1, 2], [3, 4, 5]]
+    for one, other in zip(alone, batches(2), strict=True):
+        assert one.keys() == other.keys()
+        assert all(torch.equal(one[name].nan_to_num(), other[name].nan_to_num()) for name in one)
+
+
+def test_people_take_turns():
+    pictures = taken(40, crop=32, people=4, sitting=5)
+    shapes = [tuple(one["shape"].tolist()) for one in pictures]
+    assert len(set(shapes[:4])) == 4
+    assert len(set(shapes)) >= 8, "each is replaced after five pictures"
+    assert {int(one["side"]) for one in pictures} == {0, 1}
+    assert len({tuple(one["qpos"].tolist()) for one in pictures}) == 40
+
+
+def test_colors_and_sensors():
+    config = RenderConfig(passes=("rgb", "depth", "normals"))
+    one = taken(1, config=config, crop=64, side="left")[0]
+    assert one["rgb"].shape == one["noisy_rgb"].shape == one["normals"].shape == (3, 64, 64)
+    assert one["rgb"].dtype == torch.uint8 and (one["rgb"] != one["noisy_rgb"]).any()
+    hand = one["depth"] > 0
+    assert (one["noisy_depth"][hand] > 0).float().mean() > 0.5, "hands are not too near for the sensor"
+    assert one["side"] == 0
+
+
+def test_own_poses_and_takes():
+    qpos = np.stack([join_qpos(np.full((5, 20), 0.2))] * 2, axis=1)
+    qpos[:, 1, 1] += 0.15
+    one = taken(1, poses=qpos, crop=64)[0]
+    assert one["keypoints"].shape == (2, 21, 2) and one["side"].tolist() == [1, 0]
+    shape = HandModel.named("L", side="left").shape
+    one = taken(1, poses=qpos[:, 0], model=shape, crop=64)[0]
+    np.testing.assert_allclose(one["qpos"], qpos[0, 0], atol=1e-6)
+    assert one["shape"][0] == np.float32(shape.length) and one["side"] == 0
+    take = simulate_take(TakeConfig(kind="hand-pen", num_frames=6))
+    one = taken(1, takes=take, crop=64)[0]
+    assert one["keypoints"].shape == (2, 21, 2) and one["ids"].max() == 3, "two hands and a pen"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"sampler": fists, "poses": np.zeros((2, 20))}, "expected one of sampler, poses and takes"),
+        ({"side": "both"}, "unknown side 'both'"),
+        ({"people": 0}, "people is 0"),
+        ({"camera": "headset_fisheye", "crop": 64}, "expected 16 pixels or more of a pinhole camera"),
+        ({"camera": 3}, "camera is 3, expected a Camera or the name of a preset"),
+        ({"config": RenderConfig(shutter=ShutterConfig())}, "poses without times have no motion to blur"),
+        ({"sampler": lambda model, count, rng: np.zeros((count, 21))}, r"array of shape \(128, 21\)"),
+    ],
+)
+def test_mistakes_are_told(arguments, message):
+    with pytest.raises(HandSimError, match=message):
+        taken(1, **arguments)
