@@ -11,7 +11,7 @@ DRAWING_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint format fuzz fuzz-coverage figures chaos truth docs clean drawing
+.PHONY: help demo test test-slow lint format fuzz fuzz-coverage tables results chaos truth docs clean drawing
 
 help:  ## list the targets (this)
 	@echo "usage: make TARGET [PYTHON=python3.12]"
@@ -46,15 +46,19 @@ fuzz-coverage: $(DEVELOPER)  ## the same by coverage: MOST=600 seconds of each, 
 docs: $(DEVELOPER)  ## the guide, the commands and the API reference, into build/docs
 	$(BIN)/sphinx-build -W --keep-going -q -j 2 docs build/docs
 
-figures: $(DEVELOPER)  ## write docs/figures.toml into the pages; ONLY=table5 runs that command anew
-	$(BIN)/python docs/renew_figures.py $(if $(ONLY),--only $(ONLY))
+tables: $(DEVELOPER)  ## print the paper's tables beside ours, half an hour; ONLY=table5 for one
+	for table in $(or $(ONLY),table3 table4 table5 table6 table7 cameras); do \
+	  OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.paper $$table || exit 1; done
+
+results: $(DEVELOPER)  ## write docs/results.md from the figures in benchmarks/figures
+	$(BIN)/python -m benchmarks.results
 
 chaos: $(DEVELOPER)  ## kill every long command at random moments and run it again; KILLS=20
-	$(BIN)/python benchmarks/chaos.py --kills $(or $(KILLS),20)
+	$(BIN)/python -m benchmarks.chaos --kills $(or $(KILLS),20)
 
 truth: $(DEVELOPER)  ## the tracker on real hands in motion: DATA=path of Mocap_SIG18_Data
 	@test -d "$(DATA)" || { echo "make truth needs DATA, the path of a folder of Mocap_SIG18_Data"; exit 1; }
-	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/real_motion.py $(DATA)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.real_motion $(DATA)
 
 clean:  ## remove .venv, caches and what the demo wrote
 	rm -rf $(VENV) demo docs/api docs/help build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

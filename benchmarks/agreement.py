@@ -1,6 +1,6 @@
 """How exactly the fast paths agree with MuJoCo, and how valid sampled poses are.
 
-    python benchmarks/agreement.py [--hands 50 --poses 2000]
+    python -m benchmarks.agreement [--hands 50 --poses 2000]
 
 Random people of both sides and all ages: kinematics against mj_kinematics, sight against mj_multiRay, ranges,
 and the deepest self-penetration of any sampled pose.
@@ -12,8 +12,8 @@ import argparse
 
 import mujoco
 import numpy as np
-from machine import describe
 
+from benchmarks.record import add_save, describe, save_figures
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.visibility import free_rays
@@ -49,6 +49,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--hands", type=int, default=50)
     parser.add_argument("--poses", type=int, default=2000)
+    add_save(parser)
     arguments = parser.parse_args()
     print(describe("mujoco"))
     rng = np.random.default_rng(0)
@@ -78,6 +79,12 @@ def main() -> None:
     print(f"deepest self-penetration {1e3 * deepest:.3f} mm (limit 1 mm)")
     print(f"kinematics against mj_kinematics: largest difference {kinematics:.1e} m")
     print(f"sight against mj_multiRay: {rays - disagreeing:,} of {rays:,} rays agree")
+    figures = {
+        "kinematics": ("kinematics against mj_kinematics, largest difference [m]", kinematics),
+        "rays": ("rays that agree with mj_multiRay, of all", [rays - disagreeing, rays]),
+        "deepest": ("deepest self-penetration of the sampled poses [mm]", 1e3 * deepest),
+    }
+    save_figures(arguments.save, figures)
 
 
 if __name__ == "__main__":

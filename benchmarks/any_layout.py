@@ -4,7 +4,7 @@ Without any training of the glove (at once), after `train.any_layout.fine_tuning
 the labeler that was trained on it. People and poses are simulated, and in no training. Random layouts of 6 to
 30 markers come beside the shipped ones, some even over the hand, some crowded on few bones.
 
-python benchmarks/any_layout.py [--frames 1000] [--random 4] [--captures FOLDER]
+python -m benchmarks.any_layout [--frames 1000] [--random 4] [--captures FOLDER]
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 
+from benchmarks.record import describe
 from gloves.captures.collection import read_markers
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from train.any_layout.fine_tuning import fine_tuned_labeler
@@ -26,9 +26,10 @@ from train.any_layout.skin_bank import sample_places
 from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
-from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.evaluate import evaluate_labeler
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler, shipped_labelers
+from train.labelers.storage import shipped_labelers
 
 CAPTURE_FRAMES = 3000
 

@@ -1,6 +1,6 @@
 """How near a calibration comes to the truth, on simulated users.
 
-    python benchmarks/calibration.py [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
+    python -m benchmarks.calibration [--users 6 --seed 0 --layout dense19 --free 40 --rounds 3]
         [--picture FILE.png] [--captures FOLDER]
 
 Each user is one hand, right and left in turn: a size's mean hand made 8 % larger or smaller, with the
@@ -28,9 +28,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from machine import describe
-from people import right_hands
 
+from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.people import right_hands
+from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, load_layout
@@ -43,8 +44,7 @@ from poses.shapes.touch import FINGERS, is_touching, thumb_contact
 from track.calibration.contacts import contact_geometry, initialize_contacts
 from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import SkinPatch, displace_markers
-from track.calibration.user_calibration import calibrate
-from track.evaluation.hand_errors import hand_errors
+from track.calibration.user_calibration import calibrate_hand
 from track.kinematics.pose_solver import PoseSolver
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 
@@ -166,7 +166,7 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
     rows = {"before": tell("before", start, true, held_out)}
     for name, (seen, begin) in ways.items():
         began = time.perf_counter()
-        result = calibrate(seen, begin, take.rate)
+        result = calibrate_hand(seen, begin, take.rate)
         took = time.perf_counter() - began
         within = (1e3 * hand_errors(result.hand, true).wrist_positions < 2e3 * result.position_errors).mean()
         rows[name] = tell(name, result.hand, true, held_out)
@@ -179,16 +179,20 @@ def run_user(number: int, arguments: argparse.Namespace, layout: MarkerLayout) -
     return rows
 
 
-def tell_people(captures: Path, layout: MarkerLayout) -> None:
-    """Print what markers are off by on captures that a calibration has not seen."""
+def tell_people(captures: Path, layout: MarkerLayout) -> list[list[float]]:
+    """What markers are off by on captures that a calibration has not seen, medians before and after [mm]."""
+    medians: list[list[float]] = [[], []]
     for name, markers in right_hands(captures, layout.names).items():
         half = len(markers) // 2
         seen = markers[half:][np.isfinite(markers[half:, :, 0]).all(axis=1)][::EVERY]
-        result = calibrate(markers[:half], nominal_fit(layout, "M", "right"), 120.0)
+        result = calibrate_hand(markers[:half], nominal_fit(layout, "M", "right"), 120.0)
         off = [1e3 * PoseSolver(hand).solve(seen).rms for hand in (result.start, result.hand)]
         print(f"{name}: {len(seen)} held-out frames, 3D RMS median {np.median(off[0]):.2f} mm before, "
               f"{np.median(off[1]):.2f} mm after (p95 {np.percentile(off[1], 95):.2f}); "
               f"{len(result.touches)} touches found")  # fmt: skip
+        for one, values in zip(medians, off, strict=True):
+            one.append(float(np.median(values)))
+    return medians
 
 
 def main() -> None:
@@ -202,17 +206,30 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--picture")
     parser.add_argument("--captures", type=Path)
+    add_save(parser)
     arguments = parser.parse_args()
     print(describe("scipy", "numba"))
     layout = load_layout(arguments.layout)
     users = [run_user(number, arguments, layout) for number in range(arguments.users)]
+    figures: Figures = {}
     for name in users[0]:
         mean, worst = (by([user[name] for user in users], axis=0) for by in (np.mean, np.max))
         print(f"{name}: places {mean[0]:.2f} mm (worst {worst[1]:.2f}; in the wrist's frame {mean[2]:.2f}), "
               f"bones {mean[3]:.2f} % (worst {worst[4]:.1f}), tips {mean[5]:.1f} %, touches off by "
               f"{mean[6]:.2f} mm (worst finger {worst[8]:.2f}), skins by {mean[7]:.2f} mm")  # fmt: skip
+        key = {"from the next size": "next_size", "1 % wrong labels": "wrong_labels"}.get(name, name)
+        what = (
+            f"{len(users)} simulated users, mean and worst: marker positions [mm] | bones between joints [%] "
+            f"| last bones to their tips [%] | held-out touches [mm]: {name}"
+        )
+        figures[key] = what, [[mean[0], worst[1]], [mean[3], worst[4]], mean[5], [mean[6], worst[8]]]
+        if name == "after":
+            figures["wrist_frame"] = "marker positions in the wrist's frame, mean [mm]", mean[2]
     if arguments.captures:
-        tell_people(arguments.captures, layout)
+        before, after = tell_people(arguments.captures, layout)
+        figures["people_before"] = "real people, held-out frames, 3D RMS median before [mm]", before
+        figures["people_after"] = "the same after calibration [mm]", after
+    save_figures(arguments.save, figures)
 
 
 if __name__ == "__main__":

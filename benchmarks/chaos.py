@@ -1,6 +1,6 @@
 """Kill every long command at random moments, run it again, and compare.
 
-    python benchmarks/chaos.py [generate train ...] [--kills 20 --seed 0]
+    python -m benchmarks.chaos [generate train ...] [--kills 20 --seed 0]
 
 Each command runs once undisturbed. Then it is killed by SIGTERM, SIGKILL and SIGINT in turn, at a random
 moment, and run again to its end. The table counts what must be zero: reruns whose files differ, processes
@@ -55,7 +55,6 @@ CASES = {
         )
     ),
     "simulate": Case(("simulate", "--num-frames", "240", "--out", "OUT/take.c3d")),
-    "benchmark": Case(("benchmark", "make", "--workers", "2", "--out", "OUT")),
     "track": Case(("track", "WORK/take.c3d", "--out", "OUT/tracked.npz")),
     "calibrate": Case(("calibrate", "WORK/long.c3d", "--hands", "right", "--out", "OUT/user.json")),
 }
@@ -180,7 +179,7 @@ def finish(args: tuple[str, ...]) -> None:
 
 
 def program(args: tuple[str, ...]) -> list[str]:
-    """The command with small shards, so that there are several, and a small benchmark."""
+    """The command with small shards, so that there are several."""
     return [sys.executable, __file__, "--run", *args]
 
 
@@ -199,11 +198,9 @@ def contents(folder: Path, files: str) -> dict[str, str]:
 
 
 if sys.argv[1:2] == ["--run"]:  # also in worker processes, which read this file first
-    from track.benchmark.difficulties import SIZES, Plan
     from train.simulation import generation
 
     generation.ROWS_PER_SHARD = 150
-    SIZES["small"] = Plan("small", people=1, num_frames=100)
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--run"]:

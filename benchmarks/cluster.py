@@ -1,6 +1,6 @@
 """A Dask scheduler and its workers against this machine's worker processes: bytes, deaths, and overhead.
 
-python benchmarks/cluster.py [--frames 400000] [--pictures 5000] [--workers 4] [--rounds 2] [--shards 10000]
+python -m benchmarks.cluster [--frames 400000] [--pictures 5000] [--workers 4] [--rounds 2] [--shards 10000]
 
 Training sets and pictures are made by worker processes and by as many `dask worker` processes of one thread,
 in turns, and compared byte by byte. Then each is made once more while two of the workers are killed (SIGKILL)
@@ -21,20 +21,21 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 
-from handsim.app.executors.dask_cluster import DaskCluster
-from handsim.app.executors.executor import Executor, Processes
+from benchmarks.record import describe
+from handsim.app.cluster import chosen_workers
+from handsim.app.workers import run_jobs
 from render.config import RenderConfig
 from render.session import render_take
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.generation import make_dataset
+from train.simulation.takes import simulate_take
 
 WAIT = 60.0  # [s] for a scheduler or a worker to come
 
@@ -89,7 +90,7 @@ class DaskProcesses:
         return subprocess.Popen(command, cwd=self.folder, stdout=log, stderr=log, env=environment)
 
 
-Make = Callable[[Path, Executor], object]
+Make = Callable[[Path, int | Executor], object]
 
 
 def main() -> None:
@@ -103,7 +104,7 @@ def main() -> None:
     print(describe("dask", "distributed"))
     with tempfile.TemporaryDirectory() as name, running(Path(name), options.workers) as dask:
         folder = Path(name)
-        take = simulate_take(TakeConfig(kind="hand-hand", num_frames=options.pictures))
+        take = simulate_take(kind="hand-hand", num_frames=options.pictures)
         take.save(folder / "take.npz")
         kinds: dict[str, Make] = {
             f"{options.frames} training frames": functools.partial(frames, options.frames),
@@ -126,13 +127,13 @@ def running(folder: Path, workers: int) -> Iterator[DaskProcesses]:
         dask.stop()
 
 
-def frames(count: int, out: Path, executor: Executor) -> None:
-    generate_dataset(DatasetConfig(num_frames=count, seed=3), out, workers=executor)
+def frames(count: int, out: Path, workers: int | Executor) -> None:
+    make_dataset(DatasetConfig(num_frames=count, seed=3), out, workers=workers)
 
 
-def pictures(take: Path, out: Path, executor: Executor) -> None:
+def pictures(take: Path, out: Path, workers: int | Executor) -> None:
     config = RenderConfig(passes=("rgb", "depth", "ids"), depth_sensor=None, color_sensor=None, seed=3)
-    render_take(take, out, ("webdataset",), config, workers=executor)
+    render_take(take, out, ("webdataset",), config, workers=workers)
 
 
 def compare(kind: str, make: Make, dask: DaskProcesses, options: argparse.Namespace) -> None:
@@ -143,11 +144,9 @@ def compare(kind: str, make: Make, dask: DaskProcesses, options: argparse.Namesp
         for name, times in seconds.items():
             with tempfile.TemporaryDirectory() as folder:
                 out = Path(folder) / "out"
-                executor = Processes(options.workers)
-                if name == "dask":
-                    executor = DaskCluster(dask.address, out, tell=lambda line: None)
                 start = time.perf_counter()
-                make(out, executor)
+                with chosen(name, dask, options) as workers:
+                    make(out, workers)
                 times.append(time.perf_counter() - start)
                 results.add(digest(out))
     pool, there = (float(np.median(each)) for each in seconds.values())
@@ -162,7 +161,8 @@ def compare(kind: str, make: Make, dask: DaskProcesses, options: argparse.Namesp
         for timer in timers:
             timer.start()
         start = time.perf_counter()
-        make(out, DaskCluster(dask.address, out, tell=lambda line: None))
+        with chosen("dask", dask, options) as workers:
+            make(out, workers)
         took = time.perf_counter() - start
         for timer in timers:
             timer.join()
@@ -187,17 +187,23 @@ def nothing(number: int) -> int:
     return number
 
 
+def chosen(
+    name: str, dask: DaskProcesses, options: argparse.Namespace
+) -> AbstractContextManager[int | Executor]:
+    """Processes of this machine, or the workers of the scheduler."""
+    if name == "dask":
+        return chosen_workers(dask.address, None, lambda line: None)
+    return chosen_workers(None, options.workers, print)
+
+
 def empty_shards(dask: DaskProcesses, options: argparse.Namespace) -> None:
     """What either takes for a shard, if nothing is to be done."""
-    with tempfile.TemporaryDirectory() as folder:
-        for name, executor in (
-            ("Dask", DaskCluster(dask.address, Path(folder), tell=lambda line: None)),
-            ("processes", Processes(options.workers)),
-        ):
-            start = time.perf_counter()
-            done = sum(1 for _ in executor.run(nothing, range(options.shards)))
-            took = time.perf_counter() - start
-            print(f"{done} empty shards, {name}: {took:.1f} s, {1e3 * took / done:.2f} ms each", flush=True)
+    for name in ("dask", "processes"):
+        start = time.perf_counter()
+        with chosen(name, dask, options) as workers:
+            done = sum(1 for _ in run_jobs(nothing, range(options.shards), workers))
+        took = time.perf_counter() - start
+        print(f"{done} empty shards, {name}: {took:.1f} s, {1e3 * took / done:.2f} ms each", flush=True)
 
 
 if __name__ == "__main__":

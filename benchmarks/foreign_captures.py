@@ -1,6 +1,6 @@
 """Marker files of other programs: read by handsim and by readers of others, and compared.
 
-    python benchmarks/foreign_captures.py FOLDER... [--list]
+    python -m benchmarks.foreign_captures FOLDER... [--list]
 
 Every .trc, .c3d, .csv and .tsv under the folders is read by `read_capture` and, a C3D, by ezc3d (in a process
 of its own, because a damaged file can end it) and by the package c3d where that is installed; a text by a

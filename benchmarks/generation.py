@@ -1,6 +1,6 @@
 """How fast training sets are made, every ray from every marker to every camera cast.
 
-    python benchmarks/generation.py [--frames 170330]
+    python -m benchmarks.generation [--frames 170330]
 
 The floor of a frame is what cannot be left out: its rays, 19 markers x 16 cameras, each against 21 capsules,
 and its row on the disk. Then come the stages of `train.simulation.generation` for a hand alone, a new
@@ -19,8 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 
+from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.ghosts import sample_ghosts
@@ -33,7 +33,7 @@ from poses.shapes.validity import sample_valid_angles
 from train.data.shards import row_dtype
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.simulation.people import sample_hands
 
 CONFIG = DatasetConfig()
@@ -100,7 +100,9 @@ def stages() -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--frames", type=int, default=CONFIG.num_frames)
-    frames = parser.parse_args().frames
+    add_save(parser)
+    arguments = parser.parse_args()
+    frames = arguments.frames
     print(describe("mujoco", "numba"))
     parts = stages()
     rays = load_layout(CONFIG.glove).num_markers * len(named_rig(CONFIG.rig).positions)
@@ -113,21 +115,24 @@ def main() -> None:
     for name, microseconds in parts.items():
         print(f"  {name:40s} {microseconds:6.1f} us/frame")
     print(f"  {'sum':40s} {sum(parts.values()) - kernel:6.1f} us/frame")
+    figures: Figures = {"rays": ("rays alone, one core [million/s]", rays / kernel)}
     single = SceneMix(alone=1.0, together=0.0, holding=0.0)
-    for name, scenes, workers in (
-        ("single hands", single, 1),
-        ("single hands", single, 2),
-        ("the mix", SceneMix(), 2),
+    for key, name, scenes, workers in (
+        ("single_alone", "single hands", single, 1),
+        ("single", "single hands", single, 2),
+        ("mix", "the mix", SceneMix(), 2),
     ):
         with tempfile.TemporaryDirectory() as folder:
             config = DatasetConfig(num_frames=frames, scenes=scenes)
             start, busy = time.perf_counter(), sum(os.times()[:4])
-            generate_dataset(config, Path(folder) / "set", workers=workers)
+            make_dataset(config, Path(folder) / "set", workers=workers)
             seconds, busy = time.perf_counter() - start, sum(os.times()[:4]) - busy  # workers' time too
         print(
             f"{name}, {workers} worker(s): {frames:,} frames in {seconds:.1f} s, {frames / seconds:,.0f} "
             f"frames/s; {frames / busy:,.0f} frames a second of processor time"
         )
+        figures[key] = (f"training frames of {name}, {workers} worker(s) [frames/s]", frames / seconds)
+    save_figures(arguments.save, figures)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What a graphics card is worth here: labels, training and pictures, on the CPU and on it.
 
-    python benchmarks/gpu.py [--sections labels training pictures]
+    python -m benchmarks.gpu [--sections labels training pictures]
                              [--clouds 20000] [--samples 100000] [--frames 200]
 
 labels: clouds a second in batches, the default labeler and the paper's network.
@@ -26,19 +26,19 @@ from typing import Final
 
 import numpy as np
 import torch
-from machine import describe
-from rendering import COLORS, draw, rate, rate_in_processes
-from training_scaling import train
 
+from benchmarks.record import describe
+from benchmarks.rendering import COLORS, draw, rate, rate_in_processes
+from benchmarks.training_scaling import train
 from render.painting.gl import _renderer_name, opengl_has_hardware
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
+from train.glove_labeler import load_labeler
 from train.labelers import batch_network
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.simulation.held_out import held_out_markers
 
 SECTIONS: Final = ("labels", "training", "pictures")
@@ -91,7 +91,7 @@ def labels(count: int) -> None:
 def training(samples: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         dataset = Path(folder) / "set"
-        generate_dataset(DatasetConfig(num_frames=20_000), dataset)
+        make_dataset(DatasetConfig(num_frames=20_000), dataset)
         plans = [("cpu", "32"), *((("cuda", "32"), ("cuda", "bf16")) if len(devices()) > 1 else ())]
         for kind, count in (("set", samples), ("cnn", samples // 20)):
             for device, precision in plans:

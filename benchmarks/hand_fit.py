@@ -1,6 +1,6 @@
 """Fit of the hand model to real people: one shape and one marker placement per person, one pose per frame.
 
-    python benchmarks/hand_fit.py CAPTURES [--frames 400 --held-out 400 --seed 0]
+    python -m benchmarks.hand_fit CAPTURES [--frames 400 --held-out 400 --seed 0]
 
 CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (right hands, *_right.trc). Shape
 (bone lengths, knuckles, directions of digits) and marker places are fitted together with the poses of some
@@ -16,9 +16,9 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from machine import describe
-from people import right_hands
 
+from benchmarks.people import right_hands
+from benchmarks.record import add_save, describe, save_figures
 from gloves.attachment import Attachment, attach_markers
 from gloves.layout import MarkerLayout, load_layout
 from handsim.hand.jacobian import skinned_jacobian
@@ -131,6 +131,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400)
     parser.add_argument("--held-out", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
+    add_save(parser)
     arguments = parser.parse_args()
     print(describe("scipy"))
     rng, layout, everyone = np.random.default_rng(arguments.seed), load_layout("dense19"), []
@@ -142,6 +143,8 @@ def main() -> None:
         everyone.append(1e3 * fit.rms)
     rms = np.concatenate(everyone)
     print(f"all: median {np.median(rms):.2f} mm, p95 {np.percentile(rms, 95):.2f} mm")
+    what = f"fit of the hand to {len(rms)} other frames, 3D RMS median and p95 [mm]"
+    save_figures(arguments.save, {"all": (what, np.percentile(rms, [50, 95]))})
 
 
 if __name__ == "__main__":

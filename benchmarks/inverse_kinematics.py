@@ -1,6 +1,6 @@
 """How quickly a hand's pose is found from labeled markers: ours, MuJoCo's Jacobian, SciPy, mink.
 
-    OMP_NUM_THREADS=1 python benchmarks/inverse_kinematics.py [--frames 300 --noise 0.3 --hands 10 --seed 0]
+    OMP_NUM_THREADS=1 python -m benchmarks.inverse_kinematics [--frames 300 --noise 0.3 --hands 10 --seed 0]
 
 A random 120 Hz motion is followed on one core, every frame from the pose that the same solver found for the
 one before. For the comparison each marker of dense19 is bound to one bone, because a site of MuJoCo is; all
@@ -19,9 +19,9 @@ from collections.abc import Callable
 
 import mujoco
 import numpy as np
-from machine import describe
 from scipy.optimize import least_squares
 
+from benchmarks.record import describe
 from gloves.attachment import Attachment, attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout

@@ -1,6 +1,6 @@
 """What drawn pictures teach: a keypoint network that has seen only them, tried on photographs.
 
-    python benchmarks/keypoint_network.py OUT --photos FOLDER --reference FILE [--variants ours plain ...]
+    python -m benchmarks.keypoint_network OUT --photos FOLDER --reference FILE [--variants ours plain ...]
         [--pictures 12000 --samples 240000 --seed 0]
 
 Trains the network of `keypoint_training.py` once for each variant of the pictures, from
@@ -31,12 +31,12 @@ from typing import Any, Final
 from unittest.mock import patch
 
 import cv2
-import keypoint_training as training
 import numpy as np
 import torch
 import trimesh
-from machine import describe
 
+from benchmarks import keypoint_training as training
+from benchmarks.record import Figures, add_save, describe, save_figures
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from render.config import RenderConfig
@@ -190,6 +190,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=240000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--page", type=Path)
+    add_save(parser)
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     print(describe())
@@ -197,17 +198,24 @@ def main() -> None:
     held_out = training.middle_of(pictures_of("ours", 1000, HELD_OUT, options.out))
     print(f"{options.pictures} pictures, {options.samples} samples; {len(photos.crops)} photographs")
     result = {}
+    figures: Figures = {
+        "photographs": ("photographs of hands on which the reference is sure", len(photos.crops))
+    }
     for variant in options.variants:
         network = network_of(variant, options)
         sets = {"learned": learned_by(variant, options), "drawn": held_out, "photographs": photos}
         found = result[variant] = {name: 100 * training.pck(network, one) for name, one in sets.items()}
         shares = "  ".join(f"{name} {share:5.1f}" for name, share in found.items())
         print(f"{variant:15s} {shares}", flush=True)
+        key, sets_of = variant.replace(" ", "_"), "pictures learned from | other drawn hands | photographs"
+        figures[key] = (f"trained on {variant}, PCK@0.1 [%]: {sets_of}", list(found.values()))
         if "ours" in result and variant != "ours":
             ratio = (100 - found["photographs"]) / (100 - result["ours"]["photographs"])
             print(f"misses on photographs, {variant} over ours: {ratio:.2f}", flush=True)
+            figures[f"{key}_ratio"] = (f"misses on photographs, {variant} over ours", ratio)
         if options.page is not None:
             page(network, photos, options.page.with_stem(f"{options.page.stem}_{variant.replace(' ', '_')}"))
+    save_figures(options.save, figures)
     (options.out / "result.json").write_text(json.dumps(result, indent=1))
 
 

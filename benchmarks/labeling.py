@@ -1,6 +1,6 @@
 """How long labelers take for one hand on one core, matching included, whatever runs them.
 
-python benchmarks/labeling.py [--frames 2000] [--cnn RUN]
+python -m benchmarks.labeling [--frames 2000] [--cnn RUN]
 
 RUN is a folder that handsim train --labeler cnn wrote; without it the paper's network is timed untrained, so
 that it tries every view.
@@ -17,14 +17,15 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import torch
-from machine import describe
 
+from benchmarks.record import Figures, add_save, describe, save_figures
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
+from train.glove_labeler import load_labeler
 from train.labelers.depth_image import depth_images
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
-from train.labelers.storage import load_labeler, load_network
+from train.labelers.storage import load_network
 from train.labelers.views import principal_axes
 from train.simulation.held_out import held_out_markers
 
@@ -33,6 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--cnn", type=Path)
+    add_save(parser)
     options = parser.parse_args()
     count = options.frames
     torch.set_num_threads(1)
@@ -64,13 +66,21 @@ def main() -> None:
         "- eight images, onnxruntime": (lambda _: images["onnxruntime, eight"](), few),
     }
     print("one hand at a time, one thread                p50       p99 [ms]")
+    figures: Figures = {}
     for name, (label, clouds) in runs.items():
         p50, p99 = np.percentile(measure(label, clouds), [50, 99])
+        if name.startswith("set labeler"):
+            key = name.split(", ")[1].removesuffix("runtime")
+            figures[key] = (f"{name}, one hand on one core: p50 and p99 [ms]", [p50, p99])
         print(f"{name:40} {p50:8.2f} {p99:9.2f}")
     for name, batched in {"onnxruntime": onnx, "torch": labeler}.items():
         start = time.perf_counter()
         batched.label_frames(frames)
-        print(f"set labeler, {name}, in batches: {1e3 * (time.perf_counter() - start) / count:.2f} ms a hand")
+        milliseconds = 1e3 * (time.perf_counter() - start) / count
+        print(f"set labeler, {name}, in batches: {milliseconds:.2f} ms a hand")
+        key = f"batch_{name.removesuffix('runtime')}"
+        figures[key] = (f"set labeler in batches, {name} [ms per hand]", milliseconds)
+    save_figures(options.save, figures)
 
 
 def convolutions(cnn: torch.nn.Module, path: Path) -> dict[str, Callable[[], object]]:

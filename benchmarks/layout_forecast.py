@@ -4,7 +4,7 @@ Twelve layouts of 6 to 30 markers: the shipped ones, even and crowded random one
 palm, whose fingers look alike. Each gets a training set and a labeler of its own; forecast and measurement
 use other people, poses and losses. Layouts that are finished stay in the folder; run again to continue.
 
-python benchmarks/layout_forecast.py FOLDER [--frames 60000] [--samples 300000]
+python -m benchmarks.layout_forecast FOLDER [--frames 60000] [--samples 300000]
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from any_layout import random_layout
-from machine import describe
 from scipy.stats import spearmanr
 
+from benchmarks.any_layout import random_layout
+from benchmarks.record import describe
 from gloves.layout import MarkerLayout, list_layouts, load_layout, save_layout
 from handsim.cli.main import main as handsim
 from handsim.space.cameras import load_rig
@@ -30,7 +30,7 @@ from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
 from track.kinematics.pose_solver import PoseSolver
 from train.any_layout.fine_tuning import fine_tuned_labeler
-from train.glove_labeler import labeler_for_glove
+from train.glove_labeler import load_labeler
 
 SCORED_FRAMES = 1500  # as `handsim glove score`
 MEASURED_FRAMES = 3000
@@ -111,7 +111,7 @@ def measure(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> Fi
     seconds = time.perf_counter() - begin
     rng = np.random.default_rng(99)
     hands = observe_poses(layout, load_rig("figure5"), MEASURED_FRAMES, rng=rng)
-    score = score_layout(layout, hands, labeler_for_glove(str(glove), run), rng=rng)
+    score = score_layout(layout, hands, load_labeler(str(glove), run), rng=rng)
     return {**slots(score), "joints": solved_errors(hands, rng).tolist(), "seconds": seconds}
 
 

@@ -3,7 +3,7 @@
 It begins with six markers on three fingers that look alike, with fifteen of which every digit has three at
 the same places and the back of the hand none, and with dense19. What is finished stays in the folder.
 
-python benchmarks/layout_improvement.py FOLDER [--minutes 3] [--frames 60000] [--samples 300000]
+python -m benchmarks.layout_improvement FOLDER [--minutes 3] [--frames 60000] [--samples 300000]
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from layout_forecast import measure, stored
-from machine import describe
 
+from benchmarks.layout_forecast import measure, stored
+from benchmarks.record import describe
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout, save_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of

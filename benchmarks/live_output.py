@@ -4,7 +4,7 @@ A simulated capture of two hands is replayed at 120 Hz by a process of its own, 
 clients, which are processes of their own. In the middle the server is restarted, with another data port.
 The latency that is added to the tracker's own time is from the server's `sendto` to the client's `recv`.
 
-python benchmarks/live_output.py [--seconds 600]
+python -m benchmarks.live_output [--seconds 600]
 """
 
 from __future__ import annotations
@@ -14,28 +14,26 @@ import json
 import multiprocessing
 import socket
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import closing
 from multiprocessing.sharedctypes import Synchronized
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from machine import describe
 from pythonosc.osc_bundle import OscBundle
 from websockets.sync.client import connect
 
+from benchmarks.paper.take_evaluation import true_users
+from benchmarks.record import describe
 from gloves.takes.take import Take
-from track.capture_tracking import track_stream, warm_up
-from track.evaluation.take_evaluation import true_users
+from track.setup import warm_up
 from track.sinks.addresses import open_sinks
 from track.streams import natnet
 from track.streams.addresses import open_source
-from track.streams.frame_source import StreamedFrame
 from track.streams.natnet import ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 RATE = 120.0
 SPAWN = multiprocessing.get_context("spawn")
@@ -54,7 +52,7 @@ class StampedServer(ReplayServer):
         ids[ids >= 0] += (
             (first + np.arange(count))[:, None].repeat(ids.shape[1], 1)[ids >= 0] // take.num_frames * 100_000
         )
-        super().__init__(take.points[rows], ids, RATE, port=port)
+        super().__init__(SimpleNamespace(points=take.points[rows], ids=ids, rate=RATE), port=port)
 
     def _send_all(self, packet: bytes) -> None:
         self._times[self._first + self.sent] = time.monotonic()
@@ -117,7 +115,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=600.0)
     frames = round(parser.parse_args().seconds * RATE)
     print(describe("numba", "torch", "websockets", "python-osc"))
-    take, half = simulate_take(TakeConfig(kind="hand-hand", num_frames=1200)), frames // 2
+    take, half = simulate_take(kind="hand-hand", num_frames=1200), frames // 2
     sent, websocket, osc = (SPAWN.Array("d", frames, lock=False) for _ in range(3))
     ready, over = SPAWN.Value("i", 0), SPAWN.Value("i", 0)
     command, web, bundles = _free_ports(3)
@@ -147,22 +145,14 @@ def _track(
 ) -> tuple[np.ndarray, dict[str, int]]:
     """Track the stream; returns how long the tracker took for each frame [s]."""
     own = np.full(frames, np.nan)
-    start = 0.0
-
-    def stamped(stream: Iterable[StreamedFrame]) -> Iterator[StreamedFrame]:
-        nonlocal start
-        for frame in stream:
-            start = time.monotonic()
-            yield frame
-
     first = 0
-    with closing(open_source(url, ended=lambda: over.value > 0)) as stream:
-        for frame, tracked in track_stream(stamped(stream), tracker):
-            taken = time.monotonic() - start
+    with open_source(url, ended=lambda: over.value > 0) as stream:
+        for frame in stream:
+            tracked = tracker.step(frame.points, frame.ids, frame.time)
             sinks.send(frame, tracked)
             first += half * frame.restarted
             if not frame.silent:
-                own[first + frame.number] = taken
+                own[first + frame.number] = tracked.seconds
         return own, stream.counts
 
 

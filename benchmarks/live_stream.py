@@ -5,7 +5,7 @@ the tracker reads. On the way 5 % of the packets are dropped, as many doubled, o
 corrupted; others bring junk, wild times and frames of another sender. The server restarts now and then, on
 its port; another one on another port is not heard. Then the command itself is killed.
 
-python benchmarks/live_stream.py [--seconds 3600] [--no-hands]
+python -m benchmarks.live_stream [--seconds 3600] [--no-hands]
 """
 
 from __future__ import annotations
@@ -23,22 +23,23 @@ import time
 import warnings
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
-from machine import describe
 
+from benchmarks.paper.take_evaluation import true_users
+from benchmarks.record import describe
 from gloves.takes.growing import GrownArchive
 from gloves.takes.take import Take, load_take
-from track.capture_tracking import track_stream
-from track.evaluation.take_evaluation import true_users
-from track.live_recording import LiveRecorder
+from track.recorder import Recorder
 from track.streams import natnet
+from track.streams.frame_source import LiveStream
 from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.streams.point_stream import open_stream
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 RATE = 120.0
 SHARE = 0.05  # of the packets, for each kind of damage
@@ -175,7 +176,7 @@ def main() -> None:
     parser.add_argument("--no-hands", action="store_true", help="only other markers: the tracker has no work")
     options = parser.parse_args()
     print(describe("numba", "torch"))
-    take = simulate_take(TakeConfig(kind="hand-hand", num_frames=1200))
+    take = simulate_take(kind="hand-hand", num_frames=1200)
     with tempfile.TemporaryDirectory() as folder:
         pace = soak(take, round(options.seconds * RATE), not options.no_hands, Path(folder))
         kill(take, min(1.0, 0.4 * pace) * RATE, Path(folder))  # a busy machine needs a slower stream
@@ -192,8 +193,9 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
     start, memory, first = time.perf_counter(), [], 0
     there = np.zeros(frames, dtype=bool)
     with closing(open_stream(server.url, ended=server.ended.is_set)) as stream:
-        with LiveRecorder(tracker, out, {}) as recorder:
-            for frame, tracked in track_stream(stream, tracker):
+        with Recorder(out, tracker) as recorder:
+            for frame in LiveStream(stream):
+                tracked = tracker.step(frame.points, frame.ids, frame.time)
                 recorder.add(frame, tracked)
                 server.read = stream.packets
                 first += server.segment * frame.restarted
@@ -227,7 +229,7 @@ def kill(take: Take, rate: float, folder: Path) -> None:
         out = folder / f"{number.name}.npz"
         part = out.with_name(out.name + ".part")
         points, ids = np.tile(take.points, (20, 1, 1)), np.tile(take.ids, (20, 1))
-        with ReplayServer(points, ids, rate) as server:
+        with ReplayServer(SimpleNamespace(points=points, ids=ids, rate=rate)) as server:
             program = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
             command = [sys.executable, "-c", program, "track", "--live", server.url, "--out", str(out)]
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

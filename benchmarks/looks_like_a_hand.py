@@ -1,6 +1,6 @@
 """Whether a hand tracker that was trained on photographs takes the renders for hands.
 
-    python benchmarks/looks_like_a_hand.py OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
+    python -m benchmarks.looks_like_a_hand OUT [--clean 300 --mixed 300 --empty 100 --seed 0] [--judge FILE]
         [--takes TRACKED.npz ...]
 
 Writes two sets of 640 x 480 pictures of one hand each, as `handsim render --format coco` writes them:

@@ -1,6 +1,6 @@
 """Keypoints that MediaPipe Hands finds on photographs of single hands, as a reference for networks.
 
-    python benchmarks/photograph_reference.py PHOTOS reference.json
+    python -m benchmarks.photograph_reference PHOTOS reference.json
 
 Runs in an environment with mediapipe 0.10.14 and opencv-python-headless; handsim is not needed. Each
 photograph is enlarged until it has 400 pixels and continued around its border, because the detector looks for

@@ -1,6 +1,6 @@
 """How well sampled poses cover those of real people: the distance to the nearest one.
 
-    python benchmarks/pose_coverage.py CAPTURES [--poses 100000 --frames 2000 --seed 0]
+    python -m benchmarks.pose_coverage CAPTURES [--poses 100000 --frames 2000 --seed 0]
 
 CAPTURES is a folder of labeled dense19 captures, one sub-folder a person (such as the public
 Mocap_SIG18_Data); only right hands, named *_right.trc, are used. Sampled poses of the mean hand are scaled to
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe
-from people import right_hands
 
+from benchmarks.people import right_hands
+from benchmarks.record import add_save, describe, save_figures
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from handsim.hand.model import HandModel, join_qpos
@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument("--poses", type=int, default=100_000)
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
+    add_save(parser)
     arguments = parser.parse_args()
     print(describe("torch"))
     rng = np.random.default_rng(arguments.seed)
@@ -78,6 +79,8 @@ def main() -> None:
         f"all: {len(everyone)} frames against {len(poses)} poses: median {np.median(everyone):.2f} mm, "
         f"p90 {np.percentile(everyone, 90):.2f} mm, p95 {np.percentile(everyone, 95):.2f} mm"
     )
+    what = f"nearest of {len(poses):,} sampled poses to {len(everyone):,} frames, 3D RMS median and p95 [mm]"
+    save_figures(arguments.save, {"all": (what, np.percentile(everyone, [50, 95]))})
 
 
 if __name__ == "__main__":

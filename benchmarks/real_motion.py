@@ -1,6 +1,6 @@
 """The tracker on real hands in motion: published poses, two hands, made into captures without names.
 
-python benchmarks/real_motion.py DATA [--conditions clean gaps close new-ids exchanged-ids]
+python -m benchmarks.real_motion DATA [--conditions clean gaps close new-ids exchanged-ids]
     [--frames 0] [--label]
 
 DATA is a folder of Mocap_SIG18_Data (Han et al. 2018), with User1/capture1 and so on in it. The left and the
@@ -27,16 +27,16 @@ from time import perf_counter
 
 import numpy as np
 import torch
-from machine import describe
-from real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
 
+from benchmarks.real_scenes import CONDITIONS, FAST, NAMES, Scene, make_scene
+from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.layout import load_layout
 from track.calibration.hand_size import fit_size, sample_frames
+from track.finder.frame_hands import HandFinder
+from track.finder.labeling import label_hands
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
-from train.hands.frame_hands import HandFinder
-from train.hands.labeling import label_hands
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 
 SIDES = ("right", "left")
 
@@ -50,15 +50,18 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=0, help="of each capture at most; all when 0")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--label", action="store_true", help="label instead of tracking")
+    add_save(parser)
     options = parser.parse_args()
     torch.set_num_threads(1)
     print(describe("torch", "numba"))
     print(
         "frames right [%] | " + " | ".join(options.conditions) + " | median, p99 of the time of a frame [ms]"
     )
-    table = []
+    table: list[list[float]] = []
+    figures: Figures = {}
+    conditions = ", ".join(options.conditions)
     for folder in sorted(options.data.glob("User*/capture*")):
-        name, row, times = "/".join(folder.parts[-2:]), [], []
+        name, row, times = "/".join(folder.parts[-2:]), list[float](), []
         for condition in options.conditions:
             scene = make_scene(folder, condition, seed=options.seed, frames=options.frames)
             right, seconds = (label if options.label else track)(scene)
@@ -67,8 +70,11 @@ def main() -> None:
         table.append(row)
         p50, p99 = np.percentile(np.concatenate(times), [50, 99])
         print_row(f"{name}, {'40' if name in FAST else '120'} Hz", row, f" | {p50:.2f}, {p99:.1f}")
-    print_row("mean", np.mean(table, axis=0))
-    print_row("worst", np.min(table, axis=0))
+        figures[name.lower().replace("/", "_")] = (f"frames right [%] of {name}: {conditions}", row)
+    for name, values in (("mean", np.mean(table, axis=0)), ("worst", np.min(table, axis=0))):
+        print_row(name, values)
+        figures[name] = (f"frames right [%] over the captures, {name}: {conditions}", values)
+    save_figures(options.save, figures)
 
 
 def print_row(name: str, values: object, rest: str = "") -> None:

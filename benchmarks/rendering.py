@@ -1,6 +1,6 @@
 """Speed of rendering, accuracy of depth, and memory.
 
-    MUJOCO_GL=egl python benchmarks/rendering.py [speed accuracy memory] [--frames 200 --images 20000]
+    MUJOCO_GL=egl python -m benchmarks.rendering [speed accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
     colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
@@ -27,10 +27,10 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
-from machine import describe
 
+from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.takes.take import Take
-from handsim.app.workers import in_processes
+from handsim.app.workers import run_jobs
 from render.cameras.viewpoints import ViewConfig, Viewpoints
 from render.config import RenderConfig
 from render.drawing import Drawing
@@ -43,7 +43,7 @@ from render.painting.rasterizer import join, rasterize
 from render.skin.look import ALL_TONES
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 SECTIONS: Final = ("speed", "accuracy", "memory")
 ROUNDS: Final = 3
@@ -59,7 +59,7 @@ KINDS: Final = {
 
 @functools.lru_cache(maxsize=1)
 def a_take(frames: int) -> Take:
-    return simulate_take(TakeConfig(kind="hand-hand", num_frames=frames))
+    return simulate_take(kind="hand-hand", num_frames=frames)
 
 
 def pictures(config: RenderConfig, frames: int, shard: int) -> Iterator[RenderedFrame]:
@@ -93,7 +93,7 @@ def rate(job: Callable[[], object], count: int) -> float:
 def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> float:
     """Pictures per second while all processes are at work: from the second shard of each on."""
     ends = []
-    for _ in in_processes(job, range(1 + 6 * cores), cores):
+    for _ in run_jobs(job, range(1 + 6 * cores), cores):
         ends.append(time.perf_counter())
     steady = ends[1 + cores : -cores]  # the first is drawn before there are processes
     return (len(steady) - 1) * frames / (steady[-1] - steady[0])
@@ -133,23 +133,31 @@ def mujoco_loop(take: Take, color: bool) -> None:
             renderer.render()
 
 
-def speed(frames: int) -> None:
+def speed(frames: int) -> Figures:
     take, cores = a_take(frames), os.cpu_count() or 1
     print(f"\nimages per second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
+    figures: Figures = {}
     with tempfile.TemporaryDirectory() as folder:
         jobs = {name: functools.partial(draw, config, frames) for name, config in KINDS.items()}
         jobs["- written as WebDataset"] = functools.partial(draw_and_write, COLORS, Path(folder), frames)
         for name, job in jobs.items():
-            alone = rate(lambda job=job: job(0), frames)
-            print(f"  {name:32s} {alone:8.1f} {rate_in_processes(job, cores, frames):8.1f}")
+            rates = rate(lambda job=job: job(0), frames), rate_in_processes(job, cores, frames)
+            print(f"  {name:32s} {rates[0]:8.1f} {rates[1]:8.1f}")
+            key = name.strip("- ").split()[-1 if name.startswith("- painted") else 0].strip(",").lower()
+            figures[key] = (f"pictures per second, one process | {cores}: {name}", rates)
+    loops: dict[str, list[float]] = {"pyrender": [], "mujoco": []}
     for color, name in ((False, "depth"), (True, "colors")):
-        print(
-            f"  plain pyrender loop, {name:11s} {rate(lambda c=color: plain_pyrender(take, c), frames):8.1f}"
-        )
-        print(f"  MuJoCo's renderer, {name:13s} {rate(lambda c=color: mujoco_loop(take, c), frames):8.1f}")
+        loops["pyrender"].append(rate(lambda c=color: plain_pyrender(take, c), frames))
+        print(f"  plain pyrender loop, {name:11s} {loops['pyrender'][-1]:8.1f}")
+        loops["mujoco"].append(rate(lambda c=color: mujoco_loop(take, c), frames))
+        print(f"  MuJoCo's renderer, {name:13s} {loops['mujoco'][-1]:8.1f}")
+    what = {"pyrender": "a plain pyrender loop", "mujoco": "MuJoCo's renderer, capsules without skin"}
+    for key, rates_of in loops.items():
+        figures[key] = (f"pictures per second, one process, {what[key]}: depth | colors", rates_of)
+    return figures
 
 
-def accuracy(frames: int) -> None:
+def accuracy(frames: int) -> Figures:
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
     take = a_take(frames)
@@ -177,6 +185,10 @@ def accuracy(frames: int) -> None:
         f"{np.quantile(errors, 0.999):.2g} mm; ids and silhouettes agree on {100 * min(agree):.3f} % of the "
         "pixels or more"
     )
+    return {
+        "median": ("drawn depth against embree, median [mm]", np.median(errors)),
+        "most": ("drawn depth against embree, 99.9 % within [mm]", np.quantile(errors, 0.999)),
+    }
 
 
 def bare_studio(take: Take) -> Studio:
@@ -184,15 +196,21 @@ def bare_studio(take: Take) -> Studio:
     return Studio(take.hands, sample_people(len(take.hands), False, tones=ALL_TONES, rng=rng))
 
 
-def memory(images: int) -> None:
-    frames = 200
+def memory(images: int) -> Figures:
+    frames, megabytes = 200, list[float]()
     print(f"\nresident memory over {images} pictures (colors, depth, ids)")
     page = os.sysconf("SC_PAGE_SIZE")
     for shard in range(images // frames):
         draw(COLORS, frames, shard)
         if shard % max(1, images // frames // 8) == 0:
             pages = int(Path("/proc/self/statm").read_text().split()[1])
-            print(f"  {(shard + 1) * frames:6d}: {pages * page / 2**20:.1f} MB", flush=True)
+            megabytes.append(pages * page / 2**20)
+            print(f"  {(shard + 1) * frames:6d}: {megabytes[-1]:.1f} MB", flush=True)
+    few = min(1, len(megabytes) - 1)
+    return {
+        "early": ("resident memory at the second look [MB]", megabytes[few]),
+        "late": ("resident memory at the last look [MB]", megabytes[-1]),
+    }
 
 
 def main() -> None:
@@ -200,12 +218,15 @@ def main() -> None:
     parser.add_argument("section", nargs="*", metavar="section", help=f"of {', '.join(SECTIONS)}")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--images", type=int, default=20000)
+    add_save(parser)
     options = parser.parse_args()
+    if options.save and len(options.section) != 1:
+        parser.error("--save keeps the figures of one section")
     print(describe())
     for name in options.section or SECTIONS:
-        {"speed": speed, "accuracy": accuracy}.get(name, memory)(
-            options.images if name == "memory" else options.frames
-        )
+        section = {"speed": speed, "accuracy": accuracy}.get(name, memory)
+        figures = section(options.images if name == "memory" else options.frames)
+        save_figures(options.save, figures)
 
 
 if __name__ == "__main__":

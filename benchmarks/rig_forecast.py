@@ -3,9 +3,9 @@
 Eight rigs, shipped, planned and bad ones, of 3 to 16 cameras. The captures have other people and motions than
 the forecast, with the forecast's well-kept optical system and with the losses fitted to each kind of capture.
 
-python benchmarks/rig_forecast.py [--frames 1500] [--folder RIGS]
+python -m benchmarks.rig_forecast [--frames 1500] [--folder RIGS]
 
-The rigs are written into the folder, for `handsim reproduce cameras --rig FILE`.
+The rigs are written into the folder, for `python -m benchmarks.paper cameras --rig FILE`.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from machine import describe
 from scipy.stats import spearmanr
 
+from benchmarks.record import describe
 from gloves.captures.gaps import run_lengths
 from gloves.layout import load_layout
-from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, look_at, named_rig, save_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig, save_rig
 from train.rig_advice.forecast import ROOM, forecast, light
-from train.rig_advice.plan import LensKind, plan
+from train.rig_advice.plan import plan
 from train.rig_advice.work import sample_work
 from train.simulation.room_settings import OpticsOptions, SimulatedKind
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import TakeConfig, record_config
 
 GLOVE = "dense19"
 CAPTURES: tuple[tuple[SimulatedKind, int], ...] = (
@@ -37,7 +38,7 @@ CAPTURES: tuple[tuple[SimulatedKind, int], ...] = (
 )
 CENTER, SIDES = np.array(ROOM_CENTER), np.full(3, 0.6)
 FRAME = np.array([2.4, 1.8, 2.2])
-LENS = LensKind(float(np.deg2rad(60.0)), 1280)
+CAMERA = named_rig("six").cameras[0]
 WELL_KEPT = OpticsOptions(
     **{
         name: getattr(ROOM.optics, name)
@@ -87,15 +88,15 @@ def rigs() -> list[CameraRig]:
     """Shipped, planned and bad rigs."""
     layout = load_layout(GLOVE)
     planned = [
-        plan(count, FRAME, ("truss",), layout, CENTER, SIDES, LENS, name=f"planned{count}").rig
+        plan(count, FRAME, ("truss",), layout, CENTER, SIDES, CAMERA, name=f"planned{count}").rig
         for count in (4, 8, 12)
     ]
-    row = [look_at(np.array([x, -1.5, 1.8]), CENTER) for x in (-0.75, -0.25, 0.25, 0.75)]
+    row = [CAMERA.at(look_at(np.array([x, -1.5, 1.8]), CENTER)) for x in (-0.75, -0.25, 0.25, 0.75)]
     return [
         *(named_rig(name) for name in list_rigs()),
         *planned,
-        CameraRig("three", named_rig("six").T_world_camera[:3], *LENS),
-        CameraRig("row", np.stack(row), *LENS),
+        CameraRig("three", named_rig("six").cameras[:3]),
+        CameraRig("row", row),
     ]
 
 
@@ -103,7 +104,7 @@ def captured(rig: Path, frames: int, optics: OpticsOptions) -> tuple[float, floa
     """What simulated captures miss: share of marker-frames [%], gaps per marker-minute, median length."""
     missing, lengths, total = 0, [], 0
     for kind, seed in CAPTURES:
-        take = simulate_take(TakeConfig(kind, frames, GLOVE, str(rig), seed, optics))
+        take = record_config(TakeConfig(kind, frames, GLOVE, str(rig), seed, optics))
         present = take.markers_present()[:, : take.hand_labels[-1].stop]
         missing += int((~present).sum())
         total += present.size

@@ -1,6 +1,6 @@
 """How fast the capture room is: people, gloves and motions, then every line of sight, then the optics.
 
-    python benchmarks/room.py [--frames 2048 --repeats 5]
+    python -m benchmarks.room [--frames 2048 --repeats 5]
 
 Two hands and an object (hand-pen, hand-controller), two hands (hand-hand), all past triangle meshes, and one
 hand alone past capsules as in training sets; whole captures on one core and in two processes side by side,
@@ -19,8 +19,8 @@ from typing import Any
 
 import numba
 import numpy as np
-from machine import describe
 
+from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.attachment import wear
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_mesh
@@ -42,7 +42,7 @@ from train.simulation.people import sample_hands
 from train.simulation.room import pack_take
 from train.simulation.room_settings import TWINS
 from train.simulation.sight import SKIN_CHUNK, SceneSight
-from train.simulation.takes import TakeConfig, sample_scene, simulate_take
+from train.simulation.takes import sample_scene, simulate_take
 
 KINDS = ("hand-pen", "hand-controller", "hand-hand")
 ALONE = "one hand alone"
@@ -243,7 +243,7 @@ def whole(kind: str, frames: int, seed: int) -> None:
     if kind == ALONE:
         one_hand(frames, seed, Stopwatch())
     else:
-        simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed))  # type: ignore[arg-type]
+        simulate_take(kind=kind, num_frames=frames, seed=seed)  # type: ignore[arg-type]
 
 
 def worker(kind: str, frames: int, seeds: list[int], barrier: Any, queue: Any) -> None:
@@ -280,18 +280,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--frames", type=int, default=2048)
     parser.add_argument("--repeats", type=int, default=5)
+    add_save(parser)
     arguments = parser.parse_args()
     frames, repeats = arguments.frames, arguments.repeats
     print(describe("mujoco", "numba", "scipy"))
     floor(256)
     print(f"\nwhole captures of {frames} frames, people and motions included, medians of {repeats}")
+    figures: Figures = {}
     for kind in (*KINDS, ALONE):
+        rates = []
         for processes in (1, 2):
             rate, busy = side_by_side(kind, processes, frames, repeats)
+            rates.append((rate, busy))
             print(
                 f"  {kind:16s} {processes} process(es): {rate:6,.0f} frames/s on the clock, {busy:5.0f} us "
                 "of processor time a frame"
             )
+        what = f"{kind}: frames/s of one process | processor time [us] | frames/s of two processes together"
+        figures[kind.split("-")[1]] = (what, [*rates[0], rates[1][0]])
+    save_figures(arguments.save, figures)
     for kind in (*KINDS, ALONE):
         watch = Stopwatch()
         for seed in range(-1, repeats):

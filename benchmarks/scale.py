@@ -1,6 +1,6 @@
 """What a million and a billion cost: processor time and bytes of each item, and how far a scheduler reaches.
 
-python benchmarks/scale.py [--core-hour 0.045] [--gigabyte-month 0.023] [--workers 4 16]
+python -m benchmarks.scale [--core-hour 0.045] [--gigabyte-month 0.023] [--workers 4 16]
 
 Items are made in this process by one thread, and processor time counts, so that other work on the machine
 matters little. Prices are dollars per core-hour and per gigabyte and month. For the scheduler's part a Dask
@@ -19,17 +19,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from machine import describe
 
-from handsim.app.executors.dask_cluster import DaskCluster
+from benchmarks.record import describe
+from handsim.app.cluster import chosen_workers
+from handsim.app.workers import run_jobs
 from render.config import RenderConfig
 from render.session import render_take
 from train.data.augmentation import Corruption, corrupt
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.simulation.held_out import held_out_markers
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 SHARD = 1.0  # [s] that a shard sleeps
 EACH = 8  # shards of each worker
@@ -64,7 +65,7 @@ def main() -> None:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         print(f"largest memory so far: {peak / 1e6:.2g} GB")
         for count in options.workers:
-            share = efficiency(count, folder)
+            share = efficiency(count)
             print(f"{count} workers: {100 * share:.0f} % of their time in shards of a second", flush=True)
 
 
@@ -79,7 +80,7 @@ def cost(make: Callable[[Path], int], out: Path) -> Cost:
 
 
 def frames(out: Path, count: int) -> int:
-    generate_dataset(DatasetConfig(num_frames=count, seed=1), out, workers=1)
+    make_dataset(DatasetConfig(num_frames=count, seed=1), out, workers=1)
     return count
 
 
@@ -87,7 +88,7 @@ def pictures(out: Path, config: RenderConfig) -> int:
     """Two hands, with colors, depth, normals, ids and keypoints."""
     take = out.parent / "take.npz"
     if not take.exists():
-        simulate_take(TakeConfig(kind="hand-hand", num_frames=PICTURES, seed=1)).save(take)
+        simulate_take(kind="hand-hand", num_frames=PICTURES, seed=1).save(take)
     return render_take(take, out, ("webdataset",), config, workers=1)
 
 
@@ -125,16 +126,16 @@ def rest(number: int) -> int:
     return number
 
 
-def efficiency(count: int, folder: Path) -> float:
+def efficiency(count: int) -> float:
     """Share of the workers' time that is spent in shards."""
     from distributed import LocalCluster
 
     options = {"n_workers": count, "threads_per_worker": 1, "processes": False, "dashboard_address": None}
     with LocalCluster(**options, protocol="tcp://", host="127.0.0.1", silence_logs="CRITICAL") as cluster:
-        executor = DaskCluster(cluster.scheduler_address, folder, tell=lambda line: None)
-        start = time.perf_counter()
-        done = sum(1 for _ in executor.run(rest, range(EACH * count)))
-        return done * SHARD / count / (time.perf_counter() - start)
+        with chosen_workers(cluster.scheduler_address, None, lambda line: None) as executor:
+            start = time.perf_counter()
+            done = sum(1 for _ in run_jobs(rest, range(EACH * count), executor))
+            return done * SHARD / count / (time.perf_counter() - start)
 
 
 if __name__ == "__main__":

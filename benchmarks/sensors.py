@@ -1,6 +1,6 @@
 """Processor time of the sensors per frame, in milliseconds on one thread.
 
-    python benchmarks/sensors.py [--width 640 --height 480 --repeats 50]
+    python -m benchmarks.sensors [--width 640 --height 480 --repeats 50]
 
 A sphere before a wall, seen through every model of render's sensors: depth noise, exposure, motion blur, and
 pictures looked up through lenses. The least of the repeats, and their median: the machine may be shared.
@@ -15,8 +15,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from machine import describe
 
+from benchmarks.record import describe
 from handsim.space.camera import Camera, pinhole
 from handsim.space.lens import Lens
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals

@@ -1,6 +1,6 @@
 """How right and how fast lines of sight past the skin are, what capsules miss, and what each rig sees.
 
-    python benchmarks/sight.py [--poses 500 --seed 0]
+    python -m benchmarks.sight [--poses 500 --seed 0]
 
 One hand with the dense19 glove, random valid poses, turns and places, hands of random people. The reference
 for every line is embree (through trimesh, package embreex) on the same meshes. Speeds are processor time of
@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from machine import describe
 
+from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
 from gloves.optics.mesh_sight import clear_of_body, clear_of_mesh
@@ -73,7 +73,7 @@ def embree_clear(scene: Scene, cameras: np.ndarray, wanted: np.ndarray) -> np.nd
     return clear
 
 
-def agreement(poses: int, rng: np.random.Generator) -> None:
+def agreement(poses: int, rng: np.random.Generator) -> Figures:
     rig, sides = named_rig("figure5"), ("right", "left")
     embree, skin, capsules, asked = [], [], [], []
     for number in range(poses // POSES_A_HAND):
@@ -105,6 +105,14 @@ def agreement(poses: int, rng: np.random.Generator) -> None:
     print(f"  markers missing, capsules -> skin: all {(~loose).mean():.2%} -> {(~both).mean():.2%}")
     for number, name in enumerate(names):
         print(f"    {name:10s} {(~loose[:, number]).mean():.2%} -> {(~both[:, number]).mean():.2%}")
+    hidden, clear = 100 * (flesh & ~seen)[facing].mean(), 100 * (seen & ~flesh)[facing].mean()
+    missing = [100 * (~loose).mean(), 100 * (~both).mean()]
+    return {
+        "lines": ("lines of sight that agree with embree", int((oracle == ours).sum())),
+        "false_clear": ("lines in view and facing that capsules see and the skin hides [%]", hidden),
+        "false_hidden": ("the reverse [%]", clear),
+        "missing": ("markers missing, capsules and skin [%]", missing),
+    }
 
 
 def rigs(poses: int, rng: np.random.Generator) -> None:
@@ -180,10 +188,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--poses", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
+    add_save(parser)
     arguments = parser.parse_args()
     print(describe("numba", "trimesh", "embreex"))
     rng = np.random.default_rng(arguments.seed)
-    agreement(arguments.poses, rng)
+    save_figures(arguments.save, agreement(arguments.poses, rng))
     rigs(4 * arguments.poses, rng)
     speeds(rng)
 

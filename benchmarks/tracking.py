@@ -1,6 +1,6 @@
 """The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
 
-    OMP_NUM_THREADS=1 python benchmarks/tracking.py [calibrated drums starts speed memory]
+    OMP_NUM_THREADS=1 python -m benchmarks.tracking [calibrated drums starts speed memory]
         [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
@@ -23,24 +23,16 @@ from __future__ import annotations
 
 import argparse
 import os
-import tempfile
 import time
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 import numpy as np
-from drum_takes import with_drum
-from machine import describe
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import write_capture
-from gloves.fit import GloveFit
-from gloves.takes.take import Take
-from handsim.cli.calibrate import calibrate
-from track.capture_tracking import warm_up
-from track.evaluation.hand_errors import hand_errors
-from track.evaluation.take_evaluation import (
+from benchmarks.drum_takes import with_drum
+from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.paper.take_evaluation import (
     TrackingReport,
     evaluate_tracker,
     measured_users,
@@ -48,14 +40,18 @@ from track.evaluation.take_evaluation import (
     seen_frame,
     true_users,
 )
-from track.evaluation.trials import FEWEST_FRAMES, initialization_times, recovery_times
+from benchmarks.paper.trials import FEWEST_FRAMES, initialization_times, recovery_times
+from benchmarks.record import Figures, add_save, describe, save_figures
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from track.capture_calibration import calibrate
+from track.setup import warm_up
 from track.tracker import Tracker
-from track.user import load_user
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 from train.simulation.calibration_take import CalibrationTakeConfig, simulate_calibration
 from train.simulation.room_settings import KINDS, SIMULATED_KINDS, SimulatedKind
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
@@ -70,7 +66,7 @@ HANDS = {
 
 @cache
 def twin(kind: SimulatedKind, frames: int | None, seed: int) -> Take:
-    return simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed)).without_body()
+    return simulate_take(kind=kind, num_frames=frames, seed=seed).without_body()
 
 
 @cache
@@ -92,6 +88,11 @@ def tell(name: str, report: TrackingReport) -> None:
     print(f"  {name:30s} {shares}   {errors}", flush=True)
 
 
+def right_of(takes: dict[str, Take]) -> str:
+    """What a list of shares is, one of each take."""
+    return f"frames all of whose labels are right [%]: {', '.join(takes)}"
+
+
 def head(title: str) -> None:
     print(f"\n{title}")
     print(
@@ -105,24 +106,20 @@ def calibrated_users(take: Take, seed: int, free: float) -> list[GloveFit]:
     people = tuple(true_users(take))
     rng = np.random.default_rng((seed, 1))
     made = simulate_calibration(people, CalibrationTakeConfig(free=free), rng=rng)
-    with tempfile.TemporaryDirectory() as folder:
-        capture, user = Path(folder) / "calibration.c3d", Path(folder) / "user.json"
-        names = tuple(f"point{number}" for number in range(made.points.shape[1]))
-        write_capture(capture, Capture(names, made.points, made.rate))
-        calibrate(capture, out=user)
-        found = {hand.side: hand for hand in load_user(user)}
-    return [found[hand.side] for hand in take.hands]
+    return list(calibrate(made).of_sides(take.sides))
 
 
-def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
     head("calibrated as users are")
+    reports = []
     for name, take in takes.items():
         for number, (users, hands) in enumerate(HANDS.items()):
             tell(f"{name if number == 0 else ''} {users}", follow(take, hands(take)))
         began = time.perf_counter()
         found = calibrated_users(take, arguments.seeds[0], arguments.free)
         took = time.perf_counter() - began
-        tell(" calibrated", follow(take, found))
+        reports.append(follow(take, found))
+        tell(" calibrated", reports[-1])
         for one, true in zip(found, true_users(take), strict=True):
             errors = hand_errors(one, true)
             print(
@@ -130,11 +127,22 @@ def calibrated(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
                 f"{100 * np.abs(errors.lengths).mean():.2f} %, tips {100 * np.abs(errors.tips).mean():.1f} %"
             )
         print(f"    calibration capture, its labels and the calibration took {took:.0f} s")
+    occlusions = [list(report.by_occlusion().values()) for report in reports]
+    errors = [
+        [1e3 * np.nanmax([one[1] for one in same]), np.rad2deg(np.nanmax([one[2] for one in same]))]
+        for same in zip(*occlusions, strict=True)
+    ]
+    missing = "mean errors of joints [mm], joint angles [deg] by markers missing: none, 1-2, 3-5, 6 or more"
+    return {
+        "right": (right_of(takes), [100 * report.right.mean() for report in reports]),
+        "errors": (f"{missing}: calibrated from a capture, the worst of the takes", errors),
+    }
 
 
-def drums(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+def drums(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
     head("twenty ghosts a frame near the hands")
     lost: dict[tuple[str, str], list[float]] = {}
+    right: dict[str, list[float]] = {}
     for name, take in takes.items():
         begins = {"ghosts": 0, "ghosts from 1 s": int(take.rate)}
         noisy = {
@@ -144,17 +152,22 @@ def drums(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
         for users, hands in HANDS.items():
             clean = follow(take, hands(take))
             tell(f"{name} {users}", clean)
+            right.setdefault(f"{users}_without", []).append(100 * clean.right.mean())
             for when, one in noisy.items():
                 report = follow(one, hands(take))
                 tell(f"  {when}", report)
+                key = f"{users}_{'ghosts' if when == 'ghosts' else 'later'}"
+                right.setdefault(key, []).append(100 * report.right.mean())
                 lost.setdefault((users, when), []).append(100 * (report.right.mean() - clean.right.mean()))
                 medians = [1e3 * run.figures()["seconds_p50"] for run in (clean, report)]
                 print(f"    {lost[users, when][-1]:+.2f} points; {medians[0]:.1f} -> {medians[1]:.1f} ms")
     for (users, when), points in lost.items():
         print(f"  {users}, {when}: {np.mean(points):+.2f} points on average over {len(points)} takes")
+    return {key: (f"hands and ghosts {key}: {right_of(takes)}", shares) for key, shares in right.items()}
 
 
-def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
+    figures: Figures = {}
     print(f"\nfrom nothing, and after a second of darkness; {len(takes)} takes")
     for users, hands in HANDS.items():
         waits: dict[str, list[np.ndarray]] = {"start": [], "recovery": []}
@@ -168,7 +181,15 @@ def starts(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
                 )
                 tell_waits(f"{name}, {users}: {what}", waits[what][-1], within)
         for what, found in waits.items():
-            tell_waits(f"all, {users}: {what}", np.concatenate(found), TRIALS[what][1])
+            waited, within = np.concatenate(found), TRIALS[what][1]
+            tell_waits(f"all, {users}: {what}", waited, within)
+            share = 100 * np.mean(waited < within)
+            words = f"{users} hands, {what}: right within {within} frames [%]; not in 120 frames, of how many"
+            figures[f"{users}_{what}"] = words, [share, [np.isnan(waited).sum(), len(waited)]]
+            if (users, what) == ("true", "start") and "hand-hand 0" in takes:
+                touching = 100 * np.mean(found[list(takes).index("hand-hand 0")] < within)
+                figures["touching"] = f"true hands of hand-hand: right within {within} frames [%]", touching
+    return figures
 
 
 def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
@@ -180,7 +201,8 @@ def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
     )
 
 
-def speed(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+def speed(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
+    rows = []
     print(
         "\ntime of a frame [ms]: p50, p90, p99; and of one in which both hands are looked for: median, worst"
     )
@@ -195,9 +217,19 @@ def speed(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
             finding.append(1e3 * (time.perf_counter() - began))
         shown = " ".join(f"{np.quantile(times, share):6.2f}" for share in (0.5, 0.9, 0.99))
         print(f"  {name:20s} {shown}   {np.median(finding):6.1f} {max(finding):6.1f}", flush=True)
+        rows.append([*np.quantile(times, [0.5, 0.99]), np.median(finding), max(finding)])
+    least, most = np.min(rows, axis=0), np.max(rows, axis=0)
+    took, of = "time of a frame with two true hands [ms]", f"least and most of {len(takes)} captures"
+    return {
+        "median": (f"median {took}, {of}", [least[0], most[0]]),
+        "p99": (f"99th percentile of the {took}, {of}", [least[1], most[1]]),
+        "initialization": (f"median {took} in which both are initialized, {of}", [least[2], most[2]]),
+        "worst": (f"longest {took} in which both are initialized", most[3]),
+    }
 
 
-def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
+def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
+    sizes = []
     name, take = next(iter(takes.items()))
     print(f"\nresident memory, {name} forwards and backwards")
     tracker, lap, right = Tracker(true_users(take), labeler()), int(take.ids.max()) + 1, 0
@@ -211,12 +243,18 @@ def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> None:
         if (number + 1) % min(EVERY, max(1, arguments.hour // 12)) == 0:
             pages = int(Path("/proc/self/statm").read_text().split()[1])
             size = 1e-6 * pages * os.sysconf("SC_PAGE_SIZE")
+            sizes.append(size)
             print(
                 f"  {(number + 1) / take.rate / 60:5.1f} min: {size:7.1f} MB, "
                 f"{100 * right / (number + 1):.2f} % right, "
                 f"{1e3 * (time.perf_counter() - began) / (number + 1):.2f} ms a frame",
                 flush=True,
             )
+    resident = "resident memory [MB] at the"
+    return {
+        "five_minutes": (f"{resident} first look, of five minutes", sizes[0]),
+        "hour": (f"{resident} last look, of an hour", sizes[-1]),
+    }
 
 
 SECTIONS = {"calibrated": calibrated, "drums": drums, "starts": starts, "speed": speed, "memory": memory}
@@ -234,8 +272,11 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=200)
     parser.add_argument("--recoveries", type=int, default=100)
     parser.add_argument("--hour", type=int, default=432000, help="frames that memory is watched for")
+    add_save(parser)
     arguments = parser.parse_args()
     unknown = set(arguments.sections) - set(SECTIONS)
+    if arguments.save and len(arguments.sections) != 1:
+        parser.error("--save keeps the figures of one section")
     if unknown:
         parser.error(f"no section {', '.join(sorted(unknown))}; there are {', '.join(SECTIONS)}")
     print(describe("numba", "scipy", "torch"))
@@ -249,7 +290,8 @@ def main() -> None:
     for section in arguments.sections or SECTIONS:
         if section == "starts" and min(take.num_frames for take in takes.values()) < FEWEST_FRAMES:
             parser.error(f"starts needs {FEWEST_FRAMES} frames of every twin")
-        SECTIONS[section](takes, arguments)
+        figures = SECTIONS[section](takes, arguments)
+        save_figures(arguments.save, figures)
 
 
 if __name__ == "__main__":

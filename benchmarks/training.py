@@ -1,6 +1,6 @@
 """How many images a second the paper's network learns from, against the floor of its multiplications.
 
-python benchmarks/training.py [--steps 6] [--threads 2]
+python -m benchmarks.training [--steps 6] [--threads 2]
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe
 
-from train.config import default_config
+from benchmarks.record import describe
+from train.config import batch_recipe, default_config
 from train.data.batches import draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric
 from train.labelers.cnn_network import DeepLabelCNN, position_loss
 from train.labelers.depth_image import depth_images
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.training_state import TrainingState
 
 # Multiplications of Table 1's layers for one image: outputs x filter, and the two linear layers.
@@ -49,18 +49,19 @@ def main() -> None:
     print(describe("torch"), f"{options.threads} threads", sep="; ")
     config = dataclasses.replace(default_config("cnn"), precision="32")
     with tempfile.TemporaryDirectory() as folder:
-        generate_dataset(DatasetConfig(num_frames=2000), Path(folder) / "set")
+        make_dataset(DatasetConfig(num_frames=2000), Path(folder) / "set")
         rows = Dataset(Path(folder) / "set").rows()
         state = TrainingState(config, start_fabric(config, Path(folder)), rows)
         rng = np.random.default_rng(0)
-        batch = draw_batch(rows, config, rng=rng)
+        recipe = batch_recipe(config, rows["markers"].shape[1])
+        batch = draw_batch(rows, recipe, rng=rng)
         points, present = batch.cloud.points, batch.cloud.present
         hand = state.network.mean_hand.get()
         views = hand.training_views(points, present, batch.markers, rng=rng)
         images, frames = depth_images(points, present, views)
         targets = torch.from_numpy(frames.normalize(batch.markers)).float()
         runs = {
-            "whole steps": lambda: state.step(draw_batch(rows, config, rng=rng), rng=rng),
+            "whole steps": lambda: state.step(draw_batch(rows, recipe, rng=rng), rng=rng),
             "network alone": lambda: learn(state.network, torch.from_numpy(images)[:, None], targets),
             "network alone, all filters dense": lambda: learn(
                 dense(state.network), torch.from_numpy(images)[:, None], targets

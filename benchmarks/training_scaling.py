@@ -1,6 +1,6 @@
 """Training in one process and in several: samples a second, loss and accuracy after equal samples, memory.
 
-python benchmarks/training_scaling.py [--samples 100000] [--seeds 3] [--devices 1 2] [--frames 40000]
+python -m benchmarks.training_scaling [--samples 100000] [--seeds 3] [--devices 1 2] [--frames 40000]
                                       [--set DIR] [-- OPTIONS OF handsim train]
 
 Each process has one thread. The memory is that of the training's processes at its largest; PSS counts a page
@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from machine import describe
 
+from benchmarks.record import describe
 from train.loop import CHECKPOINT
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 
 HANDSIM = [sys.executable, "-c", "import sys; from handsim.cli.main import main; sys.exit(main())"]
 EVERY = 1.0  # [s] between two looks at the memory
@@ -67,7 +67,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         dataset = given.set or Path(folder) / "set"
         if given.set is None:
-            generate_dataset(DatasetConfig(num_frames=given.frames), dataset)
+            make_dataset(DatasetConfig(num_frames=given.frames), dataset)
         runs: dict[int, list[Run]] = {devices: [] for devices in given.devices}
         for seed in range(given.seeds):
             for devices in given.devices:

@@ -1,6 +1,6 @@
 """How valid motions are, frame by frame: the deepest overlaps, the angles out of range, the fastest wrists.
 
-    python benchmarks/validity.py [--frames N --seeds 3 --people 5]
+    python -m benchmarks.validity [--frames N --seeds 3 --people 5]
 
 All twins of the paper's captures at full length (or N frames), and every script by people drawn at random for
 ten seconds each. Overlaps are of the capsules that stand for flesh, and of an object's parts, as MuJoCo
@@ -13,8 +13,8 @@ import argparse
 import itertools
 
 import numpy as np
-from machine import describe
 
+from benchmarks.record import add_save, describe, save_figures
 from gloves.takes.take import Take
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel
@@ -26,9 +26,17 @@ from poses.grasps.object_motion import object_penetration
 from poses.motion.scripts import script_names, scripted_motion
 from poses.shapes.couplings import HIGH, LOW
 from train.simulation.room_settings import KINDS
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 SECONDS = 10.0
+WORST = (
+    ("itself", "a hand in itself [mm]"),
+    ("hands", "hand in hand [mm]"),
+    ("object", "hand in object [mm]"),
+    ("wrist", "fastest wrist [m/s]"),
+    ("turn", "fastest wrist [rad/s]"),
+    ("joint", "fastest joint angle [rad/s]"),
+)
 
 
 def fastest(qpos: np.ndarray, rate: float) -> tuple[float, float, float]:
@@ -63,7 +71,9 @@ def overlaps(take: Take) -> tuple[float, float, float]:
     return 1e3 * own, 1e3 * between, 1e3 * thing
 
 
-def twins(frames: int | None, seeds: int) -> None:
+def twins(frames: int | None, seeds: int) -> np.ndarray:
+    """The greatest value of each figure in `WORST`."""
+    found = []
     print(
         "\ntwins: deepest overlap [mm] of a hand in itself, hand in hand, hand in object; angles out of "
         "range;"
@@ -72,7 +82,7 @@ def twins(frames: int | None, seeds: int) -> None:
         "fastest wrist [m/s], [rad/s] and hinge [rad/s]; farthest wrist from the room's middle, an axis [m]"
     )
     for kind, seed in itertools.product(KINDS, range(seeds)):
-        take = simulate_take(TakeConfig(kind=kind, num_frames=frames, seed=seed))
+        take = simulate_take(kind=kind, num_frames=frames, seed=seed)
         own, between, thing = overlaps(take)
         outside = sum(out_of_range(hand.qpos) for hand in take.moving_hands())
         speeds = np.max([fastest(hand.qpos, take.rate) for hand in take.moving_hands()], axis=0)
@@ -81,6 +91,8 @@ def twins(frames: int | None, seeds: int) -> None:
             f"  {kind:16s} seed {seed}, {take.num_frames} frames: {own:.3f}, {between:.3f}, {thing:.3f}; "
             f"{outside}; {speeds[0]:.2f}, {speeds[1]:.1f}, {speeds[2]:.1f}; {reach:.2f}"
         )
+        found.append([own, between, thing, *speeds])
+    return np.max(found, axis=0)
 
 
 def scripts(people: int) -> None:
@@ -110,9 +122,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=None)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--people", type=int, default=5)
+    add_save(parser)
     arguments = parser.parse_args()
     print(describe("mujoco", "numba", "scipy"))
-    twins(arguments.frames, arguments.seeds)
+    worst = twins(arguments.frames, arguments.seeds)
+    named = zip(WORST, worst, strict=True)
+    save_figures(arguments.save, {key: (f"twins, the worst: {what}", value) for (key, what), value in named})
     scripts(arguments.people)
 
 

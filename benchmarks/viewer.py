@@ -2,7 +2,7 @@
 
 The page here is a plain client of the socket, which takes what comes as fast as it can and draws nothing.
 
-python benchmarks/viewer.py TAKE [--seconds 10]
+python -m benchmarks.viewer TAKE [--seconds 10]
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import time
 
 import numpy as np
 import viser
-from machine import describe
 from websockets.sync.client import ClientConnection, connect
 
+from benchmarks.record import describe
 from gloves.takes.take import load_take
 from track.viewer.recordings.takes import TakeRecording
 from track.viewer.scene.frame_view import FrameView

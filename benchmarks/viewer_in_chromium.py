@@ -7,7 +7,7 @@ to connect.
 
 Needs a Chromium and the package playwright (pip install playwright); neither is a dependency of handsim.
 
-python benchmarks/viewer_in_chromium.py TAKE [--chromium /usr/bin/chromium] [--picture FILE.png]
+python -m benchmarks.viewer_in_chromium TAKE [--chromium /usr/bin/chromium] [--picture FILE.png]
 """
 
 from __future__ import annotations

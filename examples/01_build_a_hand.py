@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from handsim import HandModel, HandShape, join_qpos, sample_shape
+from handsim import HandModel, HandShape, Population, join_qpos, sample_shape
 from poses import load_gestures
 
 
@@ -18,7 +18,8 @@ def main() -> None:
     rng = np.random.default_rng(0)
     gestures = load_gestures()  # joint angles (20,) [rad] by name
     qpos = join_qpos(np.stack([gestures["spread"], gestures["fist"]]))  # (2, 27), the wrist at the origin
-    for model in (HandModel.named("S"), HandModel(sample_shape(side="left", rng=rng))):
+    child = sample_shape(Population(children=1.0), side="left", rng=rng)
+    for model in (HandModel.named("S"), HandModel(child)):
         shape: HandShape = model.shape
         print(f"{shape.side} hand, {1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm")
         bones = model.forward_kinematics(qpos)  # T_world_bone, (2, 16, 4, 4)

@@ -14,10 +14,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from train import (
+    Cloud,
     Corruption,
-    Dataset,
-    DatasetConfig,
     Labeler,
+    Labeling,
+    Report,
     corrupt,
     evaluate_labeler,
     generate_dataset,
@@ -28,15 +29,15 @@ from train import (
 def main() -> None:
     labeler: Labeler = load_labeler("dense19")
     with TemporaryDirectory() as folder:
-        generate_dataset(DatasetConfig(num_frames=1000, seed=42), Path(folder) / "set", workers=1)
-        markers = Dataset(Path(folder) / "set").rows()["markers"].astype(np.float64)  # (1000, 19, 3) [m]
-    cloud = corrupt(markers[:1], Corruption(), rng=np.random.default_rng(0))  # the first frame
+        dataset = generate_dataset(Path(folder) / "set", num_frames=1000, seed=42, workers=1)
+        markers = dataset.rows()["markers"].astype(np.float64)  # (1000, 19, 3) [m]
+    cloud: Cloud = corrupt(markers[:1], Corruption(), rng=np.random.default_rng(0))  # the first frame
     points = cloud.points[0, cloud.present[0]]  # (N, 3)
-    labeling = labeler.label_frames([points])[0]
+    labeling: Labeling = labeler.label_frames([points])[0]
     for label, confidence in zip(labeling.labels[:4], labeling.confidence[:4], strict=True):
         print("ghost" if label < 0 else labeler.marker_names[label], f"{confidence:.3f}")
     for corruption in (Corruption(occlude=0, ghosts=0), Corruption(occlude=5, ghosts=2)):
-        report = evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
+        report: Report = evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
         share = 100 * report.figures["slot_accuracy"]
         print(f"occlude {corruption.occlude}, ghosts {corruption.ghosts}: {share:.2f} % of slots right")
 

@@ -14,11 +14,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from gloves import Capture, Take, load_take, read_capture, write_capture
-from train import TakeConfig, evaluate_takes, load_labeler, simulate_take
+from train import evaluate_labeler, load_labeler, simulate_take
 
 
 def main() -> None:
-    simulated = simulate_take(TakeConfig(kind="hand-pen", num_frames=300))  # 2.5 s at 120 Hz
+    simulated = simulate_take(kind="hand-pen", num_frames=300)  # 2.5 s at 120 Hz
     with TemporaryDirectory() as folder:
         write_capture(Path(folder) / "pen.trc", simulated.capture())  # points without labels
         simulated.save(Path(folder) / "pen.truth.npz")  # labels, IDs and motion as well
@@ -30,7 +30,7 @@ def main() -> None:
     ghosts = np.isfinite(take.points[..., 0]) & (take.labels < 0)  # (300, N)
     print(f"{gaps} gaps, {100 * (1 - present.mean()):.2f} % of the markers missing")
     print(f"{ghosts.sum() / take.num_frames:.2f} ghosts per frame")
-    figures = evaluate_takes(load_labeler("dense19"), [take]).figures
+    figures = evaluate_labeler(load_labeler("dense19"), [take]).figures
     for name in ("slot_accuracy", "occlusion_recall", "ghost_recall"):
         print(f"{name.replace('_', ' ')}: {100 * figures[name]:.2f} %")
 

@@ -2,18 +2,18 @@
 
     python examples/06_track_a_capture.py
 
-The capture is tracked twice: with the true hands and gloves, and with hands of size M in gloves put on as
-designed, which is what a tracker knows of a user who has not been calibrated.
+The capture is tracked twice: with the true hands and gloves, as if their user had been calibrated, and with
+hands whose size is measured in the capture, as `handsim track` does.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from gloves import Take, load_layout, nominal_fit
+from gloves import Take
 from handsim import HandModel
-from track import Tracker, track_capture
-from train import TakeConfig, load_labeler, simulate_take
+from track import track_capture
+from train import simulate_take
 
 
 def joints(model: HandModel, qpos: np.ndarray) -> np.ndarray:
@@ -31,13 +31,10 @@ def compare(name: str, tracked: Take, truth: Take) -> None:
 
 
 def main() -> None:
-    truth = simulate_take(TakeConfig(kind="hand-controller", num_frames=240))  # 2 s at 120 Hz
+    truth = simulate_take(kind="hand-controller", num_frames=240)  # 2 s at 120 Hz
     capture = truth.capture()  # no names, many gaps, some ghosts
-    labeler = load_labeler("dense19")
-    known = list(truth.hands)
-    usual = [nominal_fit(load_layout("dense19"), "M", hand.side) for hand in truth.hands]
-    for name, hands in (("known hands", known), ("hands of size M", usual)):
-        compare(name, track_capture(capture, Tracker(hands, labeler)), truth)
+    compare("known hands", track_capture(capture, hands=truth.hands), truth)
+    compare("measured hands", track_capture(capture, glove="dense19"), truth)
 
 
 if __name__ == "__main__":

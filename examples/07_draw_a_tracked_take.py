@@ -14,11 +14,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from gloves import nominal_fit
 from handsim import Camera
 from render import RenderConfig, RenderedFrame, SkinLook, ViewConfig, draw, render_take
-from track import Tracker, track_capture
-from train import TakeConfig, load_labeler, simulate_take
+from track import track_capture
+from train import simulate_take
 
 
 def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
@@ -33,9 +32,8 @@ def compare(frame: RenderedFrame, truth: RenderedFrame) -> None:
 
 
 def main() -> None:
-    truth = simulate_take(TakeConfig(kind="hand-hand", num_frames=120))  # 1 s at 120 Hz
-    hands = [nominal_fit(hand.layout, "M", hand.side) for hand in truth.hands]  # nobody was calibrated
-    tracked = track_capture(truth.capture(), Tracker(hands, load_labeler("dense19")))
+    truth = simulate_take(kind="hand-hand", num_frames=120)  # 1 s at 120 Hz
+    tracked = track_capture(truth.capture(), glove="dense19")  # nobody was calibrated
     tone = SkinLook(lightness=45.0).typology_angle  # [deg]; people with skin about as dark as this
     config = RenderConfig(
         view=ViewConfig("orbit"), passes=("rgb", "depth"), tones=(tone - 5.0, tone + 5.0), every=40, seed=1

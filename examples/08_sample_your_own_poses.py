@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from handsim import HandModel, HandMotion, join_qpos
-from poses import PoseSampler, load_gestures, sample_motion, sample_poses, validate
+from poses import MotionConfig, PoseSampler, load_gestures, sample_motion, sample_poses, validate
 
 
 def pointing(model: HandModel, num_poses: int, *, rng: np.random.Generator) -> np.ndarray:
@@ -27,7 +27,8 @@ def main() -> None:
     for name, poses in (("drawn", drawn), ("sampled", qpos)):
         deepest = 1e3 * model.penetration(poses).max()
         print(f"{name}: {100 * validate(model, poses).mean():.0f} % valid, at most {deepest:.1f} mm deep")
-    motion: HandMotion = sample_motion(model, 2.0, rng=rng)  # between random poses
+    config = MotionConfig(rate=60.0)  # [Hz]
+    motion: HandMotion = sample_motion(model, 2.0, config, rng=rng)  # between random poses
     fastest = np.rad2deg(np.abs(motion.speeds()).max())
     print(f"{len(motion.qpos)} frames at {motion.rate:g} Hz, joints move at up to {fastest:.0f} degrees/s")
     print("valid in every frame:", validate(model, motion.qpos).all())

@@ -20,14 +20,14 @@ from collections.abc import Iterator
 import numpy as np
 
 from track import LiveMessage, StreamedFrame
-from train import TakeConfig, simulate_take
+from train import simulate_take
 
 
 class Simulated:
     """Frames as a camera system would send them: here from a simulated capture, at its own pace."""
 
     def __init__(self, frames: str = "120") -> None:  # what follows the name's "?" are strings
-        self.take = simulate_take(TakeConfig(kind="hand-controller", num_frames=int(frames)))
+        self.take = simulate_take(kind="hand-controller", num_frames=int(frames))
         self.closed = False
 
     def __iter__(self) -> Iterator[StreamedFrame]:

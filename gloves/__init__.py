@@ -13,8 +13,8 @@ from handsim._lazy import lazy_exports
 if TYPE_CHECKING:
     from gloves.captures.capture import Capture
     from gloves.captures.formats import read_capture, write_capture
-    from gloves.fit import GlovedHand, GloveFit, attach, nominal_fit
-    from gloves.layout import MarkerLayout, load_layout
+    from gloves.fit import GloveFit, attach
+    from gloves.layout import MarkerLayout, MarkerPlace, load_layout
     from gloves.takes.take import Take, load_take
 
 __getattr__, __dir__ = lazy_exports(
@@ -22,13 +22,12 @@ __getattr__, __dir__ = lazy_exports(
     {
         "Capture": "gloves.captures.capture",
         "GloveFit": "gloves.fit",
-        "GlovedHand": "gloves.fit",
         "MarkerLayout": "gloves.layout",
+        "MarkerPlace": "gloves.layout",
         "Take": "gloves.takes.take",
         "attach": "gloves.fit",
         "load_layout": "gloves.layout",
         "load_take": "gloves.takes.take",
-        "nominal_fit": "gloves.fit",
         "read_capture": "gloves.captures.formats",
         "write_capture": "gloves.captures.formats",
     },
@@ -37,14 +36,13 @@ __getattr__, __dir__ = lazy_exports(
 __all__ = [
     "Capture",
     "GloveFit",
-    "GlovedHand",
     "MarkerLayout",
+    "MarkerPlace",
     "Take",
     "__version__",
     "attach",
     "load_layout",
     "load_take",
-    "nominal_fit",
     "read_capture",
     "write_capture",
 ]

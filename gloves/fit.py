@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from gloves.attachment import Attachment, attach_markers
-from gloves.layout import MarkerLayout
+from gloves.layout import MarkerLayout, load_layout
 from gloves.optics.visibility import visible_cameras
 from handsim.errors import ArgumentError
-from handsim.hand.model import HandModel
+from handsim.hand.model import HandModel, load_model
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_QPOS, Side
 from handsim.space.cameras import CameraRig
@@ -108,23 +109,25 @@ class GlovedHand:
         return self.fit.layout
 
 
-def attach(layout: MarkerLayout, model: HandModel) -> GloveFit:
+def attach(layout: MarkerLayout | str | Path, model: HandModel | HandShape | str) -> GloveFit:
     """Put a glove on a hand as designed.
 
     Args:
-        layout: The glove's markers.
-        model: The hand.
+        layout: The glove's markers, or the name or path of a layout.
+        model: The hand, its shape, or one of the sizes XS, S, M, L, XL.
 
     Returns:
         The hand in its glove; `GloveFit.markers` gives marker centers (T, M, 3) [m] of poses.
 
     Raises:
-        LayoutError: A marker meets no skin; the message names the marker.
+        ArgumentError: An argument is none of these.
+        LayoutError: There is no such layout, or a marker meets no skin; the message names the marker.
     """
-    return GloveFit(model, attach_markers(layout, model))
+    worn_by = load_model(model)
+    return GloveFit(worn_by, attach_markers(load_layout(layout), worn_by))
 
 
-def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
+def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> GloveFit:
     """A hand of one of the five sizes, with its glove put on as designed.
 
     Args:
@@ -136,5 +139,15 @@ def nominal_fit(layout: MarkerLayout, size: str, side: Side) -> GloveFit:
         ArgumentError: There is no such size or side.
         LayoutError: A marker meets no skin, and the message names it; or the glove is for the other hand.
     """
-    layout.check_side(side)
-    return attach(layout, HandModel.named(size, side=side))
+    worn, model = load_layout(layout), HandModel.named(size, side=side)
+    worn.check_side(side)
+    return attach(worn, model)
+
+
+def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:
+    """The two markers that are nearest on the flat hand, and the distance of their centers [m]."""
+    points = fit.attachment.points
+    distances = np.linalg.norm(points[:, None] - points, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    first, second = divmod(int(distances.argmin()), len(points))
+    return fit.layout.names[first], fit.layout.names[second], float(distances[first, second])

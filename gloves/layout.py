@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
+from handsim._checks import check_type
 from handsim.errors import HandSimError, LayoutError, choices
 from handsim.files.atomic import atomic_write, read_toml
 from handsim.files.toml_values import check_keys, number_of, quoted, tables_of, text_of, written
@@ -81,6 +82,12 @@ class MarkerPlace:
     """Length of the stalk [m]: how far the center stands above its place on the skin without one."""
 
     def __post_init__(self) -> None:
+        check_type("name of a marker", self.name, str, "text")
+        check_type(f"bone of marker '{self.name}'", self.bone, str, "the name of one", BONE_NAMES)
+        for key in ("along", "around", "across", "height"):
+            check_type(
+                f"{key} of marker '{self.name}'", getattr(self, key), (int, float, np.number), "a number"
+            )
         if not self.name or self.name != self.name.strip() or not self.name.isprintable():
             raise LayoutError(
                 f"marker name {self.name!r}: expected printable characters without outer blanks"
@@ -124,6 +131,12 @@ class MarkerLayout:
     """The hands that the glove fits: both, or one."""
 
     def __post_init__(self) -> None:
+        check_type("name of a layout", self.name, str, "text")
+        check_type("markers of a layout", self.markers, (tuple, list), "MarkerPlaces")
+        for marker in self.markers:
+            check_type("marker of a layout", marker, MarkerPlace, "a MarkerPlace")
+        check_type("radius of a layout", self.radius, (int, float, np.number), "a number [m]")
+        check_type("sides of a layout", self.sides, (tuple, list), "the sides that it fits", SIDES)
         object.__setattr__(self, "markers", tuple(self.markers))
         object.__setattr__(self, "sides", tuple(self.sides))
         if not self.name or not self.name.isprintable():
@@ -188,23 +201,27 @@ def list_layouts() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 
-def load_layout(name_or_path: str | Path) -> MarkerLayout:
-    """A shipped layout by its name, or your own by the path of its `.toml` file.
+def load_layout(glove: MarkerLayout | str | Path) -> MarkerLayout:
+    """A shipped layout by its name, or your own by the path of its `.toml` file; a layout as it is.
 
     The file has the marker radius in [mm] and angles in [deg]; the layout has them in [m] and [rad].
     `handsim glove new FILE` writes a commented file to begin with.
 
     Args:
-        name_or_path: `dense19`, `sparse13`, another shipped name, or a path.
+        glove: A layout; `dense19`, `sparse13` or another shipped name; or a path.
 
     Raises:
+        ArgumentError: It is none of these.
         LayoutError: No such layout or file, or the file does not describe one; the message names the file.
     """
-    path = Path(name_or_path)
-    if str(name_or_path) in list_layouts():
-        path = _SHIPPED / f"{name_or_path}.toml"
+    if isinstance(glove, MarkerLayout):
+        return glove
+    check_type("glove", glove, (str, Path), "a MarkerLayout, or the name or path of one", list_layouts())
+    path = Path(glove)
+    if str(glove) in list_layouts():
+        path = _SHIPPED / f"{glove}.toml"
     elif path.suffix.lower() != ".toml":
-        unknown = choices(str(name_or_path), list_layouts(), noun="glove")
+        unknown = choices(str(glove), list_layouts(), noun="glove")
         raise LayoutError(f"{unknown}, or the path of a .toml file")
     table = read_toml(path, error=LayoutError)
     try:

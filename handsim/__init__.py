@@ -16,13 +16,14 @@ from handsim.errors import HandSimError
 if TYPE_CHECKING:
     from handsim.hand.model import HandModel, join_qpos
     from handsim.hand.motion import HandMotion
-    from handsim.hand.shape import HandShape, sample_shape
+    from handsim.hand.shape import HandShape, Population, sample_shape
     from handsim.space.camera import Camera
     from handsim.space.cameras import CameraRig, load_rig
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "Population": "handsim.hand.shape",
         "Camera": "handsim.space.camera",
         "CameraRig": "handsim.space.cameras",
         "HandModel": "handsim.hand.model",
@@ -41,6 +42,7 @@ __all__ = [
     "HandMotion",
     "HandShape",
     "HandSimError",
+    "Population",
     "ShadowedPackageWarning",
     "__version__",
     "join_qpos",

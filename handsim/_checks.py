@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import reprlib
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, choices
+
+Settings = TypeVar("Settings")
 
 
 def check_type(
@@ -34,6 +37,67 @@ def check_type(
     raise ArgumentError(
         f"{name} is {shown_value(value)}, expected {expected}" + (f"; valid names: {names}" if names else "")
     )
+
+
+def fill_settings(config: Any) -> None:
+    """Put settings in the place of mappings, in the fields of a frozen dataclass that are groups of settings.
+
+    Args:
+        config: The dataclass; a mapping holds what differs from the field's default.
+
+    Raises:
+        ArgumentError: A setting is unknown, or a field is no such group.
+    """
+    for one in dataclasses.fields(config):
+        if one.default_factory is dataclasses.MISSING:
+            continue
+        value, default = getattr(config, one.name), one.default_factory()
+        if not dataclasses.is_dataclass(default) or type(value) is type(default):
+            continue
+        check_type(one.name, value, Mapping, f"a {type(default).__name__} or a mapping of its settings")
+        made = make_settings(type(default), f"setting of {one.name}", value, default=default)
+        object.__setattr__(config, one.name, made)
+
+
+def make_settings(
+    kind: type[Settings], noun: str, given: Mapping[str, Any], *, default: Any = None
+) -> Settings:
+    """A dataclass of settings, some of which are given by name.
+
+    Args:
+        kind: The dataclass.
+        noun: What one of its fields is called in messages.
+        given: Fields and their values.
+        default: Where the others come from; the dataclass's own defaults when not given.
+
+    Raises:
+        ArgumentError: There is no field of some name.
+    """
+    known = [one.name for one in dataclasses.fields(kind) if one.init]  # type: ignore[arg-type]
+    for name in given:
+        if name not in known:
+            raise ArgumentError(choices(str(name), known, noun=noun))
+    made: Settings = kind(**given) if default is None else dataclasses.replace(default, **given)
+    return made
+
+
+def check_rng(rng: object) -> None:
+    """Refuse anything but a generator of numpy as the source of randomness.
+
+    Raises:
+        ArgumentError: It is something else.
+    """
+    check_type("rng", rng, np.random.Generator, "a numpy.random.Generator, such as default_rng(0)")
+
+
+def check_callable(name: str, value: object, expected: str) -> None:
+    """Refuse what cannot be called.
+
+    Raises:
+        ArgumentError: It cannot.
+    """
+    if not callable(value):
+        raise ArgumentError(f"{name} is {shown_value(value)}, expected {expected}")
 
 
 def shown_value(value: Any) -> str:

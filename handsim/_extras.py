@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import Any, Final
 
 from handsim.errors import ArgumentError
+
+EGL_PACKAGES: Final = "libegl1 libegl-mesa0 libgl1-mesa-dri libgl1 libopengl0"
+"""What drawing through OpenGL without a screen needs of Debian and Ubuntu, which pip cannot install."""
 
 
 def import_extra(module: str, what: str, extra: str) -> Any:

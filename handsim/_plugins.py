@@ -17,6 +17,7 @@ from urllib.parse import parse_qsl
 from handsim.errors import ArgumentError, HandSimError, choices
 
 _NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
+_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
 
 
 def is_plugin(name: str) -> bool:
@@ -67,6 +68,23 @@ def make_plugin(address: str, *, group: str, noun: str) -> Any:
     name, _, options = address.partition("?")
     given = dict(parse_qsl(options, keep_blank_values=True))
     return call_plugin(_find(name, group, noun), name, noun, **given)
+
+
+def plugin_name(value: Any) -> str:
+    """How a function or an object is called in records and messages: `module:name`, or its name as it is.
+
+    What has no name of its own is shown as Python shows it, without addresses in memory.
+    """
+    if isinstance(value, str):
+        return value
+    if isinstance(value, functools.partial):
+        options = "".join(f", {key}={option!r}" for key, option in value.keywords.items())
+        return f"partial({plugin_name(value.func)}{''.join(f', {one!r}' for one in value.args)}{options})"
+    if hasattr(value, "__qualname__") and hasattr(value, "__module__"):
+        return f"{value.__module__}:{value.__qualname__}"
+    shown = repr(value)
+    kind = type(value)
+    return f"{kind.__module__}:{kind.__qualname__}" if _ADDRESS.search(shown) else shown
 
 
 def _find(name: str, group: str, noun: str) -> Any:

@@ -11,6 +11,7 @@ from handsim import __version__  # the first import: it warns about a package of
 from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from poses.motion.minimum_jerk import MotionConfig
     from poses.motion.motions import sample_motion
     from poses.shapes.library import load_gestures
     from poses.shapes.sampling import PoseSampler, sample_poses
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "MotionConfig": "poses.motion.minimum_jerk",
         "PoseSampler": "poses.shapes.sampling",
         "load_gestures": "poses.shapes.library",
         "sample_motion": "poses.motion.motions",
@@ -27,4 +29,12 @@ __getattr__, __dir__ = lazy_exports(
     },
 )
 
-__all__ = ["PoseSampler", "__version__", "load_gestures", "sample_motion", "sample_poses", "validate"]
+__all__ = [
+    "MotionConfig",
+    "PoseSampler",
+    "__version__",
+    "load_gestures",
+    "sample_motion",
+    "sample_poses",
+    "validate",
+]

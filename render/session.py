@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,17 +16,16 @@ from numpy.typing import ArrayLike
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
-from handsim.app.executors.executor import Executor, executor_of
-from handsim.app.executors.output import FolderOutput, Make, Output, open_output
 from handsim.app.interrupts import Stopped
+from handsim.app.output import Make, Output, Place, open_output, place_of
+from handsim.app.workers import check_workers, run_jobs
 from handsim.errors import HandSimError, HandSimWarning, choices
-from handsim.files.atomic import remove_leftovers
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
-from handsim.files.object_folder import ObjectFolder
 from render.config import RenderConfig
 from render.drawing import Cameras, Drawing, configured
 from render.formats.annotations.common import without_colors
+from render.formats.clip_writer import TAR
 from render.formats.merging import CONFIG
 from render.formats.shards import INDEX
 from render.formats.writer import FORMATS, NEED_COLORS, open_writer
@@ -45,7 +45,7 @@ _ON_SHEET: Final = 9
 
 def render_take(
     source: Take | str | Path | PoseFile | ArrayLike,
-    out: str | Path | ObjectFolder,
+    out: str | Place,
     formats: str | Sequence[str] = ("webdataset",),
     config: RenderConfig | None = None,
     *,
@@ -63,16 +63,19 @@ def render_take(
     Args:
         source: A take or its path; or poses (T, 27), joint angles (T, 20) with the wrist at the origin, or
             poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
-        out: Folder, or a folder of an object store; each of several formats has a folder of its own in it.
+        out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
+            formats has a folder of its own in it.
         formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         times: Time of each pose (T,) [s]; poses are no motion without them.
         people: Who strikes your poses, instead of the model: a number of drawn people, or their hands.
-        person: Number of the person in each pose (T,); distributed at random when not given.
+        person: Which of the people is in each pose (T,); when not given, a number of people is distributed at
+            random, and of hands there is one, or one for each pose.
         glove: Marker layout on the hands of your poses, where they wear gloves; dense19 when not given.
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
-        workers: Processes, all cores when not given; or who else draws the shards.
+        workers: Number of processes, all cores when not given; or an executor, as Dask's
+            `Client.get_executor()`.
         progress: Called after every shard.
 
     Returns:
@@ -84,15 +87,14 @@ def render_take(
             shards are kept.
     """
     formats = (formats,) if isinstance(formats, str) else tuple(formats)
-    out = Path(out) if isinstance(out, str) else out
     config = configured(config, camera, None).settled()
     _check_formats(formats, config)
-    if isinstance(out, ObjectFolder) and _RENAMES in formats:
+    place, workers = place_of(out), workers if isinstance(workers, Executor) else check_workers(workers)
+    if not isinstance(place, Path) and _RENAMES in formats:
         raise HandSimError(
             f"{out}: {_RENAMES} renames its pictures at the end, which no object store can; render into a "
             "folder and copy it"
         )
-    executor = executor_of(workers)
     kept = source_of(
         source, model=model, times=times, people=people, person=person, glove=glove, seed=config.seed
     )
@@ -102,11 +104,11 @@ def render_take(
     drawing.check_view()
     shards, views = drawing.shards(), drawing.viewpoints.num_cameras
     make = functools.partial(_render_shard, kept, formats, config)
-    with open_output(out) as output:
+    with open_output(place) as output:
         settings = _settings(drawing) | {"formats": list(formats)}
         output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
-        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], executor, progress)
-        output.collect(INDEX, _LEFT_OUT.format("*"))
+        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], workers, progress)
+        output.fetch(INDEX, _LEFT_OUT.format("*"))
         for name in formats:
             open_writer(name, _folder(output.folder, formats, name)).finish()
         lost = frozenset(left_out_frames(output.folder))
@@ -126,22 +128,23 @@ def _draw_shards(
     formats: Sequence[str],
     make: Make,
     counts: Sequence[int],
-    executor: Executor,
+    workers: int | Executor,
     progress: Progress | None,
 ) -> None:
     """Have the shards drawn that are not there; each has a count of pictures."""
-    done, total = _finished(output, formats), sum(counts)
+    output.fetch(INDEX, names_of=[f"*{TAR}"])
+    done, total = _finished(output.folder, formats), sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
     try:
-        for drawn, number in enumerate(executor.run(output.job(make), todo)):
+        job = output.job(make, last=[INDEX, f"*{TAR}"])
+        for drawn, number in enumerate(run_jobs(job, todo, workers)):
             count += counts[number]
             if progress is not None:
                 progress(count, total)
-            if drawn == 0 and isinstance(output, FolderOutput):
+            if drawn == 0 and output.is_here:
                 _check_space(output.folder, len(done) + 1, len(todo) - 1)
     except KeyboardInterrupt as stop:
-        remove_leftovers(output.folder)  # of workers that had no time to
         drawn_so_far = f"{count} of {total} images are in {output}, and the same command goes on after them"
         raise Stopped.again(stop, drawn_so_far) from stop
 
@@ -158,10 +161,10 @@ def _settings(drawing: Drawing) -> dict[str, Any]:
     return settings if subject.poses is None else settings | {"poses": subject.poses}
 
 
-def left_out_frames(out: Path | ObjectFolder) -> list[int]:
+def left_out_frames(out: str | Place) -> list[int]:
     """Numbers of the frames that a rendering left out: a camera would be inside a hand or an object."""
     with open_output(out) as output:
-        output.collect(_LEFT_OUT.format("*"))
+        output.fetch(_LEFT_OUT.format("*"))
         files = sorted(output.folder.glob(_LEFT_OUT.format("*")))
         return sorted(frame for file in files for frame in load_json(file)["frames"])
 
@@ -186,10 +189,8 @@ def _folder(out: Path, formats: Sequence[str], name: str) -> Path:
     return out if len(formats) == 1 else out / name
 
 
-def _finished(output: Output, formats: Sequence[str]) -> frozenset[int]:
-    if not isinstance(output, FolderOutput):
-        return frozenset(output.receipts)
-    done = [open_writer(name, _folder(output.folder, formats, name)).done() for name in formats]
+def _finished(folder: Path, formats: Sequence[str]) -> frozenset[int]:
+    done = [open_writer(name, _folder(folder, formats, name)).done() for name in formats]
     return frozenset.intersection(*done)
 
 

@@ -5,6 +5,7 @@ The sentences are a golden file; HANDSIM_RENEW_GOLDEN=1 pytest tests/test_bad_in
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 from pathlib import Path
@@ -17,7 +18,7 @@ from gloves.captures.formats import write_capture
 from gloves.layout import load_layout, save_layout
 from gloves.takes.archives import write_archive
 from handsim.cli.main import main
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 GOLDEN = Path(__file__).parent / "golden" / "bad_input.json"
 MARKER = '[[marker]]\nname = "{}"\nbone = "{}"\nalong = 0.5\naround = 0.0\n'
@@ -55,9 +56,6 @@ def folder(tmp_path, monkeypatch):
         "unknown_bone.toml": layout(*FIVE, ("e", "indx_middle")),
         "twice.toml": layout(*FIVE, ("a", "index_middle")),
         "two_markers.toml": layout(*FIVE[:2]),
-        "dense91.toml": 'gloves = ["dense91"]',
-        "sample.toml": "[train]\nsample = 3",
-        "lonely.toml": "[simulate]\nnum_frames = 10",
         "one_camera.toml": rig([1.5, 0.0, 2.0]),
         "in_the_way.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.1, 0.0, 1.3]),
         "at_the_hands.toml": rig([1.5, 0.0, 2.0], [-1.5, 0.0, 2.0], [0.0, 0.65, 1.1]),
@@ -80,10 +78,11 @@ def folder(tmp_path, monkeypatch):
     }
     for name, content in files.items():
         (tmp_path / name).write_text(content)
-    write_archive(tmp_path / "tracked.npz", "tracked take", 1, {}, {})
-    write_archive(tmp_path / "newer.npz", "tracked take", 99, {}, {})
-    take = simulate_take(TakeConfig(num_frames=2))
+    write_archive(tmp_path / "older.npz", {"kind": "tracked take", "schema": 2}, {})
+    write_archive(tmp_path / "newer.npz", {"kind": "take", "schema": 99}, {})
+    take = simulate_take(num_frames=2)
     take.save(tmp_path / "good.truth.npz")
+    dataclasses.replace(take, settings={"tracker": {}}).save(tmp_path / "tracked.npz")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "broken.jpg").write_text("no picture")
     save_layout(tmp_path / "copy.toml", load_layout("dense19"))
@@ -119,27 +118,15 @@ CASES = {
     "a capture in another kind of file": ["simulate", "--out", "out.fbx"],
     "a damaged take": ["evaluate", "damaged.truth.npz", "--json", "out.json"],
     "no such take": ["evaluate", "missing.truth.npz", "--json", "out.json"],
-    "an unknown glove of a table": ["reproduce", "table3", "--glove", "dense91"],
-    "a negative seed of a table": ["reproduce", "table3", "--seed", "-1"],
     "millimeters said to be meters": ["label", "millimeters.trc", "--out", "out.trc"],
     "millimeters said to be meters, as truth": ["evaluate", "millimeters.trc", "--json", "out.json"],
     "a damaged ONNX file": ["label", "good.trc", "--labeler", "damaged.onnx", "--out", "out.trc"],
     "an export to another kind of file": ["export", "dense19", "--out", "out.pt"],
     "motion in another kind of file": ["export", "good.truth.npz", "--out", "out.fbx"],
+    "motion of a take of before": ["export", "older.npz", "--out", "out.glb"],
     "motion of a damaged take": ["export", "damaged.truth.npz", "--out", "out.glb"],
     "a size and a take": ["hand", "--size", "M", "--take", "good.truth.npz", "--out", "out.xml"],
     "an export of an unknown labeler": ["export", "dense91", "--out", "out.onnx"],
-    "an unknown labeler of a table": ["reproduce", "table4", "--labelers", "dense91"],
-    "a table of another glove's labeler": ["reproduce", "table6", "--labelers", "dense19"],
-    "an unknown glove of a tracking table": ["reproduce", "table5", "--glove", "dense91"],
-    "a tracking table without frames": ["reproduce", "table7", "--num-frames", "0", "--json", "out.json"],
-    "a labeler of another glove in a tracking table": ["reproduce", "table5", "--labeler", "sparse13"],
-    "an unknown rig of fewer cameras": ["reproduce", "cameras", "--rig", "figure6", "--json", "out.json"],
-    "a sweep that is not there": ["sweep", "none.toml", "--out", "out"],
-    "a sweep without lists": ["sweep", "two_markers.toml", "--out", "out"],
-    "a sweep of an unknown glove": ["sweep", "dense91.toml", "--out", "out"],
-    "a sweep of an unknown setting": ["sweep", "sample.toml", "--out", "out"],
-    "a sweep into a folder of something else": ["sweep", "lonely.toml", "--out", "."],
     "nothing to track": ["track", "--out", "out.npz"],
     "a capture and a stream": ["track", "good.trc", "--live", "natnet://localhost", "--out", "out.npz"],
     "a time for a capture": ["track", "good.trc", "--seconds", "3", "--out", "out.npz"],
@@ -193,10 +180,6 @@ CASES = {
     "no folder of photographs": ["render", "good.truth.npz", "--photos", "missing", "--out", "out"],
     "a folder of broken photographs": ["render", "good.truth.npz", "--photos", "photos", "--out", "out"],
     "pictures into a file": ["render", "good.truth.npz", "--out", "good.trc"],
-    "no benchmark to score": ["benchmark", "score", ".", "photos", "--json", "out.json"],
-    "no benchmark to track": ["benchmark", "run", "good.trc", "--out", "out"],
-    "a benchmark among other files": ["benchmark", "make", "--out", "."],
-    "a benchmark by nobody": ["benchmark", "make", "--workers", "0", "--out", "out"],
     "a calibration in a closed format": ["rig", "import", "lab.cal", "--out", "out.toml"],
     "a page for a calibration": ["rig", "import", "page.xml", "--out", "out.toml"],
     "a calibration with entities": ["rig", "import", "bomb.xcp", "--out", "out.toml"],
@@ -224,7 +207,6 @@ USAGE = {
     "an unknown kind of capture": ["simulate", "--kind", "hand-pn", "--out", "out.c3d"],
     "frames that are no number": ["simulate", "--num-frames", "many", "--out", "out.c3d"],
     "no output": ["simulate", "--kind", "hand-pen"],
-    "an unknown table": ["reproduce", "table9"],
     "an unknown size": ["track", "good.trc", "--size", "XXL", "--out", "out.npz"],
     "an unknown hand": ["track", "good.trc", "--hands", "middle", "--out", "out.npz"],
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.formats import read_capture, write_capture
 from gloves.takes.take import load_take
 from handsim.cli.simulate import simulate
@@ -13,9 +14,6 @@ from handsim.hand.model import HandModel
 from render import RenderConfig, draw
 from render.cameras.viewpoints import ViewConfig
 from track.capture_tracking import track_capture
-from track.evaluation.take_evaluation import true_users
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
 from train.simulation.takes import TakeConfig
 
 MOST_MILLIMETERS = 1.0
@@ -35,7 +33,7 @@ def tracked(truth):
     """Tracked from the file of points alone."""
     take, folder = truth
     capture = read_capture(folder / "take.c3d")
-    result = track_capture(capture, Tracker(true_users(take), load_labeler("dense19")))
+    result = track_capture(capture, hands=true_users(take), labeler="dense19")
     result.save(folder / "tracked.npz")
     return load_take(folder / "tracked.npz"), folder
 

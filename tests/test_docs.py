@@ -18,7 +18,6 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 SLOW = {
     "calibration",
     "formats",
-    "sweeps",
     "training_on_many_devices",
     "tracking_commands",
     "troubleshooting",

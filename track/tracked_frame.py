@@ -74,6 +74,8 @@ class TrackedFrame:
     bodies: tuple[TrackedBody, ...] = ()
     notes: tuple[str, ...] = ()
     """What was wrong with the frame itself, in words; empty for most frames."""
+    seconds: float = np.nan
+    """Computing time of the tracker [s]; NaN where it was not measured."""
 
 
 class FrameTracker(Protocol):

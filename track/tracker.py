@@ -8,8 +8,8 @@ the labeler. A frame goes one way, as a `FrameState` that every step replaces by
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, Final, NamedTuple
+from time import perf_counter
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,14 +30,11 @@ from track.association.labeler_review import LabelerReview
 from track.association.point_linking import PointHistory
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.config import TrackerConfig
+from track.given import AnyLabeler, labeler_of
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler
 
-_EVIDENCE_PER_FRAME: Final = (
-    2.0  # of a label (log-odds), less half the squared Mahalanobis distance of its point
-)
+_EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
 _MOST_EVIDENCE: Final = 12.0  # of a label (log-odds), so that a wrong one can still be lost
 _DOUBT_SHARE: Final = 0.6  # a track with a smaller share of its markers labeled is doubted
 _DOUBT_RMS: Final = 0.003  # [m], biases removed, from which on a track is doubted
@@ -57,20 +54,21 @@ class Tracker:
     """Tracks the user's hands, and bodies with markers of their own, from frame to frame.
 
     Args:
-        hands: The user's hands, each side at most once, or a `User` with such hands.
-        labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`.
+        hands: The user's hands, each side at most once, or a `User`.
+        labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`. That of
+            the glove when not given.
         bodies: Rigid bodies beside the hands.
         config: Settings.
 
     Raises:
         ArgumentError: An argument is of another type, or two hands are of one side.
-        WeightsError: There is no labeler of that name.
+        WeightsError: There is no labeler of that name, or it knows other markers.
     """
 
     def __init__(
         self,
         hands: Sequence[GloveFit],
-        labeler: Labeler | str | Path,
+        labeler: AnyLabeler = None,
         bodies: Sequence[RigidTemplate] = (),
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     ) -> None:
@@ -78,7 +76,7 @@ class Tracker:
         self.hands = _checked_hands(hands)
         self.bodies = tuple(bodies)
         self.config = config
-        named = load_labeler(labeler) if isinstance(labeler, str | Path) else labeler
+        asked = labeler_of(self.hands[0].layout, labeler)
         self._intake = Intake(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
         self._states = [HandState(hand, config) for hand in self.hands]
@@ -86,8 +84,8 @@ class Tracker:
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)
         self._digits = digit_table(self._states, self._numbering)
-        self._initializer = HandInitializer(self._states, named, config)
-        self._review = LabelerReview(named, len(self.hands), config)
+        self._initializer = HandInitializer(self._states, asked, config)
+        self._review = LabelerReview(asked, len(self.hands), config)
         self._last_sound = np.zeros(len(self.hands))  # [s] when each track was last beyond doubt
 
     def step(
@@ -107,6 +105,7 @@ class Tracker:
         Raises:
             ArgumentError: `points` and `ids` do not fit together or are no numbers, or there is no time.
         """
+        began = perf_counter()
         incoming = self._intake.check_frame(points, ids, time)
         bodies, labels = self._track_bodies(incoming)
         free = labels < 0
@@ -133,7 +132,10 @@ class Tracker:
         all_labels, all_confidence = np.full(incoming.num_points, -1), np.ones(incoming.num_points)
         all_labels[incoming.kept] = labels
         all_labels[incoming.kept[free]], all_confidence[incoming.kept[free]] = final.labels, final.confidence
-        return TrackedFrame(float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes)
+        seconds = perf_counter() - began
+        return TrackedFrame(
+            float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes, seconds
+        )
 
     def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], NDArray[np.int64]]:
         """Every body, and the labels (P,) of their points."""
@@ -279,20 +281,19 @@ class Tracker:
         return frame.with_markers(found.index, markers), (*others[0], started, *others[1])
 
 
-def _checked_hands(hands: object) -> tuple[GloveFit, ...]:
-    """Hands, or those of a user.
+def _checked_hands(hands: Sequence[GloveFit]) -> tuple[GloveFit, ...]:
+    """The hands of a sequence or a user.
 
     Raises:
-        ArgumentError: They are something else, or two are of one side.
+        ArgumentError: It is something else or empty, or two are of one side.
     """
-    given: Any = getattr(hands, "hands", hands)
-    check_type("hands", given, (list, tuple), "a user, or a sequence of hands in their gloves (GloveFit)")
-    for number, hand in enumerate(given):
-        check_type(f"hands[{number}]", hand, GloveFit, "a hand in its glove (GloveFit)")
-    sides = [hand.side for hand in given]
-    if len(set(sides)) < len(sides):
-        raise ArgumentError(f"hands are {', '.join(sides)}, expected each side at most once")
-    return tuple(given)
+    check_type("hands", hands, Sequence, "a User, or hands in their gloves (GloveFit)")
+    for hand in hands:
+        check_type("a hand", hand, GloveFit, "one in its glove (GloveFit)")
+    sides = [hand.side for hand in hands]
+    if not sides or len(set(sides)) < len(sides):
+        raise ArgumentError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
+    return tuple(hands)
 
 
 def _tracked_hand(

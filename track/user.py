@@ -1,23 +1,26 @@
-"""Files of a user: calibrated hands in their gloves, as JSON."""
+"""A user: a person's hands in their gloves, and their JSON file."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, overload
 
 import numpy as np
 
 from gloves.attachment import Attachment
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import MarkerLayout, stored_layout
-from handsim.errors import ArgumentError, FileError, HandSimError
+from handsim.errors import ArgumentError, FileError, HandSimError, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
+from handsim.hand.topology import SIDES, Side
+from track.calibration.user_calibration import Calibration
 
 SCHEMA: Final = 1
 _MOST: Final = 1 << 24  # bytes; a user of two hands has 40,000
@@ -38,47 +41,123 @@ class UserError(FileError):
     """A user's file that cannot be read or written."""
 
 
-def save_user(path: str | Path, hands: Sequence[GloveFit], notes: str = "") -> None:
-    """Write a user's hands and gloves as JSON; `load_user` gives the same numbers again.
-
-    Args:
-        path: The file, usually `user.json`.
-        hands: One hand or two, all in the same glove.
-        notes: Remarks for a reader, such as how the hands were calibrated.
+@dataclass(frozen=True, slots=True, eq=False)
+class User(Sequence[GloveFit]):
+    """A person's hands in their gloves: measured, calibrated or read from a file. It is the sequence of them.
 
     Raises:
-        ArgumentError: There is no hand, or two are of one side or wear different gloves.
-        UserError: The file cannot be written.
+        ArgumentError: There is no hand, two are of one side, or they wear different gloves.
     """
-    path = Path(path)
-    sides = [hand.side for hand in hands]
-    if not hands or len(set(sides)) < len(sides):
-        raise ArgumentError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
-    layout = hands[0].attachment.layout
-    if any(hand.attachment.layout != layout for hand in hands):
-        raise ArgumentError("the hands wear different gloves, expected one layout for all")
-    content = {
-        "schema": SCHEMA,
-        "units": "metres, radians; every hand is described as a right one, its markers as they are",
-        "notes": notes,
-        "glove": dataclasses.asdict(layout),
-        "hands": [_to_json(hand) for hand in hands],
-    }
-    try:
-        with atomic_write(path) as temporary:
-            temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+    hands: tuple[GloveFit, ...]
+    """One hand or two, all with the same markers; lengths in [m], angles in [rad]."""
+    notes: str = ""
+    """Where they are from, in words."""
+    calibrations: tuple[Calibration, ...] = ()
+    """How `calibrate` found each hand, and how well it fits frames that were held out; not in a file."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hands", tuple(self.hands))
+        sides = [hand.side for hand in self.hands]
+        if not sides or len(set(sides)) < len(sides):
+            raise ArgumentError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
+        if any(hand.layout.names != self.layout.names for hand in self.hands):
+            raise ArgumentError("the hands wear different gloves, expected the same markers on all")
+
+    @property
+    def layout(self) -> MarkerLayout:
+        """The glove, of the first hand."""
+        return self.hands[0].layout
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """Sides of the hands, in their order."""
+        return tuple(hand.side for hand in self.hands)
+
+    def __str__(self) -> str:
+        """Length and breadth of the hands [mm], one pair where both are alike."""
+        sizes = [f"{1e3 * one.shape.length:.0f} x {1e3 * one.shape.breadth:.0f} mm" for one in self.hands]
+        return " and ".join(dict.fromkeys(sizes))
+
+    @overload
+    def __getitem__(self, index: int) -> GloveFit: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[GloveFit, ...]: ...
+    def __getitem__(self, index: int | slice) -> GloveFit | tuple[GloveFit, ...]:
+        """A hand, or several."""
+        return self.hands[index]
+
+    def __len__(self) -> int:
+        """Number of hands."""
+        return len(self.hands)
+
+    def of_sides(self, sides: Sequence[Side]) -> User:
+        """The user's hands of these sides, in their order.
+
+        Raises:
+            ArgumentError: The user has no such hand.
+        """
+        known = {hand.side: hand for hand in self.hands}
+        for side in sides:
+            if side not in known:
+                raise ArgumentError(choices(side, known, noun="hand"))
+        return dataclasses.replace(self, hands=tuple(known[side] for side in sides))
+
+    def save(self, path: str | Path) -> None:
+        """Write hands and gloves as JSON; `load_user` gives the same numbers again.
+
+        Args:
+            path: The file, usually `user.json`.
+
+        Raises:
+            ArgumentError: The hands wear the same markers in gloves of different design.
+            UserError: The file cannot be written.
+        """
+        if any(hand.layout != self.layout for hand in self.hands):
+            raise ArgumentError("the hands wear different gloves, expected one layout for all")
+        content = {
+            "schema": SCHEMA,
+            "units": "metres, radians; every hand is described as a right one, its markers as they are",
+            "notes": self.notes,
+            "glove": dataclasses.asdict(self.layout),
+            "hands": [_to_json(hand) for hand in self.hands],
+        }
+        try:
+            with atomic_write(Path(path)) as temporary:
+                temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", "utf-8")
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def load_user(path: str | Path) -> tuple[GloveFit, ...]:
-    """Hands and gloves of a user, from the JSON file that `handsim calibrate` wrote.
+def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User:
+    """Hands of one of the five sizes in gloves as designed.
+
+    Raises:
+        ArgumentError: There is no such size, a side is named twice, or none is.
+        LayoutError: The glove is for the other hand.
+    """
+    check_sides(sides)
+    return User(tuple(nominal_fit(layout, size, side) for side in sides), size)
+
+
+def check_sides(sides: Sequence[str]) -> None:
+    """Refuse anything but one side, or both.
+
+    Raises:
+        ArgumentError: It is something else.
+    """
+    if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):
+        raise ArgumentError(f"hands are '{' '.join(sides)}', expected right, left, or one of each")
+
+
+def load_user(path: str | Path) -> User:
+    """Hands and gloves of a user, from the JSON file that `handsim calibrate` or `User.save` wrote.
 
     Args:
         path: The file, usually `user.json`; lengths are in [m], angles in [rad].
 
     Returns:
-        One hand or two, each in its glove.
+        The user; `hands` are one hand or two, each in its glove.
 
     Raises:
         UserError: The file does not exist, is not a user's file, has another schema, or is damaged.
@@ -94,12 +173,11 @@ def load_user(path: str | Path) -> tuple[GloveFit, ...]:
         raise UserError(f"{path}: a user's file of schema {content['schema']!r}, expected {SCHEMA}")
     try:
         layout = stored_layout(content["glove"])
-        hands = tuple(_from_json(hand, layout) for hand in content["hands"])
-        if not hands or len({hand.side for hand in hands}) < len(hands):
-            raise ValueError("no hand, or two of one side")
+        return User(
+            tuple(_from_json(hand, layout) for hand in content["hands"]), str(content.get("notes", ""))
+        )
     except _DAMAGE as error:
         raise UserError(f"{path}: a damaged user's file: {_reason(error)}") from error
-    return hands
 
 
 def _reason(error: Exception) -> str:

@@ -12,46 +12,52 @@ from handsim._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from train.config import TrainConfig
-    from train.data.augmentation import Corruption, corrupt
+    from train.data.augmentation import Cloud, Corruption, corrupt
+    from train.data.cloud_stream import CloudStream
+    from train.data.own_corruption import OwnCorruption
     from train.data.shards import Dataset
-    from train.evaluation.labeler_evaluation import evaluate_labeler, evaluate_takes
-    from train.labelers.protocol import Labeler
-    from train.labelers.storage import load_labeler
+    from train.evaluate import evaluate_labeler
+    from train.evaluation.labeler_evaluation import Report
+    from train.glove_labeler import load_labeler
+    from train.labelers.protocol import Labeler, Labeling
     from train.loop import train_labeler
-    from train.simulation.dataset_config import DatasetConfig
     from train.simulation.generation import generate_dataset
-    from train.simulation.takes import TakeConfig, simulate_take
+    from train.simulation.takes import simulate_take
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
+        "Cloud": "train.data.augmentation",
+        "OwnCorruption": "train.data.own_corruption",
+        "Report": "train.evaluation.labeler_evaluation",
+        "Labeling": "train.labelers.protocol",
+        "CloudStream": "train.data.cloud_stream",
         "Corruption": "train.data.augmentation",
         "Dataset": "train.data.shards",
-        "DatasetConfig": "train.simulation.dataset_config",
         "Labeler": "train.labelers.protocol",
-        "TakeConfig": "train.simulation.takes",
         "TrainConfig": "train.config",
         "corrupt": "train.data.augmentation",
-        "evaluate_labeler": "train.evaluation.labeler_evaluation",
-        "evaluate_takes": "train.evaluation.labeler_evaluation",
+        "evaluate_labeler": "train.evaluate",
         "generate_dataset": "train.simulation.generation",
-        "load_labeler": "train.labelers.storage",
+        "load_labeler": "train.glove_labeler",
         "simulate_take": "train.simulation.takes",
         "train_labeler": "train.loop",
     },
 )
 
 __all__ = [
+    "Cloud",
+    "CloudStream",
     "Corruption",
     "Dataset",
-    "DatasetConfig",
     "Labeler",
-    "TakeConfig",
+    "Labeling",
+    "OwnCorruption",
+    "Report",
     "TrainConfig",
     "__version__",
     "corrupt",
     "evaluate_labeler",
-    "evaluate_takes",
     "generate_dataset",
     "load_labeler",
     "simulate_take",

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
-from handsim._checks import check_number
+from handsim._checks import check_callable, check_number, check_type, fill_settings
+from handsim._plugins import plugin_name
 from handsim.errors import ArgumentError, HandSimError, choices
+from train.data.augmentation import Corruption
+from train.data.batches import BatchRecipe, paper_corruption
+from train.data.own_corruption import OwnCorruption
 
 Kind = Literal["set", "cnn"]
 """`set` is the default labeler (`train.labelers.set_network`), `cnn` the paper's
@@ -126,7 +130,7 @@ class TrainConfig:
     in the paper for its 19 and 13 markers."""
     ghosts: int = 2
     """Most ghosts added in the paper's corruption."""
-    corruption: str | None = None
+    corruption: OwnCorruption | str | None = None
     """A corruption of your own instead of the paper's: module:name, or the name of an entry point."""
     anisotropy: float = 0.06
     """Log standard deviation of the stretch of each hand along three random directions."""
@@ -142,8 +146,25 @@ class TrainConfig:
         """The settings of the network of this kind."""
         return self.cnn if self.labeler == "cnn" else self.network
 
+    def record(self) -> dict[str, Any]:
+        """The settings as JSON; a corruption by its name."""
+        name = None if self.corruption is None else plugin_name(self.corruption)
+        return dataclasses.asdict(dataclasses.replace(self, corruption=name))
+
     def __post_init__(self) -> None:
+        fill_settings(self)
+        if self.corruption is not None and not isinstance(self.corruption, str):
+            check_callable("corruption", self.corruption, "a function (markers, *, rng), or its module:name")
+        for name, valid in (
+            ("labeler", KINDS),
+            ("optimizer", ("adamw", "sgd")),
+            ("schedule", ("cosine", "steps")),
+            ("precision", ("auto", "32", "bf16")),
+        ):
+            if getattr(self, name) not in valid:
+                raise ArgumentError(choices(str(getattr(self, name)), valid, noun=name))
         for name in ("samples", "batch", "devices", "average_every"):
+            check_type(name, getattr(self, name), int, "a whole number")
             if getattr(self, name) < 1:
                 raise HandSimError(f"{name} is {getattr(self, name)}, expected at least 1")
         _check_count("seed", self.seed, 0)
@@ -158,6 +179,19 @@ class TrainConfig:
         check_number("rig_share", self.rig_share, 0.0, 1.0)
         check_number("anisotropy", self.anisotropy, 0.0, 1.0)
         check_number("knee", self.knee, 0.0, above=True)
+
+
+def batch_recipe(config: TrainConfig, num_markers: int) -> BatchRecipe:
+    """How a labeler's batches are drawn for a layout of this many markers."""
+    usual = paper_corruption(num_markers).occlude
+    occlude = usual if config.occlude is None else config.occlude
+    return BatchRecipe(
+        config.batch,
+        Corruption(occlude, config.ghosts) if config.corruption is None else config.corruption,
+        config.jitter,
+        config.rig_share,
+        config.anisotropy,
+    )
 
 
 Preset = Literal["han2018"]

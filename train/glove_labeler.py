@@ -1,50 +1,104 @@
-"""The labeler of a glove: a given one, the one that was trained on it, or the one for any layout."""
+"""One door to every labeler: of a glove, for any layout, trained by you, exported, or your own object."""
 
 from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from gloves.layout import load_layout
-from handsim.errors import HandSimWarning, WeightsError
-from train.labelers.protocol import Labeler
-from train.labelers.storage import load_labeler, shipped_labelers
+from gloves.layout import MarkerLayout, list_layouts, load_layout
+from handsim._checks import check_type
+from handsim.errors import ArgumentError, HandSimWarning, WeightsError
+from train.labelers.protocol import Labeler, OwnLabeler
+from train.labelers.storage import load_stored_labeler, shipped_labelers
 
 ANY_LAYOUT: Final = "any-layout"
 """Name of the labeler that needs no training."""
+_EXPECTED: Final = (
+    "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
+    "module:name"
+)
 
 
-def labeler_for_glove(glove: str, labeler: str | Path | None) -> Labeler:
-    """The given labeler, or the glove's shipped one; checked against the glove's markers.
+def load_labeler(
+    glove: MarkerLayout | Labeler | str | Path, labeler: Labeler | str | Path | None = None
+) -> Labeler:
+    """The labeler of a glove, or a labeler by its name, path or object.
+
+    A glove without a labeler of its own gets the one for any layout, which learns the layout within a minute.
+    Only shipped labelers, folders and the one for any layout need torch.
 
     Args:
-        glove: Marker layout: a shipped name or the path of a .toml file.
-        labeler: Anything that `load_labeler` reads, or `any-layout`. When None the shipped one of the glove
-            or, where none was trained on it, the one for any layout, with a warning.
+        glove: A marker layout, or its name or path, whose labeler is wanted. Or, where `labeler` is not
+            given, a labeler: a folder that `handsim train` wrote, an .onnx file, `module:name` of a `Labeler`
+            or of a class of them, an entry point of the group `handsim.labelers`, or a `Labeler`.
+        labeler: A labeler like these, or `any-layout`, to be used with this glove; it is checked against the
+            glove's markers.
+
+    Returns:
+        A labeler; `label_frames` gives labels (N,) and confidences (N,) of points (N, 3) [m].
 
     Raises:
+        ArgumentError: An argument is none of these, or `any-layout` is given without a glove.
         LayoutError: The glove is unknown.
         WeightsError: The labeler is unknown, damaged, or knows other markers.
-    """
-    layout = load_layout(glove)
-    if labeler is None and glove not in shipped_labelers():
-        warnings.warn(
-            f"no labeler was trained on glove '{glove}', so that the one for any layout learns it within a "
-            f"minute; a better one takes handsim generate --glove {glove} --out SET && handsim train SET "
-            "--out RUN, and --labeler RUN",
-            HandSimWarning,
-            stacklevel=2,
-        )
-        labeler = ANY_LAYOUT
-    if labeler == ANY_LAYOUT:
-        from train.any_layout.fine_tuning import fine_tuned_labeler  # torch
 
-        return fine_tuned_labeler(layout)
-    found = load_labeler(glove if labeler is None else labeler)
+    Warns:
+        HandSimWarning: No labeler was trained on the glove, so that it is the one for any layout.
+    """
+    if labeler is None:
+        return _of_layout(load_layout(glove), glove) if _is_layout(glove) else _of(glove)  # type: ignore[arg-type]
+    layout = load_layout(glove)  # type: ignore[arg-type]
+    if labeler == ANY_LAYOUT:
+        return _for_any(layout)
+    found = _of(labeler)
     if found.marker_names != layout.names:
         raise WeightsError(
-            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{glove}' has "
+            f"the labeler knows markers {', '.join(found.marker_names)}, but glove '{layout.name}' has "
             f"{', '.join(layout.names)}"
         )
     return found
+
+
+def _is_layout(glove: Any) -> bool:
+    return (
+        isinstance(glove, MarkerLayout)
+        or str(glove) in list_layouts()
+        or (isinstance(glove, str | Path) and Path(glove).suffix.lower() == ".toml")
+    )
+
+
+def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
+    """The labeler that was trained on a layout, or the one for any."""
+    for name in shipped_labelers():
+        if load_layout(name) == layout:
+            return load_stored_labeler(name)
+    shown = layout.name if isinstance(glove, MarkerLayout) else glove
+    warnings.warn(
+        f"no labeler was trained on glove '{shown}', so that the one for any layout learns it within a "
+        f"minute; a better one takes handsim generate --glove {shown} --out SET && handsim train SET "
+        "--out RUN, and --labeler RUN",
+        HandSimWarning,
+        stacklevel=3,
+    )
+    return _for_any(layout)
+
+
+def _for_any(layout: MarkerLayout) -> Labeler:
+    from train.any_layout.fine_tuning import fine_tuned_labeler  # torch
+
+    return fine_tuned_labeler(layout)
+
+
+def _of(labeler: Any) -> Labeler:
+    """A labeler by its name, path or object."""
+    if labeler == ANY_LAYOUT:
+        raise ArgumentError(
+            f"labeler '{ANY_LAYOUT}' needs a glove, expected load_labeler(GLOVE, '{ANY_LAYOUT}') with a "
+            "MarkerLayout, or the name or path of one"
+        )
+    if hasattr(labeler, "label_frames") and not isinstance(labeler, type):
+        ours = type(labeler).__module__.startswith("train.")
+        return labeler if ours else OwnLabeler(labeler)
+    check_type("labeler", labeler, (str, Path), _EXPECTED, list_layouts())
+    return load_stored_labeler(labeler)

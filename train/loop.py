@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +15,15 @@ import numpy as np
 import torch
 from lightning_fabric import Fabric
 
+from handsim._checks import check_type, make_settings
 from handsim.app.interrupts import Stopped, interrupt_flag
 from handsim.errors import ArgumentError, DatasetError, WeightsError
 from handsim.files.json_files import claim
-from train.config import Kind, TrainConfig
+from train.config import KINDS, Kind, TrainConfig, batch_recipe, default_config
 from train.data.batches import Batch, draw_batch
 from train.data.mapped_rows import MappedRows
 from train.data.own_corruption import check_corruption
-from train.data.shards import Dataset
+from train.data.shards import Dataset, load_dataset
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import check_devices, start_fabric
 from train.devices.local_processes import Progress, in_local_processes
@@ -39,15 +40,18 @@ _CURVE_FRAMES: Final[dict[Kind, int]] = {"set": 512, "cnn": 160}  # of each of t
 
 
 def train_labeler(
-    dataset: Dataset | Path,
-    config: TrainConfig,
-    out: Path,
+    dataset: Dataset | str | Path,
+    out: str | Path,
+    config: TrainConfig | None = None,
     *,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
     save_every: float = 60.0,
+    **settings: Any,
 ) -> dict[str, Any]:
     """Train a labeler and write weights, card, curves and a page to `out`; continues from a checkpoint there.
+
+    `load_labeler(out)` is the labeler.
 
     A run there may have had fewer samples. The learning rate then goes on as in a run of the new length. It
     may have had another number of devices.
@@ -57,12 +61,14 @@ def train_labeler(
 
     Args:
         dataset: The training set, or its folder.
-        config: How to train.
         out: Folder of the run.
+        config: How to train; as the shipped labelers when not given.
         threads: Threads of each process on a CPU; one or all when not given, whichever a few steps show to be
             faster, and one on several devices. Weights differ in their last bits with it.
-        progress: Called after every step.
+        progress: Called after every step with samples done, samples expected and the loss.
         save_every: Time between checkpoints [s].
+        settings: Settings of `TrainConfig` that differ from `config`: `samples=300_000`; `labeler="cnn"`
+            stands for the settings that the paper's network is trained with.
 
     Returns:
         The model card.
@@ -75,18 +81,33 @@ def train_labeler(
         PeerError: Another process of the run failed, and tells why.
         Stopped: A signal came; the last step is kept in the checkpoint.
     """
+    config, out = _chosen_config(config, settings), _folder(out)
     if config.devices == 1 or world_of().size > 1:
         return _train(dataset, config, out, threads=threads, progress=progress, save_every=save_every)
     check_threads(threads)
     check_devices(config, config.devices, config.devices)
-    checked = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+    checked = load_dataset(dataset)
     job = functools.partial(_train, checked, config, out, threads=threads, save_every=save_every)
     card: dict[str, Any] = in_local_processes(job, config.devices, progress=progress)
     return card
 
 
+def _chosen_config(config: TrainConfig | None, settings: dict[str, Any]) -> TrainConfig:
+    """The settings, with those that were given by name."""
+    if config is None:
+        labeler = settings.get("labeler", "set")
+        config = default_config(labeler) if labeler in KINDS else TrainConfig(labeler=labeler)
+    check_type("config", config, TrainConfig, "a TrainConfig")
+    return make_settings(TrainConfig, "setting of a training", settings, default=config)
+
+
+def _folder(out: str | Path) -> Path:
+    check_type("out", out, (str, Path), "the path of a folder")
+    return Path(out)
+
+
 def _train(
-    dataset: Dataset | Path,
+    dataset: Dataset | str | Path,
     config: TrainConfig,
     out: Path,
     *,
@@ -149,12 +170,12 @@ def _curves_closed(fabric: Fabric) -> Iterator[None]:
 
 
 def _prepare(
-    dataset: Dataset | Path, config: TrainConfig, out: Path, fabric: Fabric, ranks: Agreement
+    dataset: Dataset | str | Path, config: TrainConfig, out: Path, fabric: Fabric, ranks: Agreement
 ) -> _Run:
     """Open the set, claim the folder of the run and go on from its checkpoint."""
 
     def claimed() -> tuple[Dataset, TrainConfig, MappedRows, MappedRows]:
-        opened = dataset if isinstance(dataset, Dataset) else Dataset(dataset)
+        opened = load_dataset(dataset)
         whole = _for_set(config, len(opened.marker_names), fabric.world_size)
         parts = _split(opened, config.batch)
         if fabric.is_global_zero:
@@ -181,7 +202,7 @@ def _for_set(config: TrainConfig, num_labels: int, devices: int) -> TrainConfig:
 
 def _claim(out: Path, config: TrainConfig, dataset: Dataset) -> None:
     """Claim the folder of the run, or check that the run there is this one."""
-    settings: dict[str, Any] = {"train": dataclasses.asdict(config), "dataset": dataset.manifest.config}
+    settings: dict[str, Any] = {"train": config.record(), "dataset": dataset.manifest.config}
     del settings["train"]["devices"]
     if config.corruption is None:
         del settings["train"]["corruption"]
@@ -242,7 +263,8 @@ class _Run:
         """The batch of the next step, and the generator that the step goes on with."""
         # One generator per step, so that a resumed run makes the same draws; the same one on each device.
         rng = np.random.default_rng((self.state.config.seed, self.state.done, 0))
-        return draw_batch(self.rows, self.state.config, rng=rng), rng
+        recipe = batch_recipe(self.state.config, len(self.dataset.marker_names))
+        return draw_batch(self.rows, recipe, rng=rng), rng
 
     @contextmanager
     def kept(self, checkpoint: Path) -> Iterator[None]:

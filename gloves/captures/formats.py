@@ -16,6 +16,7 @@ from gloves.captures.plausibility import unit_fault, zeros_as_missing
 from gloves.captures.qtm_tsv import read_qtm_tsv
 from gloves.captures.trc import read_trc, write_trc
 from gloves.captures.vicon_csv import read_vicon_csv, vicon_sections
+from handsim._checks import check_type
 from handsim.errors import CaptureError, HandSimWarning, choices
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
@@ -39,17 +40,19 @@ READABLE: Final = tuple(_READERS)
 WRITABLE: Final = (".trc", ".c3d", ".csv")
 
 
-def read_capture(path: str | Path) -> Capture:
+def read_capture(capture: Capture | str | Path) -> Capture:
     """Read a `.trc` or `.c3d` file, a `.csv` of Motive or Vicon, or a `.tsv` of Qualisys.
 
     Args:
-        path: The file; its suffix decides the format, its content between the two kinds of `.csv`.
+        capture: The file; its suffix decides the format, its content between the two kinds of `.csv`. A
+            capture that was read before is returned as it is.
 
     Returns:
         Positions (T, N, 3) in [m], whatever the file's unit, with one trajectory per column, and the rate
         [Hz].
 
     Raises:
+        ArgumentError: It is neither.
         CaptureError: The suffix is unknown, the file is missing, cut or damaged, or its unit is unknown or
             cannot be that of its positions.
 
@@ -57,7 +60,10 @@ def read_capture(path: str | Path) -> Capture:
         HandSimWarning: Points at exactly (0, 0, 0) were taken as missing; the file states no unit or rate, or
             contradicts itself, in a way that leaves one reading.
     """
-    path = Path(path)
+    if isinstance(capture, Capture):
+        return capture
+    check_type("capture", capture, (str, Path), "a Capture or the path of a file", READABLE)
+    path = Path(capture)
     check_suffix(path, READABLE)
     data = read_bytes(path, error=CaptureError)
     if not data:
@@ -67,10 +73,10 @@ def read_capture(path: str | Path) -> Capture:
         warnings.warn(f"{path}: {text}", HandSimWarning, stacklevel=3)
 
     try:
-        capture = _READERS[path.suffix.lower()](data, tell)
+        read = _READERS[path.suffix.lower()](data, tell)
     except CaptureError as error:
         raise CaptureError(f"{path}: {error}") from error
-    return _checked(path, capture)
+    return _checked(path, read)
 
 
 def _checked(path: Path, capture: Capture) -> Capture:
@@ -103,8 +109,11 @@ def write_capture(path: str | Path, capture: Capture, *, title: str | None = Non
         title: The file name that a text states in its header; that of `path` when None.
 
     Raises:
+        ArgumentError: An argument is of another type.
         CaptureError: The suffix is unknown, a name cannot be written to the file, or writing fails.
     """
+    check_type("path", path, (str, Path), "the path of a file", WRITABLE)
+    check_type("capture", capture, Capture, "a Capture, as read_capture gives it")
     path = Path(path)
     check_suffix(path, WRITABLE)
     for name in capture.names:

@@ -1,4 +1,8 @@
-"""Blobs in the pictures of single cameras, compiled: noise, blobs that merge, and the rays through them."""
+"""Blobs in the pictures of single cameras, compiled: noise, blobs that merge, and the rays through them.
+
+Blobs are kept in undistorted pixels from the principal point, of each camera's focal lengths; their noise is
+one of real pixels, taken through the lens.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +11,18 @@ from typing import Any, Final
 import numpy as np
 
 from handsim.kernels.kernel import kernel
+from handsim.space.lens import PINHOLE, distort_jacobian
 
 MARKER_RADIUS: Final = 0.0032
 """Radius of the spheres of Han et al. 2018 (section 3) [m]: of markers on objects, and of strays."""
 
 
+_BLIND: Final = 1e-6  # determinant of a lens's Jacobian below which it makes no blob
+
+
 @kernel
 def draw_blobs(
-    sources: Any, sizes: Any, seen: Any, T_world_camera: Any, camera: Any, rng: Any, centers: Any, radii: Any
+    sources: Any, sizes: Any, seen: Any, cameras: Any, optics: Any, rng: Any, centers: Any, radii: Any
 ) -> None:
     """Write noisy blob centers and radii of one frame; radius 0 where there is no blob.
 
@@ -25,16 +33,17 @@ def draw_blobs(
         sources: Positions of everything that shines (S, 3) [m]; NaN where there is none.
         sizes: Radius of each (S,) [m].
         seen: Which cameras have a free view of each (S, C).
-        T_world_camera: Camera poses (C, 4, 4).
-        camera: Focal length [px], noise of a source of `MARKER_RADIUS` [px], chance to lose a blob,
-            roundness.
+        cameras: `CameraArrays` of C cameras.
+        optics: Noise of a source of `MARKER_RADIUS` [px], chance to lose a blob, roundness.
         rng: Source of all randomness; the draws go by camera, then source.
         centers: Where the centers go (C, S, 2) [px].
         radii: Where the radii go (C, S) [px].
     """
-    focal, loss = camera[0], camera[2]
-    for c in range(len(T_world_camera)):
-        pose = T_world_camera[c]
+    loss = optics[1]
+    for c in range(len(cameras.lenses)):
+        pose, lens = cameras.T_world_camera[c], cameras.lenses[c]
+        fx, fy = cameras.intrinsics[c, 0], cameras.intrinsics[c, 1]
+        focal = np.sqrt(fx * fy)
         for s in range(len(sources)):
             radii[c, s] = 0.0
             if not seen[s, c] or np.isnan(sources[s, 0]) or (loss > 0.0 and rng.random() < loss):
@@ -45,31 +54,42 @@ def draw_blobs(
                 continue
             right = pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z
             down = pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z
+            noise = optics[0] * np.sqrt(MARKER_RADIUS / sizes[s])
+            du, dv = noise * rng.standard_normal(), noise * rng.standard_normal()
+            if lens[0] != PINHOLE:
+                xx, xy, yx, yy = distort_jacobian(lens, right, down, depth)
+                determinant = xx * yy - xy * yx
+                if not determinant > _BLIND:  # also where the lens does not see: NaN
+                    continue
+                across, along = du / fx, dv / fy
+                du, dv = (
+                    fx * (yy * across - xy * along) / determinant,
+                    fy * (xx * along - yx * across) / determinant,
+                )
             radii[c, s] = focal * sizes[s] / depth
-            noise = camera[1] * np.sqrt(MARKER_RADIUS / sizes[s])
-            centers[c, s, 0] = focal * right / depth + noise * rng.standard_normal()
-            centers[c, s, 1] = focal * down / depth + noise * rng.standard_normal()
+            centers[c, s, 0] = fx * right / depth + du
+            centers[c, s, 1] = fy * down / depth + dv
 
 
 @kernel
 def cast_rays(
-    seen: Any, T_world_camera: Any, camera: Any, centers: Any, radii: Any, directions: Any, usable: Any
+    seen: Any, cameras: Any, optics: Any, centers: Any, radii: Any, directions: Any, usable: Any
 ) -> None:
     """Write the unit rays of every source's blob in every camera, after blobs that touch have merged.
 
     Args:
         seen: Which cameras have a free view of each source (S, C).
-        T_world_camera: Camera poses (C, 4, 4).
-        camera: As for `draw_blobs`.
+        cameras: As for `draw_blobs`.
+        optics: As for `draw_blobs`.
         centers: Blob centers (C, S, 2) [px].
         radii: Blob radii (C, S) [px]; 0 where there is none.
         directions: Where the rays go (S, C, 3), in the world.
         usable: Output (S, C), whether a camera has a ray to a source.
     """
-    focal, roundness = camera[0], camera[3]
+    roundness = optics[2]
     count = seen.shape[0]
-    for c in range(len(T_world_camera)):
-        pose = T_world_camera[c]
+    for c in range(len(cameras.lenses)):
+        pose, inner = cameras.T_world_camera[c], cameras.intrinsics[c]
         for s in range(count):
             usable[s, c] = radii[c, s] > 0.0
             if not usable[s, c]:
@@ -87,7 +107,7 @@ def cast_rays(
                     usable[s, c] = False
                     break
                 u, v, members = u + centers[c, o, 0], v + centers[c, o, 1], members + 1
-            u, v = u / (members * focal), v / (members * focal)
+            u, v = u / (members * inner[0]), v / (members * inner[1])
             length = np.sqrt(u * u + v * v + 1.0)
             for i in range(3):
                 directions[s, c, i] = (pose[i, 0] * u + pose[i, 1] * v + pose[i, 2]) / length

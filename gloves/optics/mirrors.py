@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
+from handsim.space.camera import in_picture
 from handsim.space.cameras import CameraRig
 
 
@@ -49,15 +50,14 @@ def cameras_by_mirror(
         radii: Their radii [m].
     """
     seen = np.zeros((*images.shape[:2], len(rig.positions)), dtype=np.bool_)
-    view = np.cos(rig.field_of_view / 2)
-    _over_patch(images, plane_point, plane_normal, radius, rig.T_world_camera, view, segments, radii, seen)
+    _over_patch(images, plane_point, plane_normal, radius, rig.arrays, segments, radii, seen)
     return seen
 
 
 @kernel
 def _over_patch(
-    images: Any, plane_point: Any, plane_normal: Any, radius: float, T_world_camera: Any, view: float,
-    segments: Any, radii: Any, seen: Any,
+    images: Any, plane_point: Any, plane_normal: Any, radius: float, cameras: Any, segments: Any,
+    radii: Any, seen: Any,
 ) -> None:  # fmt: skip
     """Write which cameras see which mirror image into `seen` (T, P, C); see `cameras_by_mirror`.
 
@@ -66,13 +66,12 @@ def _over_patch(
         plane_point: Middle of the patch (T, 3) [m].
         plane_normal: Unit normal of its shiny side (T, 3).
         radius: Radius of the patch [m].
-        T_world_camera: Camera poses (C, 4, 4).
-        view: Cosine of half the field of view.
+        cameras: `CameraArrays` of C cameras.
         segments: Axes of the blocking capsules (T, K, 2, 3) [m].
         radii: Their radii (K,) [m].
         seen: Where the result goes (T, P, C), False before.
     """
-    hit, marker, camera = np.empty(3), np.empty(3), np.empty(3)
+    hit, marker, camera, local = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for t in range(len(images)):
         point, normal = plane_point[t], plane_normal[t]
         for p in range(images.shape[1]):
@@ -83,15 +82,19 @@ def _over_patch(
                 continue
             for i in range(3):
                 marker[i] = images[t, p, i] + 2.0 * behind * normal[i]
-            for c in range(len(T_world_camera)):
-                ahead, off, deep, far = 0.0, 0.0, 0.0, 0.0
+            for c in range(len(cameras.sizes)):
+                pose = cameras.T_world_camera[c]
+                ahead, off = 0.0, 0.0
+                local[:] = 0.0
                 for i in range(3):
-                    camera[i] = T_world_camera[c, i, 3]
+                    camera[i] = pose[i, 3]
                     line = images[t, p, i] - camera[i]
                     ahead -= line * normal[i]
-                    deep += line * T_world_camera[c, i, 2]
-                    far += line * line
-                if ahead <= behind or deep < view * np.sqrt(far):
+                    for k in range(3):
+                        local[k] += line * pose[i, k]
+                if ahead <= behind or not in_picture(
+                    cameras.intrinsics[c], cameras.sizes[c], cameras.lenses[c], local[0], local[1], local[2]
+                ):
                     continue
                 for i in range(3):
                     hit[i] = images[t, p, i] + behind / ahead * (camera[i] - images[t, p, i])

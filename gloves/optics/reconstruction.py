@@ -32,8 +32,8 @@ class OpticsConfig:
     """
 
     noise: float = 0.12
-    """Standard deviation of a blob's center per axis [px], for a sphere of 3.2 mm radius; it falls with the
-    root of the radius."""
+    """Standard deviation of a blob's center per axis in the camera's own pixels [px], for a sphere of 3.2 mm
+    radius; it falls with the root of the radius."""
     partial: float = 0.5
     """Each line of sight goes to a random point of the marker within this share of its radius, so markers
     behind an edge flicker."""
@@ -135,8 +135,8 @@ def reconstruct(
         np.ascontiguousarray(sources, dtype=np.float64),
         np.broadcast_to(np.asarray(radii, dtype=np.float64), count).copy(),
         np.ascontiguousarray(seen & ~lost[:, None]),
-        np.ascontiguousarray(rig.T_world_camera),
-        (rig.focal_length, config.noise, config.blob_loss, config.roundness),
+        rig.arrays,
+        (config.noise, config.blob_loss, config.roundness),
         (config.max_residual, np.sin(np.deg2rad(config.min_angle)), config.min_distance),
         (config.min_rays, config.min_rays_to_start if continuous else config.min_rays),
         rng,

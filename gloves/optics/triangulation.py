@@ -15,7 +15,7 @@ _FALSE_STEP = 0.015  # [m] a false point that moved no farther since the last fr
 
 @kernel
 def reconstruct_frames(
-    sources: Any, sizes: Any, seen: Any, T_world_camera: Any, camera: Any, gates: Any, min_rays: Any,
+    sources: Any, sizes: Any, seen: Any, cameras: Any, optics: Any, gates: Any, min_rays: Any,
     rng: Any, positions: Any, rays: Any, false_points: Any,
 ) -> None:  # fmt: skip
     """Write the points of every frame; see `reconstruct`.
@@ -24,8 +24,8 @@ def reconstruct_frames(
         sources: True positions (T, S, 3) [m]; NaN where there is none.
         sizes: Radius of each source (S,) [m].
         seen: Which cameras have a free view of each (T, S, C).
-        T_world_camera: Camera poses (C, 4, 4).
-        camera: As for `gloves.optics.blobs.draw_blobs`.
+        cameras: `CameraArrays` of C cameras.
+        optics: As for `gloves.optics.blobs.draw_blobs`.
         gates: Largest residual of a ray [m], sine of the smallest angle, smallest distance of two points [m].
         min_rays: Rays that must meet for a point to go on, and to begin.
         rng: Source of all randomness.
@@ -33,13 +33,14 @@ def reconstruct_frames(
         rays: Where the number of their rays goes (T, S).
         false_points: Where false intersections go (T, F, 3) [m]; NaN before.
     """
-    count, cameras = seen.shape[1:]
-    centers, radii = np.empty((cameras, count, 2)), np.empty((cameras, count))
-    directions = np.empty((count, cameras, 3))
-    usable = np.empty((count, cameras), dtype=np.bool_)
+    count, num_cameras = seen.shape[1:]
+    T_world_camera = cameras.T_world_camera
+    centers, radii = np.empty((num_cameras, count, 2)), np.empty((num_cameras, count))
+    directions = np.empty((count, num_cameras, 3))
+    usable = np.empty((count, num_cameras), dtype=np.bool_)
     for t in range(len(sources)):
-        draw_blobs(sources[t], sizes, seen[t], T_world_camera, camera, rng, centers, radii)
-        cast_rays(seen[t], T_world_camera, camera, centers, radii, directions, usable)
+        draw_blobs(sources[t], sizes, seen[t], cameras, optics, rng, centers, radii)
+        cast_rays(seen[t], cameras, optics, centers, radii, directions, usable)
         for s in np.argsort(-usable.sum(axis=1), kind="mergesort"):
             enough = min_rays[0] if t > 0 and rays[t - 1, s] > 0 else min_rays[1]
             rays[t, s] = _meet(directions[s], usable[s], T_world_camera, gates, enough, positions[t, s])

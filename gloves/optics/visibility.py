@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from handsim.hand.capsules import bounding_spheres
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
+from handsim.space.camera import in_picture
 from handsim.space.cameras import CameraRig
 
 MAX_FACING: Final = np.deg2rad(85.0)
@@ -73,8 +74,8 @@ def facing_cameras(
     seen: NDArray[np.bool_] = _facing(
         np.ascontiguousarray(markers, dtype=np.float64),
         np.ascontiguousarray(normals, dtype=np.float64),
-        np.ascontiguousarray(rig.T_world_camera),
-        (np.cos(rig.field_of_view / 2), np.cos(MAX_FACING)),
+        rig.arrays,
+        np.cos(MAX_FACING),
     )
     return seen
 
@@ -93,27 +94,32 @@ def unpack_cameras(packed: NDArray[np.uint32], num_cameras: int) -> Bool[np.ndar
 
 
 @kernel
-def _facing(markers: Any, normals: Any, T_world_camera: Any, cosines: tuple[float, float]) -> Any:
+def _facing(markers: Any, normals: Any, cameras: Any, facing: float) -> Any:
     """Which cameras (T, M, C) have a marker in view and on its outward side; see `facing_cameras`.
 
     Args:
         markers: Marker centers (T, M, 3) [m]; what is NaN is in no view.
         normals: Outward unit directions (T, M, 3).
-        T_world_camera: Camera poses (C, 4, 4).
-        cosines: Of half the field of view, and of the largest angle of facing.
+        cameras: `CameraArrays` of C cameras.
+        facing: Cosine of the largest angle of facing.
     """
     frames, count = markers.shape[:2]
-    seen = np.empty((frames, count, len(T_world_camera)), dtype=np.bool_)
-    for t in range(frames):
-        for m in range(count):
-            marker, normal = markers[t, m], normals[t, m]
-            for c in range(len(T_world_camera)):
-                pose = T_world_camera[c]
+    seen = np.empty((frames, count, len(cameras.sizes)), dtype=np.bool_)
+    for c in range(len(cameras.sizes)):
+        pose, inner = cameras.T_world_camera[c], cameras.intrinsics[c]
+        size, lens = cameras.sizes[c], cameras.lenses[c]
+        for t in range(frames):
+            for m in range(count):
+                marker, normal = markers[t, m], normals[t, m]
                 x, y, z = marker[0] - pose[0, 3], marker[1] - pose[1, 3], marker[2] - pose[2, 3]
                 distance = np.sqrt(x * x + y * y + z * z)
-                depth = x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2]
                 ahead = -(x * normal[0] + y * normal[1] + z * normal[2])
-                seen[t, m, c] = depth >= cosines[0] * distance and ahead > cosines[1] * distance
+                seen[t, m, c] = (ahead > facing * distance) & in_picture(
+                    inner, size, lens,
+                    x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0],
+                    x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1],
+                    x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2],
+                )  # fmt: skip
     return seen
 
 

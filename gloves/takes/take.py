@@ -32,6 +32,7 @@ from gloves.takes.columns import (
     stacked_frames,
 )
 from gloves.takes.formats import motion_format
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, choices
 from handsim.hand.keypoints import KEYPOINT_NAMES, NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
@@ -276,6 +277,11 @@ class Take:
         return len(self.times)
 
     @property
+    def is_tracked(self) -> bool:
+        """Whether a tracker made it, whose labels may be wrong; its settings are among those of the take."""
+        return "tracker" in self.settings
+
+    @property
     def sides(self) -> tuple[Side, ...]:
         """Sides of the hands, in their order."""
         return tuple(hand.side for hand in self.hands)
@@ -518,8 +524,10 @@ def load_take(path: str | Path) -> Take:
         path: The file.
 
     Raises:
+        ArgumentError: It is no path.
         CaptureError: No such file, of another kind or schema, or damaged.
     """
+    check_type("path", path, (str, Path), "the path of a take")
     return read_archive(path, unpack_take)
 
 

@@ -1,17 +1,10 @@
-"""The application around the commands.
+"""What commands share: what they say, how they end, and who does their work.
 
-- command_table: the table of commands, each loaded when it is called
-- cli: the command `handsim`, its errors and exit codes
-- completion: a script that completes commands and options in a shell
-- presets: commands whose defaults come from a preset
-- demo: what the steps of `handsim demo` share
-- memory: refuses work that the machine has no memory for
-- messages: lines as they are, and warnings as lines
+- messages: lines as they are, warnings as lines, and a line of status that is renewed in place
 - progress: the progress bar of all commands, and lines in its place in a log
-- live_status: one line of status, renewed in place
 - interrupts: signals to end, as a flag that a loop reads or as an exception
-- workers: numbered jobs in worker processes, which end with their parent
-- executors: who does numbered jobs, those processes or a cluster
-- system_packages: names of system packages that pip cannot install
+- workers: numbered jobs in processes of this machine, or on another executor
+- cluster: the workers of a Dask scheduler as an executor
+- output: where jobs leave their files, a folder or an object store
 - page: one HTML page of pictures and figures
 """

@@ -1,32 +1,28 @@
-"""Numbered jobs, done in worker processes that end with the process that started them.
-
-Not multiprocessing's pools: their queues need named semaphores, which outlive a process that is killed and
-which a machine without /dev/shm does not have. Here each worker has one pipe.
-"""
+"""Numbered jobs on workers: processes of this machine, or any other `concurrent.futures.Executor`."""
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
 import pickle
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
-from types import FrameType
-from typing import Final, cast
+from itertools import islice
+from multiprocessing.connection import Connection
+from types import TracebackType
+from typing import Any, Final
 
 from handsim.errors import ArgumentError, DatasetError, HandSimError
 
 Job = Callable[[int], int]
-"""Takes a number and returns it."""
+"""Takes a number, leaves files that depend on nothing else, and returns the number; it can be pickled."""
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-_PR_SET_PDEATHSIG: Final = 1
-_PATIENCE: Final = 1.0  # [s] until a worker that was asked to end is killed
+_IN_FLIGHT: Final = 1000  # jobs that an executor knows of: enough for hundreds of workers, few in memory
+_AGAIN: Final = "run the same command again to go on"
 
 
 def usable_cores() -> int:
@@ -38,120 +34,109 @@ def check_workers(workers: int | None) -> int:
     """A number of processes: the given one, or one a core.
 
     Raises:
-        ArgumentError: It is less than 1.
+        ArgumentError: It is no number, or less than 1.
     """
-    if workers is not None and workers < 1:
-        raise ArgumentError(f"workers is {workers}, expected at least 1")
+    if workers is not None and (not isinstance(workers, int) or workers < 1):
+        raise ArgumentError(f"workers is {workers!r}, expected at least 1")
     return usable_cores() if workers is None else workers
 
 
-def in_processes(job: Job, todo: Sequence[int], workers: int, *, first_alone: bool = True) -> Iterator[int]:
-    """Do jobs and yield the number of each when it is done.
-
-    Workers have one thread each; they end when this process does, however it ends.
+def run_jobs(job: Job, todo: Sequence[int], workers: int | Executor | None) -> Iterator[int]:
+    """Do jobs, each in any process and in any order, and yield the number of each when it is done.
 
     Args:
-        job: Takes a number and returns it; workers are spawned and unpickle it.
+        job: Takes a number and returns it.
         todo: The numbers of the jobs.
-        workers: Number of processes; with one, all jobs are done in this process.
-        first_alone: Whether the first is done in this process, before the others. This fills numba's cache
-            before workers need it, and a mistake common to all jobs shows at once.
+        workers: Number of processes, all cores when not given; or an executor. With a number the first job is
+            done in this process, before the others: this fills numba's cache before workers need it, and a
+            mistake common to all jobs shows at once.
 
     Raises:
+        Exception: What a job raised.
         DatasetError: A worker died.
     """
-    if todo and (first_alone or workers == 1):
-        yield job(todo[0])
-        todo = todo[1:]
-    if workers == 1 or len(todo) == 1:
-        yield from (job(number) for number in todo)
+    if isinstance(workers, Executor):
+        yield from _share_out(job, todo, workers)
         return
-    if not todo:
-        return
-    pool: dict[Connection, SpawnProcess] = {}
-    try:
-        for _ in range(min(workers, len(todo))):
-            channel, process = spawn(_work, job)
-            pool[channel] = process
-        yield from _share_out(todo, list(pool))
-    finally:
-        end_processes(pool)
+    count = check_workers(workers)
+    here = len(todo) if count == 1 or len(todo) == 2 else 1
+    for number in todo[:here]:
+        yield job(number)
+    if todo[here:]:
+        with LocalProcesses(min(count, len(todo) - here)) as processes:
+            yield from _share_out(job, todo[here:], processes)
 
 
-def _share_out(todo: Sequence[int], channels: list[Connection]) -> Iterator[int]:
-    """Give each worker a job whenever it has none, and yield the numbers that come back."""
+def _share_out(job: Job, todo: Sequence[int], executor: Executor) -> Iterator[int]:
+    """Keep an executor supplied with jobs, and yield the numbers of those that are done."""
     waiting = iter(todo)
-    busy = set()
-    for channel, number in zip(channels, waiting, strict=False):
-        _send(channel, number)
-        busy.add(channel)
-    while busy:
-        for ready in cast("list[Connection]", wait(list(busy))):
-            done = _receive(ready)
-            number_or_none = next(waiting, None)
-            if number_or_none is None:
-                busy.discard(ready)
-            else:
-                _send(ready, number_or_none)
-            yield done
-
-
-def _send(channel: Connection, number: int) -> None:
+    pending: set[Future[int]] = set()
     try:
-        channel.send(number)
-    except OSError as error:
-        raise _death() from error
+        while True:
+            more = islice(waiting, _IN_FLIGHT - len(pending))
+            pending.update([executor.submit(_do, job, number) for number in more])
+            if not pending:
+                return
+            done, pending = wait(pending, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+    except BrokenProcessPool as error:
+        raise DatasetError(f"a worker died (out of memory?); {_AGAIN}") from error
+    except CancelledError as error:
+        raise HandSimError(f"the workers are gone; {_AGAIN}") from error
+    finally:
+        for future in pending:
+            future.cancel()
 
 
-def _receive(channel: Connection) -> int:
-    """The number of a finished job.
-
-    Raises:
-        Exception: What the job raised.
-        DatasetError: The worker died.
-    """
+def _do(job: Job, number: int) -> int:
+    """Do a job in a worker; its error comes back as it is, or in words where it cannot be pickled."""
     try:
-        answer = channel.recv()
-    except (EOFError, OSError) as error:
-        raise _death() from error
-    if isinstance(answer, BaseException):
-        raise answer
-    return int(answer)
+        return job(number)
+    except Exception as error:
+        raise portable(error) from None
 
 
-def _death() -> DatasetError:
-    return DatasetError("a worker died (out of memory?); run the same command again to go on")
+class LocalProcesses(ProcessPoolExecutor):
+    """Processes of this machine, spawned when they are needed, with one thread each unless the user chose.
 
+    They end with the block; at once if it raises, or if this process ends, however that ends. They do not
+    hear Ctrl-C and hang-ups.
 
-def spawn(live: Callable[..., None], *args: object) -> tuple[Connection, SpawnProcess]:
-    """A process that calls `live(*args, channel)`, and this end of its pipe.
-
-    It ends when this process does, however that ends, has one thread unless the user chose otherwise, and
-    does not hear Ctrl-C or hang-ups.
+    Args:
+        workers: Number of processes.
     """
-    context = multiprocessing.get_context("spawn")
-    channel, theirs = context.Pipe()
-    process = context.Process(target=_bound, args=(os.getpid(), live, *args, theirs), daemon=True)
-    with _one_thread(), without_signals():
-        process.start()
-    theirs.close()
-    return channel, process
+
+    def __init__(self, workers: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        theirs, self._ours = context.Pipe(duplex=False)
+        super().__init__(workers, mp_context=context, initializer=_end_with, initargs=(theirs,))
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Have a process call `fn(*args, **kwargs)`."""
+        with _one_thread(), without_signals():  # this starts a process if none waits for work
+            return super().submit(fn, *args, **kwargs)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self._ours.close()
+        self.shutdown(wait=True, cancel_futures=kind is not None)
+        self._ours.close()
 
 
-def _bound(parent: int, live: Callable[..., None], *args: object) -> None:
-    _end_with(parent)
-    live(*args)
+def _end_with(channel: Connection) -> None:
+    """Have this process end when the other end of a pipe is closed, as it is when its process ends."""
 
+    def watch() -> None:
+        try:
+            channel.poll(None)
+        except OSError:  # on Windows
+            pass
+        os._exit(1)
 
-def end_processes(pool: dict[Connection, SpawnProcess]) -> None:
-    """End processes, whatever they do, and wait until they are gone."""
-    for channel, process in pool.items():
-        channel.close()
-        process.terminate()
-    for process in pool.values():
-        process.join(_PATIENCE)
-        process.kill()
-        process.join()
+    threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager
@@ -179,54 +164,8 @@ def without_signals() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _work(job: Job, channel: Connection) -> None:
-    """The life of a worker: do one job after the other until the pipe closes."""
-    signal.signal(signal.SIGTERM, _leave)  # so that a half-written file is removed
-    try:
-        _do_jobs(job, channel)
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what Python calls at its end would print the exit
-
-
-def _do_jobs(job: Job, channel: Connection) -> None:
-    while True:
-        try:
-            number = channel.recv()
-        except (EOFError, OSError):
-            return
-        try:
-            answer: int | Exception = job(number)
-        except Exception as error:
-            answer = portable(error)
-        try:
-            channel.send(answer)
-        except OSError:
-            return
-
-
-def _leave(_number: int, _frame: FrameType | None) -> None:
-    raise SystemExit(1)
-
-
-def _end_with(parent: int) -> None:
-    """Have this process killed when its parent ends, however that ends."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it ended before
-            os._exit(1)
-        return
-
-    def watch() -> None:
-        process = multiprocessing.parent_process()
-        if process is not None:
-            process.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def portable(error: Exception) -> Exception:
-    """The same error, or its words where it does not survive the pipe."""
+    """The same error, or its words where it does not survive pickling."""
     try:
         same = pickle.loads(pickle.dumps(error))
     except Exception:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final
 
-# "module:function", or "module:TABLE" for a dict of functions: sub-commands; tables of several modules are
-# joined by "+". Strings, so that nothing heavy loads for --help and no package names one above in an import.
+# "module:function", or "module:TABLE" for a dict of functions: sub-commands. Strings, so that nothing heavy
+# loads for --help and no package names one above in an import.
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "demo": (
         "handsim.cli.demo:demo",
@@ -14,11 +14,11 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     ),
     "hand": ("handsim.cli.hand:hand", "Write a hand as a MuJoCo model, a URDF or a rigged mesh."),
     "glove": (
-        "handsim.cli.glove:GLOVE+handsim.cli.glove_advice:GLOVE",
+        "handsim.cli.glove:GLOVE",
         "List, show, start and check marker layouts; score and improve one before it is worn.",
     ),
     "rig": (
-        "handsim.cli.rig:RIG+handsim.cli.rig_import:RIG+handsim.cli.rig_advice:RIG",
+        "handsim.cli.rig:RIG",
         "List, start, check and import camera rigs; forecast what one will miss, and plan a better one.",
     ),
     "generate": ("handsim.cli.generate:generate", "Make a training set; goes on where it was stopped."),
@@ -39,38 +39,11 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "view": ("handsim.cli.view:view", "Show a file or a live tracker in the browser."),
     "body": ("handsim.cli.body:body", "Write a rigid body's markers as a file, to track it with."),
     "render": ("handsim.cli.render:render", "Draw the hands of a take, with the truth of each picture."),
-    "reproduce": (
-        "handsim.cli.reproduce:REPRODUCE",
-        "Print a table of the paper with our figures beside.",
-    ),
-    "benchmark": (
-        "handsim.cli.benchmark:BENCHMARK_COMMANDS",
-        "Make the public benchmark, run a tracker on it, score anybody's results.",
-    ),
-    "sweep": (
-        "handsim.cli.sweep:sweep",
-        "Train and measure for gloves x rigs x people x seeds, as one job with a table.",
-    ),
     "doctor": ("handsim.cli.doctor:doctor", "Say what is missing on this machine, and how to get it."),
 }
 
-# The steps of `handsim demo` in the order in which they run and in which their sections stand on the page.
-DEMO_STEPS: Final = (
-    "handsim.cli.demo_pictures:draw_hands",
-    "handsim.cli.demo_pictures:draw_worn_glove",
-    "handsim.cli.demo_pictures:draw_camera_view",
-    "handsim.cli.demo_figures:generate_and_label",
-    "handsim.cli.demo_pictures:draw_labeled_frame",
-    "handsim.cli.demo_tracking:track_take",
-    "handsim.cli.demo_pictures:draw_tracked_take",
-    "handsim.cli.demo_figures:figures_section",
-)
-
 
 def load(target: str) -> Any:
-    """What "module:name" stands for, imported now and not before; tables joined by "+" are one."""
-    found = []
-    for part in target.split("+"):
-        module, _, attribute = part.partition(":")
-        found.append(getattr(importlib.import_module(module), attribute))
-    return found[0] if len(found) == 1 else {name: one for table in found for name, one in table.items()}
+    """What "module:name" stands for, imported now and not before."""
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)

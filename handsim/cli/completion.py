@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from handsim.cli.command_table import load
+from handsim.cli.parsing import options_of
 from handsim.cli.presets import PresetCommand
 
 _SCRIPT: Final = """\
@@ -41,17 +42,5 @@ def _words(target: str) -> list[str]:
     functions = list(command.values()) if isinstance(command, dict) else [command]
     found = list(command) if isinstance(command, dict) else []
     for function in functions:
-        found += [word for word in _options(function) if word not in found]
+        found += [word for word in options_of(function) if word not in found]
     return found
-
-
-def _options(function: Any) -> list[str]:
-    import tyro
-
-    parser: Any = tyro.extras.get_parser(function)
-    return [
-        option
-        for action in parser._actions  # argparse has no other way to list them
-        for option in action.option_strings
-        if option.startswith("--")
-    ]

@@ -11,9 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from handsim.app.messages import print_line
-from handsim.app.page import Section, write_page
-from handsim.cli.command_table import DEMO_STEPS, load
-from handsim.cli.demo_run import GLOVE, DemoRun
+from handsim.app.page import write_page
 from handsim.errors import ArgumentError
 
 
@@ -31,13 +29,12 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
         raise ArgumentError(f"seed is {seed}, expected 0 or more")
     out.mkdir(parents=True, exist_ok=True)
     console, progress = Console(), Console(stderr=True)
-    sections: list[Section] = []
     with tempfile.TemporaryDirectory(prefix=".work-", dir=out) as work, progress.status("starting") as status:
-        run = DemoRun(out, Path(work), seed, num_frames, status.update)
-        for step in DEMO_STEPS:
-            section: Section | None = load(step)(run)
-            if section is not None:
-                sections.append(section)
+        from handsim.cli.demo_sections import GLOVE, demo_sections
+
+        sections = list(
+            demo_sections(out, Path(work), seed=seed, num_frames=num_frames, report=status.update)
+        )
     figures = sections[-1]
     _print_table(console, figures.table, title=f"{num_frames} generated frames, glove {GLOVE}")
     page = out / "index.html"

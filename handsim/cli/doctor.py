@@ -15,9 +15,9 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Final
 
+from handsim._extras import EGL_PACKAGES
 from handsim._kernel_cache import VARIABLE, kernel_cache
 from handsim._siblings import SIBLINGS, shadowed_siblings
-from handsim.app.system_packages import EGL_PACKAGES
 
 _PROBE_SECONDS: Final = 120.0
 # These run in processes of their own: a broken driver ends its process, and torch and GL stay out of ours.

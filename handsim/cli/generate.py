@@ -8,15 +8,15 @@ from typing import Annotated, Final
 import tyro
 from rich.console import Console
 
-from handsim.app.executors.executor import choose_executor
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
+from handsim.app.output import place_of
 from handsim.app.progress import print_above, progress_bar
-from handsim.files.object_folder import folder_or_objects
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.generation import make_dataset
+from train.simulation.takes import simulate_take
 
 _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 
@@ -37,12 +37,15 @@ def generate(
         cluster: Where else to make shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
     """
-    place = folder_or_objects(out)
-    with progress_bar("frames") as (bar, task):
-        manifest = generate_dataset(
+    place = place_of(out)
+    with (
+        progress_bar("frames") as (bar, task),
+        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+    ):
+        manifest = make_dataset(
             config,
             place,
-            workers=choose_executor(cluster, workers, place, print_above(bar)),
+            workers=chosen,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     print_line(f"{manifest.num_frames} frames of {config.glove} in {place}")
@@ -52,9 +55,7 @@ def generate(
 
 def _report(config: DatasetConfig, out: Path) -> Path:
     """Write the page of plots."""
-    # Not in generate_dataset: a set is complete without its report, whose bytes depend on matplotlib.
+    # Not in make_dataset: a set is complete without its report, whose bytes depend on matplotlib.
     with Console(stderr=True).status("drawing the report"):
-        take = simulate_take(
-            TakeConfig(kind="hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
-        )
+        take = simulate_take("hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
         return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)

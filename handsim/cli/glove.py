@@ -1,28 +1,40 @@
-"""The commands `handsim glove list | show | new | check`."""
+"""The commands `handsim glove list | show | new | check | score | improve`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gloves.fit import GloveFit, nominal_fit
-from gloves.layout import MarkerLayout, list_layouts, load_layout, shipped_layout, starter_layout
+from gloves.layout import (
+    FEWEST_MARKERS,
+    MOST_MARKERS,
+    MarkerLayout,
+    MarkerPlace,
+    list_layouts,
+    load_layout,
+    save_layout,
+    shipped_layout,
+    starter_layout,
+)
 from handsim.app.messages import print_line
-from handsim.errors import LayoutError
+from handsim.errors import ArgumentError, LayoutError
 from handsim.files.atomic import atomic_write
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import SIZES
+from handsim.space.cameras import CameraRig, load_rig
 
-LABELED_GLOVES: Final = ("dense19", "sparse13")
-"""Gloves whose trained labeler comes with handsim."""
+if TYPE_CHECKING:
+    from gloves.fit import GloveFit
+    from track.glove_advice.layout_score import LayoutScore
+    from track.glove_advice.layout_worth import Worth
+    from track.glove_advice.observed_hands import ObservedHand
 
 
 def list_gloves(out: Path | None = None) -> None:
@@ -31,16 +43,19 @@ def list_gloves(out: Path | None = None) -> None:
     Args:
         out: A picture of all of them, a .png file.
     """
+    from train.labelers.storage import shipped_labelers
+
+    labeled = shipped_labelers()
     table = Table("name", "markers", "labeler", "description and source", box=None, pad_edge=False)
     for name in list_layouts():
         shipped = shipped_layout(name)
-        labeler = "comes with it" if name in LABELED_GLOVES else "for any layout"
+        labeler = "comes with it" if name in labeled else "for any layout"
         text = Text(shipped.description).append(f"\n{shipped.source}", "dim")
         table.add_row(name, str(shipped.layout.num_markers), labeler, text)
     Console().print(table)
     print_line(
-        "A labeler of its own for NAME: handsim generate --glove NAME --out SET && handsim train SET "
-        "--out RUN, then give --labeler RUN."
+        "The labeler for any layout needs no training. A better one of its own for NAME: handsim generate "
+        "--glove NAME --out SET && handsim train SET --out RUN, then give --labeler RUN."
     )
     if out is not None:
         from render.illustrations.captions import write_png
@@ -107,6 +122,8 @@ def check_glove(
         out: The picture, a .png file; named after the glove when not given.
         size: Size of the hand in the picture.
     """
+    from gloves.fit import nearest_markers, nominal_fit
+
     layout = load_layout(glove)
     picture = Path(glove).with_suffix(".png") if out is None else out
     check_outputs([glove], [picture])
@@ -114,8 +131,8 @@ def check_glove(
     table.add_column(Text("centers apart [mm]"), justify="right")
     overlaps = []
     for name in SIZES:
-        first, second, distance = nearest_pair(_fitted(layout, name).attachment.points)
-        pair = f"{layout.names[first]} and {layout.names[second]}"
+        first, second, distance = nearest_markers(_fitted(layout, name))
+        pair = f"{first} and {second}"
         table.add_row(name, Text(pair), f"{1e3 * distance:.1f}")
         if distance < 2 * layout.radius:
             overlaps.append(f"{pair} on size {name}")
@@ -133,19 +150,179 @@ def check_glove(
     print_line(f"{picture}: the glove on a hand of size {size}")
 
 
-def nearest_pair(points: NDArray[np.float64]) -> tuple[int, int, float]:
-    """The two nearest of some points (N, 3), and their distance."""
-    distances = np.linalg.norm(points[:, None] - points, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    first, second = divmod(int(distances.argmin()), len(points))
-    return first, second, float(distances[first, second])
-
-
 def _fitted(layout: MarkerLayout, size: str) -> GloveFit:
+    from gloves.fit import nominal_fit
+
     try:
         return nominal_fit(layout, size, layout.sides[-1])
     except LayoutError as error:
         raise LayoutError(f"on a hand of size {size}: {error}") from error
+
+
+POSES: Final = "poses"
+TWINS: Final = "twins"
+_TWIN_FRAMES: Final = 600  # of each kind of capture that is simulated
+_FEWEST_FRAMES: Final = 100
+_FEWER: Final = 3  # markers by which smaller layouts are compared with an improved one
+
+
+def score_glove(
+    glove: Annotated[str, tyro.conf.Positional],
+    rig: str = "figure5",
+    motion: str = POSES,
+    out: Path | None = None,
+    frames: int = 1500,
+    labeler: str | None = None,
+    seed: int = 0,
+) -> None:
+    """Say how well a layout can be labeled and what it tells of each joint; nothing is trained.
+
+    Args:
+        glove: A .toml file or a shipped name.
+        rig: Camera rig: a shipped name or the path of a .toml file.
+        motion: What hands do: poses (random people and poses), twins (simulated motion of one hand and of
+            two) or a take (.npz) of `handsim track` or `handsim simulate`.
+        out: The page, an .html file; named after the glove when not given.
+        frames: Frames of hands, of a take those of each hand.
+        labeler: Folder of a labeler trained on the layout, or an exported .onnx file; the network for any
+            layout when not given.
+        seed: Seed of people, poses and cameras' losses.
+    """
+    layout, cameras = load_layout(glove), load_rig(rig)
+    page = Path(glove).with_suffix(".html") if out is None else out
+    if page.suffix.lower() != ".html":
+        raise ArgumentError(f"--out is {page}, expected a file name that ends in .html")
+    if frames < _FEWEST_FRAMES:
+        raise ArgumentError(f"--frames is {frames}, expected at least {_FEWEST_FRAMES}")
+    check_outputs([glove, rig, motion], [page])
+    from track.glove_advice.advice import advice
+    from track.glove_advice.layout_score import score_layout
+    from track.glove_advice.score_page import write_score_page
+    from train.any_layout.fine_tuning import fine_tuned_labeler
+    from train.glove_labeler import load_labeler
+
+    rng = np.random.default_rng(seed)
+    with Console(stderr=True).status("simulating hands") as status:
+        hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
+        status.update("learning the layout, about a minute")
+        known = fine_tuned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
+        status.update("labeling")
+        score = score_layout(layout, hands, known, rng=rng)
+    _tell(score)
+    for number, sentence in enumerate(advice(score), 1):
+        print_line(f"{number}. {sentence}")
+    write_score_page(page, score, seen_by=f"{seen}, seen by rig {cameras.name}", trained=labeler is not None)
+    print_line(f"{page}: the hand with its confusions, markers and joints")
+
+
+def _hands(
+    motion: str, layout: MarkerLayout, rig: CameraRig, frames: int, seed: int, rng: np.random.Generator
+) -> tuple[list[ObservedHand], str]:
+    """Hands in the motion that was asked for, and its name."""
+    from gloves.takes.take import load_take
+    from track.glove_advice.observed_hands import observe_motion, observe_poses
+    from train.simulation.takes import simulate_take
+
+    if motion == POSES:
+        return observe_poses(layout, rig, frames, rng=rng), "random people and poses"
+    if motion == TWINS:
+        hands = []
+        for kind in ("single-hand", "hand-hand", "hand-pen"):
+            take = simulate_take(kind, num_frames=_TWIN_FRAMES, seed=seed)
+            hands += observe_motion(take, layout, rig, frames // 6, rng=rng)
+        return hands, "simulated motion of one hand and of two"
+    if not motion.endswith(".npz"):
+        raise ArgumentError(f"--motion is '{motion}', expected {POSES}, {TWINS} or a take (.npz)")
+    return observe_motion(
+        load_take(Path(motion)), layout, rig, frames, rng=rng
+    ), f"the take {Path(motion).name}"
+
+
+def _tell(score: LayoutScore) -> None:
+    """Print the figures of a score."""
+    from train.evaluation.metrics import percent
+
+    joints = np.rad2deg(score.joints)
+    for title, report in (
+        ("as the rig sees them", score.observed),
+        ("where every marker is seen", score.clean),
+        ("with the paper's drops and ghosts", score.corrupted),
+    ):
+        print_line(f"{percent(report.figures['slot_accuracy'])} % of the slots right {title}")
+    print_line(f"{percent(score.seen.mean())} % of the markers seen; {percent(score.sides_right)} % of the "
+               "hands told left from right")  # fmt: skip
+    print_line(
+        f"joints, frame by frame: standard deviation {np.sqrt((joints**2).mean()):.1f} deg, the worst "
+        f"{joints.max():.1f} deg"
+    )
+
+
+def improve_glove(
+    glove: Annotated[str, tyro.conf.Positional],
+    out: Path,
+    markers: int | None = None,
+    keep: tuple[str, ...] = (),
+    rig: str = "figure5",
+    minutes: float = 3.0,
+    seed: int = 0,
+) -> None:
+    """Look for a better layout near a given one: move, add or drop markers.
+
+    Args:
+        glove: A .toml file or a shipped name to begin with.
+        out: The new layout, a .toml file.
+        markers: Number of markers of the new layout; as many as before when not given.
+        keep: Names of markers that stay where they are.
+        rig: Camera rig: a shipped name or the path of a .toml file.
+        minutes: How long to move markers.
+        seed: Seed of people, poses and tries.
+    """
+    layout, cameras = load_layout(glove), load_rig(rig)
+    count = layout.num_markers if markers is None else markers
+    if not FEWEST_MARKERS <= count <= MOST_MARKERS:
+        raise ArgumentError(f"--markers is {count}, expected {FEWEST_MARKERS} to {MOST_MARKERS}")
+    if not 0.0 <= minutes < np.inf:
+        raise ArgumentError(f"--minutes is {minutes:g}, expected 0 or more")
+    if out.suffix.lower() != ".toml":
+        raise ArgumentError(f"--out is {out}, expected a file name that ends in .toml")
+    check_outputs([glove, rig], [out])
+    from track.glove_advice.improvement import Improvement
+
+    with Console(stderr=True).status("putting the glove on") as status:
+        search = Improvement(layout, cameras, keep, rng=np.random.default_rng(seed))
+        before = search.worth
+        search.resize(count)
+        search.search(60.0 * minutes, lambda worth: status.update(_worth_line(worth)))
+        status.update("dropping one marker at a time, to compare")
+        fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
+    found = search.layout
+    save_layout(out, found)
+    print_line(f"before: {layout.num_markers} markers, {_worth_line(before)}")
+    print_line(f"after:  {count} markers, {_worth_line(search.worth)}")
+    for fewer_count, worth in fewer:
+        print_line(f"        {fewer_count} markers, {_worth_line(worth)}")
+    old = {marker.name: marker for marker in layout.markers}
+    for marker in found.markers:
+        if old.get(marker.name) != marker:
+            verb = "move" if marker.name in old else "add"
+            print_line(f"{verb} {marker.name}: {_place_line(marker)}")
+    for name in sorted(set(old) - set(found.names)):
+        print_line(f"drop {name}")
+    print_line(f"{out}: run `handsim glove check {out}` and `handsim glove score {out}`")
+
+
+def _worth_line(worth: Worth) -> str:
+    return (
+        f"{100.0 * worth.slots:.1f} % of the slots right with losses and ghosts, joints to "
+        f"{np.rad2deg(worth.joints):.1f} deg"
+    )
+
+
+def _place_line(marker: MarkerPlace) -> str:
+    place = f"{marker.bone}, along {marker.along:.2f}"
+    if marker.across:
+        return f"{place}, across {marker.across:.2f}"
+    return f"{place}, around {np.rad2deg(marker.around):.0f} deg"
 
 
 GLOVE: Final[dict[str, Callable[..., Any]]] = {
@@ -153,4 +330,6 @@ GLOVE: Final[dict[str, Callable[..., Any]]] = {
     "show": show_glove,
     "new": new_glove,
     "check": check_glove,
+    "score": score_glove,
+    "improve": improve_glove,
 }

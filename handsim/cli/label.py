@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
-from numpy.typing import NDArray
+from jaxtyping import Bool
 
-from gloves.captures.capture import Capture
-from gloves.captures.formats import WRITABLE, check_suffix, read_capture, write_capture
-from gloves.captures.markers import labeled_capture, unlabeled_frames
-from gloves.layout import load_layout
+from gloves.captures.formats import WRITABLE, check_suffix, write_capture
+from gloves.takes.take import Take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
 from handsim.files.outputs import check_outputs
-from train.glove_labeler import labeler_for_glove
-from train.hands.frame_hands import HandFinder
-from train.hands.labeling import FrameLabels, label_hands
+from track.capture_labeling import label_capture, labeled_points
 from train.threads import label_on
 
 
@@ -48,45 +43,36 @@ def label(
     label_on(threads)
     check_suffix(out, WRITABLE)  # before the work, not after it
     check_outputs((capture, glove, labeler), [out])
-    network = labeler_for_glove(glove, labeler)
-    source = read_capture(capture)
-    frames = unlabeled_frames(source)
-    finder = HandFinder(network, load_layout(glove), rng=np.random.default_rng(0))
     with progress_bar("frames") as (bar, task):
-        bar.update(task, total=len(frames))
-        labelings = label_hands(
-            frames, finder, source.rate, told=lambda count: bar.update(task, advance=count)
+        take = label_capture(
+            capture,
+            glove,
+            labeler=labeler,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
-    write_capture(out, _labeled(frames, labelings, network.marker_names, source.rate))
-    confidence = [value for one in labelings for value in one.confidence[one.labels >= 0]]
-    points = sum(len(one.labels) for one in labelings)
-    sure = f", median confidence {np.median(confidence):.3f}" if confidence else ""
+    right, left = _hands_there(take)
+    write_capture(out, labeled_points(take, sides=bool((right & left).any())))
+    labeled, points = take.labels >= 0, np.isfinite(take.points[..., 0])
+    sure = f", median confidence {np.median(take.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(
-        f"{out}: {len(frames)} frames, {len(confidence)} of {points} points labeled{sure}; "
-        f"{_counts(labelings)}"
+        f"{out}: {take.num_frames} frames, {labeled.sum()} of {points.sum()} points labeled{sure}; "
+        f"{_counts(right, left)}"
     )
-    if not confidence:
+    if not labeled.any():
         told = f"no hand in {capture}, expected hands in glove '{glove}' (--glove names another)"
         warnings.warn(told, HandSimWarning, stacklevel=2)
 
 
-def _labeled(
-    frames: Sequence[NDArray[np.float64]],
-    labelings: Sequence[FrameLabels],
-    names: tuple[str, ...],
-    rate: float,
-) -> Capture:
-    """The labeled points: plain marker names, or right:ThumbTip and so on if a frame holds two hands."""
-    labels = [one.labels for one in labelings]
-    if any(all(one.hands) for one in labelings):
-        labels = [np.where(one.sides < 0, one.labels + len(names), one.labels) for one in labelings]
-        names = tuple(f"{side}:{name}" for side in ("right", "left") for name in names)
-    return labeled_capture(frames, labels, names, rate)
+def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:
+    """In which frames there is a right hand, and a left one."""
+    side_of = np.array([name.split(":")[0] for name in take.label_names])
+    labeled = take.labels >= 0
+    right, left = ((labeled & (side_of[take.labels] == side)).any(axis=1) for side in ("right", "left"))
+    return right, left
 
 
-def _counts(labelings: Sequence[FrameLabels]) -> str:
+def _counts(right: Bool[np.ndarray, "T"], left: Bool[np.ndarray, "T"]) -> str:
     """How many frames hold how many hands, and which."""
-    right, left = np.array([one.hands for one in labelings], dtype=bool).reshape(-1, 2).T
     counts = ((right & left, "two hands"), (right & ~left, "a right hand"), (left & ~right, "a left hand"))
     said = [f"{words} in {there.sum()} frames" for there, words in counts if there.any()]
     none = (~right & ~left).sum()

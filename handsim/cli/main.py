@@ -191,15 +191,12 @@ def _print_completion(commands: Mapping[str, tuple[str, str]], shells: Sequence[
 
 def _call(target: str, *, prog: str, help_line: str, args: Sequence[str]) -> int:
     """Load "module:name", hand it the arguments through tyro, and return its exit code."""
-    import tyro
+    from handsim.cli.parsing import run_command
 
     command: Callable[..., Any] | PresetCommand | dict[str, Callable[..., Any]] = load(target)
     if isinstance(command, PresetCommand):
         command = command.choose(args, prog)
-    if isinstance(command, dict):
-        result = tyro.extras.subcommand_cli_from_dict(command, prog=prog, description=help_line, args=args)
-    else:
-        result = tyro.cli(command, prog=prog, args=args)
+    result = run_command(command, prog=prog, help_line=help_line, args=args)
     return result if isinstance(result, int) else 0
 
 

@@ -10,11 +10,11 @@ from typing import Annotated, Final, Literal, cast
 import tyro
 from rich.console import Console
 
-from handsim.app.executors.executor import choose_executor
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
+from handsim.app.output import place_of
 from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimError, choices
-from handsim.files.object_folder import folder_or_objects
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from render.cameras.viewpoints import Placement, ViewConfig
@@ -138,7 +138,7 @@ def render(
     """
     if sum((take is not None, poses is not None, bool(merge))) != 1:
         raise HandSimError("expected a take, --poses or --merge, and one of them alone")
-    place = folder_or_objects(out)
+    place = place_of(out)
     if merge:
         if not isinstance(place, Path):
             raise HandSimError(f"--merge copies into a folder, and {place} is none; copy that folder then")
@@ -156,13 +156,16 @@ def render(
     start = time.perf_counter()
     if options.photos is not None:
         _print_left_out(options.photos)
-    with progress_bar("images") as (bar, task):
+    with (
+        progress_bar("images") as (bar, task),
+        chosen_workers(cluster, workers, print_above(bar)) as chosen,
+    ):
         count = render_take(
             source,
             place,
             format,
             config,
-            workers=choose_executor(cluster, workers, place, print_above(bar)),
+            workers=chosen,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     seconds = time.perf_counter() - start

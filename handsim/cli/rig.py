@@ -1,21 +1,42 @@
-"""The commands `handsim rig list | new | check`."""
+"""The commands `handsim rig list | new | check | import | score | plan`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from gloves.layout import load_layout
 from handsim.app.messages import print_line
-from handsim.errors import RigError
+from handsim.errors import ArgumentError, RigError
 from handsim.files.atomic import atomic_write
-from handsim.space.cameras import list_rigs, load_rig, named_rig, rig_description
+from handsim.files.json_files import save_json
+from handsim.files.outputs import check_outputs
+from handsim.space.camera import Camera, focal_of_angle, pinhole
+from handsim.space.cameras import (
+    FEWEST_CAMERAS,
+    MAX_CAMERAS,
+    ROOM_CENTER,
+    CameraRig,
+    list_rigs,
+    load_rig,
+    named_rig,
+    rig_description,
+    save_rig,
+)
+from handsim.space.rig_formats.any_file import import_cameras
+from train.rig_advice.mounts import MOUNTS, Mount
+
+if TYPE_CHECKING:
+    from train.rig_advice.forecast import Forecast
+    from train.simulation.motion import SceneMotion
 
 _STARTER: Final = """\
 # A camera rig (docs/rigs.md): lengths in meters, z up, the origin on the floor. Edit it, then run
@@ -24,11 +45,11 @@ _STARTER: Final = """\
 
 name = "my rig"
 description = "Four cameras at the corners of a table."
-field_of_view = 60.0  # full opening of the round view cone [deg]: that of the shorter side of the picture
-resolution = 1280  # pixels across it
+size = [1280, 1024]  # width and height of the pictures [px]
+horizontal_field_of_view = 56.0  # [deg], as data sheets state it; or focal = 1204.0 [px] of a calibration
 
-# One table for each camera, two to thirty-two of them. Hands work around (0, 0, 1.1): place the origin so,
-# or tell `handsim rig score` where they work with --center.
+# One table for each camera, two to thirty-two of them; what it says goes before what stands at the top. Hands
+# work around (0, 0, 1.1): place the origin so, or tell `handsim rig score` where they work with --center.
 
 [[camera]]
 position = [-1.2, -0.9, 2.2]  # of the lens
@@ -49,17 +70,14 @@ target = [0.0, 0.0, 1.1]
 
 
 def list_shipped() -> None:
-    """List the camera rigs that come with handsim: cameras, field of view, resolution, and what they are."""
+    """List the camera rigs that come with handsim: how many cameras, their pictures, and what they are."""
     table = Table("name", box=None, pad_edge=False)
-    for column in ("cameras", "field of view [deg]", "resolution [px]"):
-        table.add_column(Text(column), justify="right")
+    table.add_column("cameras", justify="right")
+    table.add_column("pictures")
     table.add_column("description")
     for name in list_rigs():
         rig = named_rig(name)
-        degrees = f"{np.rad2deg(rig.field_of_view):.0f}"
-        table.add_row(
-            name, str(len(rig.positions)), degrees, str(rig.resolution), Text(rig_description(name))
-        )
+        table.add_row(name, str(len(rig.cameras)), Text(rig.pictures()), Text(rig_description(name)))
     Console().print(table)
     print_line("One of your own: handsim rig new FILE.toml, then handsim rig score FILE.toml.")
 
@@ -90,7 +108,7 @@ def check_rig(rig: Annotated[str, tyro.conf.Positional]) -> None:
 
     point = working_point(cameras)
     shares = cameras.in_view(cube_points(point, np.full(3, 2 * HALF_SIDE)))
-    table = Table("camera", title=Text(f"{cameras.name}: {len(cameras.positions)} cameras"))
+    table = Table("camera", title=Text(f"{cameras.name}: {len(cameras.cameras)} cameras"))
     for column in ("position [m]", "from the middle [m]", "a marker [px]", "of the cube in view [%]"):
         table.add_column(Text(column), justify="right")
     for number, position in enumerate(cameras.positions):
@@ -115,4 +133,240 @@ def check_rig(rig: Annotated[str, tyro.conf.Positional]) -> None:
         print_line(f"Nothing is suspicious. What it sees of hands at work: handsim rig score {rig}")
 
 
-RIG: Final[dict[str, Callable[..., Any]]] = {"list": list_shipped, "new": new_rig, "check": check_rig}
+def import_rig(
+    file: Annotated[Path, tyro.conf.Positional], out: Path, up: Literal["y", "z"] | None = None
+) -> None:
+    """Write a rig's file of the calibration of a camera system: all its cameras, pictures and lenses.
+
+    Args:
+        file: Vicon's .xcp, Qualisys' calibration (.xml or .txt), Motive's .mcal, OpenCV's .yml or .json with
+            intrinsics and extrinsics, or COLMAP's cameras.txt and images.txt.
+        out: The rig, a .toml file.
+        up: The axis that points up in the calibration; y for Motive and z for the others when not given.
+            The rig's is z.
+    """
+    if out.suffix.lower() != ".toml":
+        raise RigError(f"--out is {out}, expected a file name that ends in .toml")
+    check_outputs([file], [out])
+    name = "".join(one for one in file.stem if one.isprintable()) or "rig"
+    try:
+        rig = CameraRig(name, import_cameras(file, up))
+    except RigError as error:
+        raise RigError(str(error) if str(file) in str(error) else f"{file}: {error}") from error
+    save_rig(out, rig)
+    table = Table("camera", "name", box=None, pad_edge=False)
+    for column in ("position [m]", "picture [px]", "focal length [px]", "lens"):
+        table.add_column(Text(column), justify="right", min_width=7)
+    for number, camera in enumerate(rig.cameras, 1):
+        table.add_row(
+            str(number),
+            Text(camera.name),
+            " ".join(f"{one:.2f}" for one in camera.T_world_camera[:3, 3] + 0.0),
+            f"{camera.size[0]} x {camera.size[1]}",
+            f"{camera.focal_length:.0f}",
+            camera.lens.kind,
+        )
+    Console().print(table)
+    print_line(f"{out}: {len(rig.cameras)} cameras of {rig.pictures()}")
+
+
+_GLOVE: Final = "dense19"
+_VOLUME: Final = (0.6, 0.6, 0.6)
+_PEOPLE: Final = 2  # of each kind of work
+_FEWEST_FRAMES: Final = 60
+
+_Sides = tuple[float, float, float]
+
+
+def score_rig_file(
+    rig: Annotated[str, tyro.conf.Positional],
+    volume: _Sides = _VOLUME,
+    center: _Sides | None = None,
+    take: Path | None = None,
+    glove: str | None = None,
+    out: Path | None = None,
+    json: Path | None = None,
+    frames: int = 900,
+    seed: int = 0,
+) -> None:
+    """Forecast what a rig will miss: gaps, ghosts, error, the worth of each camera; nothing is recorded.
+
+    Args:
+        rig: A .toml file or a shipped name.
+        volume: Sides of the space that hands work in [m].
+        center: Its middle [m]; (0, 0, 1.1) when not given, or where the hands of the take are.
+        take: A take (.npz) of `handsim track` or `handsim simulate`, whose hands work where they are;
+            simulated people when not given.
+        glove: Marker layout: a shipped name or the path of a .toml file; dense19 or that of the take when
+            not given.
+        out: The page, an .html file; named after the rig when not given.
+        json: File for the figures.
+        frames: Frames of every person and kind of work, or of the take.
+        seed: Seed of people, motion and cameras' losses.
+    """
+    cameras = load_rig(rig)
+    page = Path(f"{cameras.name}.html" if not rig.endswith(".toml") else Path(rig).with_suffix(".html"))
+    page = page if out is None else out
+    if page.suffix.lower() != ".html":
+        raise ArgumentError(f"--out is {page}, expected a file name that ends in .html")
+    if frames < _FEWEST_FRAMES:
+        raise ArgumentError(f"--frames is {frames}, expected at least {_FEWEST_FRAMES}")
+    sides = _checked_sides("--volume", volume)
+    check_outputs([rig, take, glove], [page, json])
+    from train.rig_advice.rig_page import COLUMNS_TOLD, camera_table, work_table, write_rig_page
+    from train.rig_advice.rig_score import score_rig, sentences
+
+    with Console(stderr=True).status("simulating hands") as status:
+        work, middle, told = _work(take, glove, center, sides, frames, seed)
+        status.update("forecasting")
+        score = score_rig(cameras, work, middle, sides, seed=seed)
+    _print(work_table(score))
+    _print(camera_table(score))
+    print_line(COLUMNS_TOLD)
+    axes = " x ".join(f"{1e3 * axis:.3f}" for axis in score.whole.error.axes)
+    print_line(f"Error of points: {axes} mm, standard deviations along its axes.")
+    for number, sentence in enumerate(sentences(score), 1):
+        print_line(f"{number}. {sentence}")
+    if json is not None:
+        save_json(json, {"work": told, "seed": seed, **score.record()})
+    write_rig_page(page, score, work=told)
+    print_line(f"{page}: what to do, the cameras' worth, a map of the volume")
+
+
+def plan_rig(
+    out: Path,
+    cameras: int,
+    room: _Sides,
+    mounts: tuple[Mount, ...] = MOUNTS,
+    volume: _Sides = _VOLUME,
+    center: _Sides = ROOM_CENTER,
+    keep: str | None = None,
+    size: tuple[int, int] = (1280, 1280),
+    field_of_view: float = 60.0,
+    glove: str = _GLOVE,
+    seed: int = 0,
+) -> None:
+    """Look for the best places of a number of cameras, for hands at work in a volume.
+
+    Args:
+        out: The rig, a .toml file.
+        cameras: Number of cameras, with those that are kept.
+        room: Width along x, depth along y and height of the room or truss [m]; it stands on the floor, its
+            middle below that of the volume.
+        mounts: What cameras can hang on: walls, a truss along the room's edges (four beams above and four
+            posts), tripods.
+        volume: Sides of the space that hands work in [m].
+        center: Its middle [m].
+        keep: A rig whose cameras stay where they are, a .toml file or a shipped name; the new ones are like
+            its first.
+        size: Width and height of the new cameras' pictures [px].
+        field_of_view: Full opening across the shorter side of these [deg].
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        seed: Seed of people and motion.
+    """
+    if out.suffix.lower() != ".toml":
+        raise ArgumentError(f"--out is {out}, expected a file name that ends in .toml")
+    hung = None if keep is None else load_rig(keep)
+    fewest = FEWEST_CAMERAS if hung is None else len(hung.cameras) + 1
+    if not fewest <= cameras <= MAX_CAMERAS:
+        raise ArgumentError(f"--cameras is {cameras}, expected {fewest} to {MAX_CAMERAS}")
+    sides, middle = _checked_sides("--volume", volume), _checked_center(center)
+    check_outputs([keep, glove], [out])
+    from train.rig_advice.plan import plan
+
+    camera = _camera(size, field_of_view) if hung is None else hung.cameras[0]
+    with Console(stderr=True).status("simulating hands") as status:
+        planned = plan(
+            cameras, _checked_sides("--room", room), mounts, load_layout(glove), middle, sides,
+            camera, hung, name=out.stem, told=status.update, seed=seed,
+        )  # fmt: skip
+    table = Table("camera", box=None, pad_edge=False)
+    table.add_column(Text("position [m]"), justify="right")
+    table.add_column(Text("looks at [m]"), justify="right")
+    for number, (position, target) in enumerate(zip(planned.rig.positions, planned.targets, strict=True), 1):
+        table.add_row(
+            str(number), *("  ".join(f"{one:.2f}" for one in part + 0.0) for part in (position, target))
+        )
+    Console().print(table)
+    if planned.before is not None:
+        print_line(f"before: {_forecast_line(planned.before)}")
+    print_line(f"after:  {_forecast_line(planned.after)}")
+    save_rig(out, planned.rig)
+    print_line(f"{out}: run `handsim rig score {out}`")
+
+
+def _camera(size: tuple[int, int], field_of_view: float) -> Camera:
+    """A camera without distortion, at the world's origin."""
+    if not 1.0 <= field_of_view <= 170.0:
+        raise ArgumentError(f"--field-of-view is {field_of_view:g} degrees, expected 1 to 170")
+    return pinhole("camera", size, focal_of_angle(min(size), np.deg2rad(field_of_view)))
+
+
+def _forecast_line(one: Forecast) -> str:
+    return (
+        f"two cameras see {100 * one.seen_by_two:.1f} % of the marker-frames of other people, three "
+        f"{100 * one.seen_by_three:.1f} %; {100 * one.missing:.1f} % missing, error "
+        f"{1e3 * one.error.mean:.3f} mm"
+    )
+
+
+def _work(
+    take: Path | None,
+    glove: str | None,
+    center: _Sides | None,
+    sides: NDArray[np.float64],
+    frames: int,
+    seed: int,
+) -> tuple[dict[str, list[SceneMotion]], NDArray[np.float64], str]:
+    """Hands at work, the middle of where they are [m], and what they do, in words."""
+    from gloves.takes.take import load_take
+    from train.rig_advice.work import sample_work, work_of_take
+
+    middle = _checked_center(ROOM_CENTER if center is None else center)
+    if take is None:
+        layout = load_layout(_GLOVE if glove is None else glove)
+        rng = np.random.default_rng(seed)
+        work = sample_work(layout, middle, sides, frames, _PEOPLE, rng=rng)
+        return work, middle, f"simulated people in the glove {layout.name}"
+    work = work_of_take(load_take(take), None if glove is None else load_layout(glove), frames)
+    if center is None:
+        wrists = [hand.qpos[:, :3] for scenes in work.values() for one in scenes for hand in one.hands]
+        middle = np.concatenate(wrists).mean(axis=0)
+    return work, middle, f"the take {take.name}"
+
+
+def _checked_center(center: Sequence[float]) -> NDArray[np.float64]:
+    array = np.array(center, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise ArgumentError(f"--center is {' '.join(map(str, array))}, expected three finite numbers")
+    return array
+
+
+def _checked_sides(option: str, sides: Sequence[float]) -> NDArray[np.float64]:
+    array = np.array(sides)
+    if not (array > 0.0).all() or not (array < 50.0).all():
+        raise ArgumentError(
+            f"{option} is {' '.join(f'{one:g}' for one in array)}, expected three lengths in meters, each "
+            "above 0 and below 50"
+        )
+    return array
+
+
+def _print(rows: list[list[str]]) -> None:
+    table = Table(box=None, pad_edge=False)
+    for number, title in enumerate(rows[0]):
+        narrow = title.replace(" [", "\n[").replace("without ", "without\n")  # eighty columns are enough
+        table.add_column(Text(narrow), justify="right" if number else "left", no_wrap=True)
+    for row in rows[1:]:
+        table.add_row(*row)
+    Console().print(table)
+
+
+RIG: Final[dict[str, Callable[..., Any]]] = {
+    "list": list_shipped,
+    "new": new_rig,
+    "check": check_rig,
+    "import": import_rig,
+    "score": score_rig_file,
+    "plan": plan_rig,
+}

@@ -14,14 +14,14 @@ from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.captures.gaps import count_gaps
 from gloves.captures.markers import UNLABELED
 from gloves.takes.take import SUFFIX, Take, load_take
-from handsim.app.executors.executor import choose_executor
-from handsim.app.memory import check_memory
+from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
+from handsim.app.workers import run_jobs
 from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
-from handsim.files.disk import check_free
+from handsim.files.capacity import check_free, check_memory
 from handsim.files.outputs import check_outputs
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import TakeConfig, record_config
 
 _MEMORY: Final = 20_000
 """Bytes that a frame of two hands takes while it is simulated; 18,000 were measured with 24,000 frames."""
@@ -41,13 +41,13 @@ def simulate(
     """
     truth = out.with_suffix(SUFFIX)
     check_suffix(out, WRITABLE)
-    check_outputs((config.glove, config.rig), (out, truth))
+    check_outputs((str(config.glove), str(config.rig)), (out, truth))
     _check_space(out, config.num_frames or 0)
     if cluster is None:
         take = _simulate_into(out, config)
     else:
-        executor = choose_executor(cluster, None, out.parent, print_line)
-        list(executor.run(functools.partial(_capture_of_seed, out, config), [config.seed]))
+        with chosen_workers(cluster, None, print_line) as workers:
+            list(run_jobs(functools.partial(_capture_of_seed, out, config), [config.seed], workers))
         take = load_take(truth)
     counts = count_gaps(take.markers_present())
     print_line(f"{out}: {take.num_frames} frames, {counts.gaps} gaps; truth in {truth}")
@@ -60,7 +60,7 @@ def _capture_of_seed(out: Path, config: TakeConfig, seed: int) -> int:
 
 
 def _simulate_into(out: Path, config: TakeConfig) -> Take:
-    take = simulate_take(config)
+    take = record_config(config)
     names = tuple(f"{UNLABELED}{number + 1}" for number in range(take.points.shape[1]))
     with atomic_writes(out, out.with_suffix(SUFFIX)) as (capture_file, truth_file):
         # A capture without its truth is no use.

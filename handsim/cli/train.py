@@ -14,6 +14,7 @@ import tyro
 from handsim.app.interrupts import Stopped
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
+from handsim.cli.parsing import run_command
 from handsim.cli.presets import PresetCommand, given_option
 from handsim.errors import DatasetError, HandSimError
 from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
@@ -54,7 +55,7 @@ def _train(
             def report(done: int, total: int, loss: float) -> None:
                 bar.update(task, completed=done, total=total, description=f"loss {loss:.3f}")
 
-            card = train_labeler(dataset, config, out, threads=threads, progress=report)
+            card = train_labeler(dataset, out, config, threads=threads, progress=report)
     except PeerError as error:  # another process has told it
         raise SystemExit(1) from error
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")
@@ -67,7 +68,7 @@ def _train_silently(dataset: Path, out: Path, config: TrainConfig, threads: int 
     from train.loop import train_labeler
 
     try:
-        train_labeler(dataset, config, out, threads=threads)
+        train_labeler(dataset, out, config, threads=threads)
     except KeyboardInterrupt as stop:
         raise SystemExit(128 + (stop.number if isinstance(stop, Stopped) else 2)) from stop
 
@@ -77,11 +78,11 @@ def _command_of_rank(args: Sequence[str], prog: str) -> Callable[..., None]:
     if not world_of().rank:
         return _with_recipe_as_default(args, prog)
     try:
-        # tyro's console_outputs=False still prints values it cannot read.
+        # A silent tyro still prints values it cannot read.
         with contextlib.redirect_stderr(io.StringIO()):
             command = _with_recipe_as_default(args, prog)
             parsed = functools.partial(_dataset_of, **command.keywords)
-            tyro.cli(parsed, prog=prog, args=args, console_outputs=False)
+            run_command(parsed, prog=prog, args=args, is_silent=True)
         return command
     except DatasetError:  # this one may not see the set
         raise
@@ -99,7 +100,7 @@ def _with_recipe_as_default(args: Sequence[str], prog: str) -> functools.partial
         return functools.partial(_train, config=default_config(kind))
     # The recipe counts epochs, so the training set must be known before its defaults are.
     recipe = functools.partial(_dataset_of, config=preset_config(preset, _PAPER_FRAMES))
-    folder = tyro.cli(recipe, prog=prog, args=args)
+    folder = run_command(recipe, prog=prog, args=args)
     config = preset_config(preset, load_manifest(folder).num_frames)
     return functools.partial(_train, config=config)
 

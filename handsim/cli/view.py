@@ -10,24 +10,21 @@ import tyro
 from rich.console import Console
 
 from handsim.app.interrupts import interrupt_flag
-from handsim.app.live_status import LiveStatus
-from handsim.app.messages import print_line
+from handsim.app.messages import LiveStatus, print_line
 from handsim.app.progress import progress_bar
-from handsim.cli.live import first_frames
-from handsim.cli.track import SHOWN, TrackerStart
-from handsim.cli.user_options import USUAL_SIZE, Size, users_of
+from handsim.cli.options import chosen_hands
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
 from handsim.space.cameras import load_rig
-from track.bodies.body_file import load_bodies
-from track.capture_tracking import track_stream, warm_up
+from track.config import TrackerConfig
+from track.live import measured_setup
+from track.setup import USUAL_SIZE, Size, TrackerSetup, warm_up
 from track.streams.addresses import open_source
 from track.viewer.contents import Content, first_look, open_content
 from track.viewer.live_view import LiveView
 from track.viewer.server import LOOPBACK, address_of, opened_server
 from track.viewer.video import write_video
-from train.glove_labeler import labeler_for_glove
 
 
 def view(
@@ -38,7 +35,7 @@ def view(
     out: Path | None = None,
     rig: str | None = None,
     live: str | None = None,
-    glove: str = "dense19",
+    glove: str | None = None,
     size: Size | None = None,
     shape: Path | None = None,
     hands: tuple[Side, ...] | None = None,
@@ -58,7 +55,7 @@ def view(
         out: File for a layout that was changed; a new name beside the layout when not given.
         rig: Cameras to show with a capture, a take or a stream: a shipped name or the path of a .toml file.
         live: Stream to track instead of a file: natnet://host, qtm://host or module:name.
-        glove: Marker layout of a live tracker.
+        glove: Marker layout of a live tracker; that of --shape, or dense19, when not given.
         size: Size of a live tracker's hands, measured in the first second when not given; or of the hand that
             wears a layout, M when not given.
         shape: The user's file from handsim calibrate, for a live tracker.
@@ -75,10 +72,8 @@ def view(
             raise ArgumentError(f"--video is {video}, but a live view is not drawn; see handsim track")
         if out is not None:
             raise ArgumentError(f"--out is {out}, but nothing of a live view is saved; see handsim track")
-        start = TrackerStart(
-            users_of(glove, size, shape, hands), labeler_for_glove(glove, labeler), load_bodies(body), glove
-        )
-        _view_live(live, start, host, port, rig, measures=shape is None and size in (None, "auto"))
+        setup = TrackerSetup.of(glove, *chosen_hands(shape, hands, size), labeler, body, TrackerConfig())
+        _view_live(live, setup, host, port, rig)
         return
     content = open_content(
         str(file), out=out, size=USUAL_SIZE if size is None or size == "auto" else size, rig=rig
@@ -111,25 +106,23 @@ def _draw(name: str, content: Content, video: Path) -> None:
     print_line(f"{video}: {count} pictures of {name} ({content.kind})")
 
 
-def _view_live(
-    url: str, start: TrackerStart, host: str, port: int | None, rig: str | None, *, measures: bool
-) -> None:
+def _view_live(url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None) -> None:
     """Track a stream and show it until a signal or the stream ends it."""
     cameras = None if rig is None else load_rig(rig)
     with Console(stderr=True).status("getting ready"):
-        warm_up(start.user, start.labeler)
-    fewest = SHOWN * start.user[0].layout.num_markers if measures else None
+        warm_up(setup.user, setup.labeler)
     with (
         interrupt_flag() as ended,
         opened_server(host, port, "handsim view") as server,
-        closing(open_source(url, ended=ended)) as stream,
+        open_source(url, ended=ended) as stream,
     ):
         print_line(f"{url}: {address_of(server)} ; Ctrl-C ends it")
         with LiveStatus() as status:
-            first = [] if fewest is None else first_frames(stream, fewest, None, status)
-        tracker = start([frame for frame in first if len(frame.points) >= (fewest or 0)])
+            setup, frames = measured_setup(stream, setup, status)
+        tracker = setup.tracker()
         with closing(LiveView(server, tracker, cameras)) as live_view:
-            for frame, tracked in track_stream(stream, tracker):
+            for frame in frames:
+                tracked = tracker.step(frame.points, frame.ids, frame.time)
                 if not frame.silent:
                     live_view.offer(frame, tracked)
         print_line(f"{live_view.frames} frames tracked, {live_view.pictures} of them shown")

@@ -8,6 +8,8 @@ import stat
 from pathlib import Path
 from typing import Final
 
+from upath import UPath
+
 from handsim.errors import HandSimError
 
 _KINDS: Final = (
@@ -64,10 +66,10 @@ def read_bytes(path: Path, *, error: type[HandSimError], most: int | None = None
         raise error(f"{path}: cannot be read: {cause.strerror or cause}") from cause
 
 
-def checksum(path: Path) -> str:
+def checksum(path: Path | UPath) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
 _NO_WAITING: Final = getattr(os, "O_NONBLOCK", 0)

@@ -9,17 +9,17 @@ from pathlib import Path
 from handsim.errors import ArgumentError
 
 
-def check_outputs(inputs: Iterable[str | Path | None], outputs: Iterable[Path | None]) -> None:
+def check_outputs(inputs: Iterable[object], outputs: Iterable[Path | None]) -> None:
     """Refuse an output that names an input, also through a link or in another spelling.
 
     Args:
-        inputs: Files and folders that a command reads, and names that may be none; None where not given.
+        inputs: Files and folders that a command reads, and names that may be none; objects are no files.
         outputs: What it writes; None where not given.
 
     Raises:
         ArgumentError: An output is one of the inputs.
     """
-    read = [Path(name) for name in inputs if name is not None]
+    read = [Path(name) for name in inputs if isinstance(name, str | Path)]
     for output in (path for path in outputs if path is not None):
         for source in read:
             if _same(source, output):

@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from handsim._checks import check_array
+from handsim._checks import check_array, check_type
 from handsim.hand.capsules import Capsules, build_capsules
 from handsim.hand.contact import penetration_depth
 from handsim.hand.kinematics import bone_transforms
 from handsim.hand.mjcf import build_spec
-from handsim.hand.shape import HandShape, named_shape
+from handsim.hand.shape import SIZES, HandShape, named_shape
 from handsim.hand.skeleton import Skeleton, build_skeleton
 from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import HandSurface, build_surface
@@ -28,6 +28,7 @@ class HandModel:
     """
 
     def __init__(self, shape: HandShape) -> None:
+        check_type("shape", shape, HandShape, "a HandShape; HandModel.named takes the name of a size")
         self.shape = shape
         self.skeleton: Skeleton = build_skeleton(shape)
 
@@ -100,6 +101,23 @@ class HandModel:
             ArgumentError: `qpos` is not (T, 27) or not finite.
         """
         return penetration_depth(self.capsules, self.forward_kinematics(qpos))
+
+
+def load_model(model: HandModel | HandShape | str) -> HandModel:
+    """A hand as it is, of a shape, or a right one of a size by its name.
+
+    Args:
+        model: The hand, its measures [m], or XS, S, M, L or XL.
+
+    Raises:
+        ArgumentError: It is none of these.
+    """
+    if isinstance(model, HandModel):
+        return model
+    if isinstance(model, HandShape):
+        return HandModel(model)
+    check_type("model", model, str, "a HandModel, a HandShape or the name of a size", SIZES)
+    return HandModel.named(model)
 
 
 def join_qpos(

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from handsim._checks import check_array, check_number
+from handsim._checks import check_array, check_number, check_rng, check_type
 from handsim.errors import ArgumentError, choices
 from handsim.hand.topology import DIGITS, SIDES, Side
 
@@ -94,6 +94,7 @@ class HandShape:
     """Thickness [m] of the palm at the metacarpals."""
 
     def __post_init__(self) -> None:
+        check_type("side", self.side, str, "the name of one", SIDES)
         if self.side not in SIDES:
             raise ArgumentError(choices(self.side, SIDES, noun="side"))
         for name, shape in (
@@ -139,6 +140,7 @@ def named_shape(size: str, *, side: Side = "right") -> HandShape:
     Raises:
         ArgumentError: There is no such size or side.
     """
+    check_type("size", size, str, "the name of one", SIZES)
     if size not in SIZES:
         raise ArgumentError(choices(size, SIZES, noun="size"))
     length, breadth = SIZES[size]
@@ -185,7 +187,15 @@ def sample_shape(
     Returns:
         The hand's length and breadth [m], bone lengths (5, 3) [m], digit directions (5, 3) [rad] and radii
         (5, 4) [m].
+
+    Raises:
+        ArgumentError: An argument is of another type, or there is no such side.
     """
+    check_type("population", population, Population, "a Population")
+    check_type("side", side, str, "the name of one", SIDES)
+    if side not in SIDES:
+        raise ArgumentError(choices(side, SIDES, noun="side"))
+    check_rng(rng)
     sex = "female" if rng.random() < 0.5 else "male"
     (length_mean, length_sd), (breadth_mean, breadth_sd), correlation = _LENGTH_BREADTH[sex]
     first, second = np.clip(rng.standard_normal(2), -2.5, 2.5)

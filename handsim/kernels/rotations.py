@@ -124,3 +124,60 @@ def rotate_quaternion(
     scale = 1.0 / np.sqrt(after[0] ** 2 + after[1] ** 2 + after[2] ** 2 + after[3] ** 2)
     for n in range(4):
         after[n] *= scale
+
+
+@kernel
+def align_rigid(
+    source: Float[np.ndarray, "N 3"],
+    target: Float[np.ndarray, "N 3"],
+    weights: Float[np.ndarray, "N"],
+    pose: Float[np.ndarray, "7"],
+) -> float:
+    """`handsim.space.transforms.rigid_fit` for kernels: weighted, and some points may be missing.
+
+    Horn, Closed-form solution of absolute orientation using unit quaternions (1987).
+
+    Args:
+        source: Points in the body's frame [m].
+        target: The same points in the world [m]; NaN where missing.
+        weights: Weight of each pair.
+        pose: Position [m] and orientation (wxyz) of the body in the world; the first seven numbers
+            are filled.
+
+    Returns:
+        The weighted sum of squared distances that is left.
+    """
+    total, size = 0.0, 0.0
+    centers, products = np.zeros((2, 3)), np.zeros((3, 3))
+    for point in range(len(source)):
+        if not np.isnan(target[point, 0]):
+            total += weights[point]
+            centers[0] += weights[point] * source[point]
+            centers[1] += weights[point] * target[point]
+    centers /= total
+    for point in range(len(source)):
+        if np.isnan(target[point, 0]):
+            continue
+        for i in range(3):
+            a = source[point, i] - centers[0, i]
+            size += weights[point] * (a * a + (target[point, i] - centers[1, i]) ** 2)
+            for j in range(3):
+                products[i, j] += weights[point] * a * (target[point, j] - centers[1, j])
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = products
+    form = np.array(
+        [
+            [xx + yy + zz, yz - zy, zx - xz, xy - yx],
+            [yz - zy, xx - yy - zz, xy + yx, zx + xz],
+            [zx - xz, xy + yx, yy - xx - zz, yz + zy],
+            [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+        ]
+    )
+    values, vectors = np.linalg.eigh(form)
+    rotation = np.empty((3, 3))
+    pose[3:7] = vectors[:, 3]
+    write_quaternion_matrix(rotation, pose[3], pose[4], pose[5], pose[6])
+    for i in range(3):
+        pose[i] = centers[1, i]
+        for j in range(3):
+            pose[i] -= rotation[i, j] * centers[0, j]
+    return size - 2.0 * values[3]  # type: ignore[no-any-return]

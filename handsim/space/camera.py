@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, choices
-from handsim.space.lens import Lens
+from handsim.kernels.kernel import kernel
+from handsim.space.lens import PINHOLE, Lens, distort_ray
 
 _LARGEST: Final = 8192  # [px]
+_NEAREST: Final = 1e-6  # [m] ahead of a camera, from which on it sees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,7 +25,8 @@ class Camera:
     """A calibrated camera, OpenCV axes: x right, y down, z into the picture.
 
     Pixel coordinates go right and down from the picture's corner, so that the first pixel's center is at
-    (0.5, 0.5); OpenCV's and MuJoCo's own counts begin half a pixel later.
+    (0.5, 0.5); OpenCV's and MuJoCo's own counts begin half a pixel later. Cameras are equal where all their
+    numbers are.
 
     Raises:
         ArgumentError: The size is out of range, `K` is not a camera matrix, or the pose is not rigid.
@@ -40,11 +44,7 @@ class Camera:
     def __post_init__(self) -> None:
         object.__setattr__(self, "K", check_array("K", self.K, (3, 3)))
         object.__setattr__(self, "T_world_camera", check_array("T_world_camera", self.T_world_camera, (4, 4)))
-        if not all(1 <= length <= _LARGEST for length in self.size):
-            raise ArgumentError(
-                f"camera '{self.name}' has pictures of {self.size[0]} x {self.size[1]} pixels, "
-                f"expected 1 to {_LARGEST} each way"
-            )
+        object.__setattr__(self, "size", _checked_size(self.name, self.size))
         rest = self.K.copy()
         rest[0, 0] = rest[1, 1] = rest[0, 2] = rest[1, 2] = 0.0
         if not (self.K[0, 0] > 0.0 and self.K[1, 1] > 0.0) or np.abs(rest - np.diag([0, 0, 1])).max() > 0.0:
@@ -52,8 +52,35 @@ class Camera:
                 f"camera '{self.name}': K is not a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
             )
         rotation = self.T_world_camera[:3, :3]
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5 or np.linalg.det(rotation) < 0.0:
+        if (
+            np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-5
+            or np.linalg.det(rotation) < 0.0
+            or not np.array_equal(self.T_world_camera[3], [0.0, 0.0, 0.0, 1.0])
+        ):
             raise ArgumentError(f"camera '{self.name}': T_world_camera is not a rigid transform")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Camera) and self.record() == other.record()
+
+    def __hash__(self) -> int:
+        return hash((self.name, tuple(self.size), self.lens))
+
+    @property
+    def focal_lengths(self) -> tuple[float, float]:
+        """Focal lengths along x and y [px]."""
+        return float(self.K[0, 0]), float(self.K[1, 1])
+
+    @property
+    def focal_length(self) -> float:
+        """Their geometric mean [px]."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Opening angles across the picture's width and height, without the lens [rad]."""
+        (width, height), (fx, fy), (cx, cy) = self.size, self.focal_lengths, self.K[:2, 2]
+        across = np.arctan2(cx, fx) + np.arctan2(width - cx, fx)
+        return float(across), float(np.arctan2(cy, fy) + np.arctan2(height - cy, fy))
 
     def at(self, T_world_camera: Float[np.ndarray, "4 4"]) -> Camera:
         """The same camera with another pose [m]."""
@@ -70,12 +97,20 @@ class Camera:
         pixels: NDArray[np.float64] = normalized * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
         return pixels
 
+    def unproject(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
+        """Unit directions in the camera's axes of pixels [px]; NaN for those that no ray meets."""
+        return self.lens.undistort((pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]])
+
+    def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
+        """Whether world points [m] are in front of the camera and, through its lens, inside its picture."""
+        seen: NDArray[np.bool_] = points_in_view(camera_arrays((self,)), points)[..., 0]
+        return seen
+
     def rays(self) -> Float[np.ndarray, "H W 3"]:
         """Unit directions in the camera's axes through the centers of all pixels."""
         width, height = self.size
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        normalized = (np.stack([columns, rows], axis=-1) - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
-        return self.lens.undistort(normalized)
+        return self.unproject(np.stack([columns, rows], axis=-1))
 
     def record(self) -> dict[str, Any]:
         """The camera as a JSON record."""
@@ -86,6 +121,19 @@ class Camera:
             "T_world_camera": self.T_world_camera.tolist(),
             "lens": {"kind": self.lens.kind, "coefficients": list(self.lens.coefficients)},
         }
+
+
+def _checked_size(name: str, size: object) -> tuple[int, int]:
+    """Width and height [px] as whole numbers."""
+    sides = np.asarray(size)
+    if sides.shape != (2,) or sides.dtype.kind not in "iuf" or (sides % 1 != 0).any():
+        raise ArgumentError(f"camera '{name}': size is {size}, expected width and height in whole pixels")
+    if not ((sides >= 1) & (sides <= _LARGEST)).all():
+        raise ArgumentError(
+            f"camera '{name}' has pictures of {sides[0]} x {sides[1]} pixels, "
+            f"expected 1 to {_LARGEST} each way"
+        )
+    return int(sides[0]), int(sides[1])
 
 
 def pinhole(
@@ -103,11 +151,95 @@ def pinhole(
     return Camera(name, size, np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]]))
 
 
-def camera_from_record(record: dict[str, Any]) -> Camera:
+def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """`T_world_camera` of a camera at `position` [m] that looks at `target` [m], upright (world z)."""
+    forward = (target - position) / np.linalg.norm(target - position)
+    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    pose[:3, 3] = position
+    return pose
+
+
+def focal_of_angle(length: float, angle: float) -> float:
+    """The focal length [px] at which so many pixels span this angle [rad]."""
+    return float(length / 2 / np.tan(angle / 2))
+
+
+def camera_from_record(record: Mapping[str, Any]) -> Camera:
     """The camera of a record of `Camera.record`."""
     lens = Lens(record["lens"]["kind"], tuple(record["lens"]["coefficients"]))
-    size = int(record["size"][0]), int(record["size"][1])
-    return Camera(record["name"], size, np.array(record["K"]), np.array(record["T_world_camera"]), lens)
+    return Camera(record["name"], record["size"], record["K"], record["T_world_camera"], lens)
+
+
+class CameraArrays(NamedTuple):
+    """C cameras as compiled functions take them."""
+
+    T_world_camera: Float[np.ndarray, "C 4 4"]
+    """[m]"""
+    intrinsics: Float[np.ndarray, "C 4"]
+    """Focal lengths along x and y and the principal point [px]."""
+    sizes: Float[np.ndarray, "C 2"]
+    """Width and height [px]."""
+    lenses: Float[np.ndarray, "C 7"]
+    """`Lens.row` of each."""
+
+
+def camera_arrays(cameras: Sequence[Camera]) -> CameraArrays:
+    """The numbers of one camera or more."""
+    return CameraArrays(
+        np.stack([one.T_world_camera for one in cameras]),
+        np.stack([one.K[[0, 1, 0, 1], [0, 1, 2, 2]] for one in cameras]),
+        np.array([one.size for one in cameras], dtype=np.float64),
+        np.stack([one.lens.row for one in cameras]),
+    )
+
+
+def points_in_view(
+    cameras: CameraArrays, points: Float[np.ndarray, "*batch 3"]
+) -> Bool[np.ndarray, "*batch C"]:
+    """Which cameras have each world point [m] in front of them and inside their pictures."""
+    flat = np.ascontiguousarray(points, dtype=np.float64)
+    seen = np.empty((*flat.shape[:-1], len(cameras.sizes)), dtype=np.bool_)
+    _points_in_view(cameras, flat.reshape(-1, 3), seen.reshape(-1, len(cameras.sizes)))
+    return seen
+
+
+@kernel(inline=True)
+def in_picture(inner: Any, size: Any, lens: Any, x: float, y: float, z: float) -> bool:
+    """Whether a camera has a point in its picture.
+
+    Args:
+        inner: Its row of `CameraArrays.intrinsics`.
+        size: Its row of `CameraArrays.sizes`.
+        lens: Its row of `CameraArrays.lenses`.
+        x: Of the point in the camera's axes [m], right.
+        y: Down.
+        z: Ahead.
+    """
+    u, v = x / z, y / z
+    if lens[0] != PINHOLE:  # the call costs more than all the rest
+        u, v = distort_ray(lens, x, y, z)
+    u, v = u * inner[0] + inner[2], v * inner[1] + inner[3]
+    inside = (u >= 0.0) & (u < size[0]) & (v >= 0.0) & (v < size[1])  # never so for NaN
+    return bool((z > _NEAREST) & inside)
+
+
+@kernel
+def _points_in_view(cameras: Any, points: Any, seen: Any) -> None:
+    for c in range(len(cameras.sizes)):
+        pose, inner = cameras.T_world_camera[c], cameras.intrinsics[c]
+        size, lens = cameras.sizes[c], cameras.lenses[c]
+        for n in range(len(points)):
+            x, y, z = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+            seen[n, c] = in_picture(
+                inner, size, lens,
+                pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z,
+                pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z,
+                pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z,
+            )  # fmt: skip
 
 
 def _presets() -> dict[str, Camera]:

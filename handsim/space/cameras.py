@@ -1,19 +1,22 @@
-"""Camera rigs: poses, field of view and resolution of the cameras around the hand, by name or from a file."""
+"""Camera rigs: the cameras around the hands, by name, from a file, or as objects."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_array
-from handsim.errors import ArgumentError, RigError, choices
+from handsim._checks import check_type
+from handsim.errors import ArgumentError, HandSimError, RigError, choices
 from handsim.files.atomic import atomic_write
-from handsim.space.rig_file import read_rig_file, rig_lines
+from handsim.space.camera import Camera, CameraArrays, camera_arrays, camera_from_record, points_in_view
+from handsim.space.rig_file import check_near, read_rig_file, rig_lines
 
 FEWEST_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32
@@ -22,90 +25,85 @@ ROOM_CENTER: Final = (0.0, 0.0, 1.1)
 """Middle of the space that hands move in, in front of a seated user [m]."""
 HAND_REACH: Final = 0.25
 """No hand reaches further from its wrist [m]; cameras stand at least this far from the wrists' volume."""
-_WIDEST: Final = 170.0  # [deg]
-_FARTHEST: Final = 50.0  # [m]
 _APART: Final = 1e-3  # [m]
 _SHIPPED: Final = Path(__file__).parents[1] / "rigs"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True)
 class CameraRig:
-    """Calibrated cameras, OpenCV axes: x right, y down, z into the picture.
+    """Calibrated cameras around the hands, each with its own picture and lens.
 
-    Messages count cameras from 1, in the order given.
+    Messages count cameras from 1, in the order given. Rigs are equal where their names and cameras are.
 
     Raises:
-        ArgumentError: `T_world_camera` is not (C, 4, 4) or not finite.
-        RigError: Too few or too many cameras, two at one position, a pose that is not rigid or lies beyond
-            50 m, or a field of view or resolution that no camera has.
+        ArgumentError: What is given are no cameras.
+        RigError: Too few or too many cameras, two at one position, or one beyond 50 m.
     """
 
     name: str
-    T_world_camera: Float[np.ndarray, "C 4 4"]
-    """Pose of each camera in the world [m]."""
-    field_of_view: float
-    """Full opening angle of the round view cone [rad]."""
-    resolution: int = 1280
-    """Pixels across the field of view."""
+    cameras: Sequence[Camera]
+    """2 to 32, kept as a tuple."""
 
     def __post_init__(self) -> None:
-        poses = check_array("T_world_camera", self.T_world_camera, (None, 4, 4))
-        object.__setattr__(self, "T_world_camera", poses)
-        if not FEWEST_CAMERAS <= len(poses) <= MAX_CAMERAS:
-            raise RigError(
-                f"rig '{self.name}' has {len(poses)} cameras, expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
+        if not isinstance(self.cameras, Sequence) or not all(isinstance(one, Camera) for one in self.cameras):
+            raise ArgumentError(
+                f"rig '{self.name}' has {type(self.cameras).__name__} as cameras, "
+                "expected a sequence of Camera"
             )
-        degrees = np.rad2deg(self.field_of_view)
-        if not 1.0 <= degrees <= _WIDEST:
+        object.__setattr__(self, "cameras", tuple(self.cameras))
+        if not FEWEST_CAMERAS <= len(self.cameras) <= MAX_CAMERAS:
             raise RigError(
-                f"rig '{self.name}': field_of_view is {degrees:g} degrees, expected 1 to {_WIDEST:g}"
+                f"rig '{self.name}' has {len(self.cameras)} cameras, "
+                f"expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
             )
-        if not 16 <= self.resolution <= 65536:
-            raise RigError(f"rig '{self.name}': resolution is {self.resolution} pixels, expected 16 to 65536")
-        for number, pose in enumerate(poses, 1):
-            _check_pose(f"camera {number} of rig '{self.name}'", pose)
+        for number, camera in enumerate(self.cameras, 1):
+            check_near(f"camera {number} of rig '{self.name}'", camera)
         _check_apart(self.name, self.positions)
+
+    @functools.cached_property
+    def arrays(self) -> CameraArrays:
+        """All cameras' numbers, for compiled functions."""
+        return camera_arrays(self.cameras)
+
+    @property
+    def T_world_camera(self) -> Float[np.ndarray, "C 4 4"]:
+        """Pose of each camera in the world [m]."""
+        return self.arrays.T_world_camera
 
     @property
     def positions(self) -> Float[np.ndarray, "C 3"]:
         """Optical centers in the world [m]."""
         return self.T_world_camera[:, :3, 3]
 
-    @property
-    def focal_length(self) -> float:
-        """Focal length of every camera [px]."""
-        return float(self.resolution / 2 / np.tan(self.field_of_view / 2))
-
     def in_view(self, points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch C"]:
-        """Which cameras have each point [m], in the world, inside their view cone."""
-        rays = points[..., None, :] - self.positions
-        ahead = np.einsum("...ci,ci->...c", rays, self.T_world_camera[:, :3, 2])
-        inside: NDArray[np.bool_] = ahead >= np.cos(self.field_of_view / 2) * np.linalg.norm(rays, axis=-1)
-        return inside
+        """Which cameras have each point [m], in the world, in front of them and inside their pictures."""
+        return points_in_view(self.arrays, points)
 
     def project(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch C 2"]:
-        """Pixel of each point [m] in each camera [px], right and down from the picture's center.
+        """Pixel of each point [m] in each camera [px], as `Camera` counts: from the picture's corner.
 
-        NaN for points that are not in front of the camera. Points outside the view cone are projected too;
+        NaN for points that a camera's lens does not see. Points outside the picture are projected too;
         `in_view` tells them apart.
         """
-        rays = points[..., None, :] - self.positions
-        x, y, depth = np.moveaxis(np.einsum("...ci,cij->...cj", rays, self.T_world_camera[:, :3, :3]), -1, 0)
-        scale = self.focal_length / np.where(depth > 0.0, depth, np.nan)
-        pixels: NDArray[np.float64] = np.stack([x * scale, y * scale], axis=-1)
-        return pixels
+        return np.stack([one.project(points) for one in self.cameras], axis=-2)
 
+    def without(self, number: int) -> CameraRig:
+        """The rig without the camera of this index."""
+        return CameraRig(self.name, (*self.cameras[:number], *self.cameras[number + 1 :]))
 
-def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """`T_world_camera` of a camera at `position` [m] that looks at `target` [m], upright (world z)."""
-    forward = (target - position) / np.linalg.norm(target - position)
-    up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    pose[:3, 3] = position
-    return pose
+    def pictures(self) -> str:
+        """The cameras' pictures in words: their sizes, and the angles that they show without lenses."""
+        sizes = dict.fromkeys(f"{width} x {height}" for width, height in (one.size for one in self.cameras))
+        angles = np.rad2deg([one.angles for one in self.cameras]).T
+        degrees = " x ".join(
+            f"{low:.0f}" if round(low) == round(high) else f"{low:.0f} to {high:.0f}"
+            for low, high in zip(angles.min(axis=1), angles.max(axis=1), strict=True)
+        )
+        return f"{' and '.join(sizes)} pixels, {degrees} degrees"
+
+    def record(self) -> dict[str, Any]:
+        """The rig as a JSON record, which `as_rig` reads."""
+        return {"name": self.name, "cameras": [one.record() for one in self.cameras]}
 
 
 def list_rigs() -> tuple[str, ...]:
@@ -119,9 +117,7 @@ def named_rig(name: str) -> CameraRig:
     Raises:
         ArgumentError: There is no rig of that name.
     """
-    if name not in list_rigs():
-        raise ArgumentError(choices(name, list_rigs(), noun="camera rig"))
-    return _read(_SHIPPED / f"{name}.toml")
+    return _read(_shipped(name))
 
 
 def rig_description(name: str) -> str:
@@ -130,69 +126,83 @@ def rig_description(name: str) -> str:
     Raises:
         ArgumentError: There is no rig of that name.
     """
-    if name not in list_rigs():
-        raise ArgumentError(choices(name, list_rigs(), noun="camera rig"))
-    return read_rig_file(_SHIPPED / f"{name}.toml").description
+    return read_rig_file(_shipped(name)).description
 
 
-def load_rig(name_or_path: str | Path) -> CameraRig:
+def load_rig(rig: CameraRig | str | Path) -> CameraRig:
     """A shipped rig by its name, or your own by the path of its `.toml` file (format: docs/rigs.md).
 
     Args:
-        name_or_path: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, or a path.
+        rig: `figure5` (sixteen cameras, as in the paper), `eight`, `six`, or a path; a rig is given back.
 
     Returns:
-        The rig with its camera poses (C, 4, 4) [m], field of view [rad] and resolution [px].
+        The rig, each camera with its pose [m], its intrinsics [px] and its lens.
 
     Raises:
+        ArgumentError: It is nothing of these.
         RigError: No such rig or file, or the file does not describe one; the sentence names the file.
     """
-    if str(name_or_path) in list_rigs():
-        return named_rig(str(name_or_path))
-    path = Path(name_or_path)
+    if isinstance(rig, CameraRig):
+        return rig
+    check_type("rig", rig, (str, Path), "a CameraRig, or the name or path of one", list_rigs())
+    if str(rig) in list_rigs():
+        return named_rig(str(rig))
+    path = Path(rig)
     if path.suffix.lower() != ".toml":
-        unknown = choices(str(name_or_path), list_rigs(), noun="camera rig")
+        unknown = choices(str(rig), list_rigs(), noun="camera rig")
         raise RigError(f"{unknown}, or the path of a .toml file")
     return _read(path)
 
 
+def as_rig(rig: CameraRig | str | Path | Mapping[str, Any]) -> CameraRig:
+    """The rig of whatever stands for one: as `load_rig`, and the record of one (`CameraRig.record`).
+
+    Raises:
+        ArgumentError: It is nothing of these.
+        RigError: There is no such rig, or it cannot be one.
+    """
+    if not isinstance(rig, Mapping):
+        return load_rig(rig)
+    try:
+        return CameraRig(rig["name"], [camera_from_record(one) for one in rig["cameras"]])
+    except (KeyError, TypeError) as error:
+        raise RigError(
+            f"a damaged record of a rig ({error!r}), expected what CameraRig.record() gives"
+        ) from error
+
+
+def rig_setting(rig: CameraRig | str | Path | Mapping[str, Any]) -> str | dict[str, Any]:
+    """What stands for a rig in settings: its name if it comes with the package, else its cameras.
+
+    Raises:
+        RigError: As `as_rig`.
+    """
+    found = as_rig(rig)
+    return found.name if found.name in list_rigs() and found == named_rig(found.name) else found.record()
+
+
 def save_rig(path: Path, rig: CameraRig) -> None:
-    """Write a rig's `.toml` file, numbers to nine decimals; `load_rig` gives the same cameras again.
+    """Write a rig's `.toml` file; `load_rig` gives an equal rig again.
 
     Raises:
         OSError: The file cannot be written.
     """
-    degrees = float(np.rad2deg(rig.field_of_view))
-    lines = rig_lines(rig.name, degrees, rig.resolution, rig.T_world_camera)
     with atomic_write(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        temporary.write_text("\n".join(rig_lines(rig.name, rig.cameras)) + "\n", encoding="utf-8")
+
+
+def _shipped(name: str) -> Path:
+    if name not in list_rigs():
+        raise ArgumentError(choices(name, list_rigs(), noun="camera rig"))
+    return _SHIPPED / f"{name}.toml"
 
 
 def _read(path: Path) -> CameraRig:
-    table = read_rig_file(path)
+    read = read_rig_file(path)
     try:
-        poses = [
-            aimed(f"camera {number}", *camera) if isinstance(camera, tuple) else camera
-            for number, camera in enumerate(table.cameras, 1)
-        ]
-        if not poses:
-            raise RigError(f"rig '{table.name}' has 0 cameras, expected {FEWEST_CAMERAS} to {MAX_CAMERAS}")
-        return CameraRig(table.name, np.stack(poses), np.deg2rad(table.field_of_view), table.resolution)
-    except RigError as error:
+        return CameraRig(read.name, read.cameras)
+    except HandSimError as error:
         raise RigError(f"{path}: {error}") from error
-
-
-def aimed(
-    owner: str, position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
-) -> NDArray[np.float64]:
-    """`look_at` [m] for a camera of a file.
-
-    Raises:
-        RigError: The target is the position.
-    """
-    if np.linalg.norm(target - position) < _APART:
-        raise RigError(f"{owner} looks at its own position; expected a target in front of it")
-    return look_at(position, target)
 
 
 def check_outside(
@@ -241,22 +251,6 @@ def check_outside_volume(
         raise ArgumentError(
             f"camera {distances.argmin() + 1} of rig '{rig.name}' is {distances.min():.2g} m from the space "
             f"that wrists move in, expected at least {clearance:g} m"
-        )
-
-
-def _check_pose(owner: str, pose: NDArray[np.float64]) -> None:
-    rotation = pose[:3, :3]
-    if (
-        not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-6)
-        or np.linalg.det(rotation) < 0.0
-        or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0])
-    ):
-        raise RigError(f"{owner}: T_world_camera is not a rotation and a position, expected a rigid pose")
-    distance = np.linalg.norm(pose[:3, 3])
-    if distance > _FARTHEST:
-        raise RigError(
-            f"{owner} stands {distance:.4g} m from the origin, expected at most {_FARTHEST:g} m; "
-            "are these millimeters? Positions are in meters"
         )
 
 

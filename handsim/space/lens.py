@@ -8,16 +8,21 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, choices
+from handsim.kernels.kernel import kernel
 
 LensKind = Literal["pinhole", "brown", "fisheye"]
 _COEFFICIENTS: Final[dict[str, int]] = {"pinhole": 0, "brown": 5, "fisheye": 4}
+PINHOLE: Final = 0
+"""The kind of a pinhole in `Lens.row`; a Brown lens is 1."""
+_FISHEYE: Final = 2
+_STEP: Final = 1e-5  # [focal lengths] of the central differences of a Jacobian
 _NODES: Final = 1024  # of the table that starts the search
 _STEPS: Final = 12  # of Newton's method; three are enough away from a fold
 _SETTLED: Final = 1e-12
@@ -57,19 +62,35 @@ class Lens:
         Returns:
             NaN for directions that the lens does not see: behind a pinhole or Brown lens, and beyond a fold.
         """
-        x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
-        if self.kind == "fisheye":
-            across = np.hypot(x, y)
-            theta = np.arctan2(across, z)
-            theta = np.where(theta <= self._fold_radius(), theta, np.nan)
-            scale = np.where(across > 1e-12, self._distorted(theta) / np.maximum(across, 1e-12), 1.0)
-            return np.stack([x * scale, y * scale], axis=-1)
-        ahead = np.where(z > 0.0, z, np.nan)
-        flat = np.stack([x / ahead, y / ahead], axis=-1)
-        if self.kind == "pinhole":
-            return flat
-        seen = (flat**2).sum(axis=-1, keepdims=True) <= self._fold_radius() ** 2
-        return self._brown(np.where(seen, flat, np.nan))
+        return self._image_points(directions, self.row)
+
+    def jacobian(self, directions: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2 2"]:
+        """How far image points move per tangent of their rays: derivatives of `distort` by x/z and y/z.
+
+        Args:
+            directions: In the camera's axes, z ahead; of any length.
+
+        Returns:
+            The identity for a pinhole; NaN where the lens does not see.
+        """
+        rays = np.ascontiguousarray(directions, dtype=np.float64)
+        jacobians = np.empty((*rays.shape[:-1], 2, 2))
+        _distort_jacobians(self.row, rays.reshape(-1, 3), jacobians.reshape(-1, 4))
+        return jacobians
+
+    @property
+    def row(self) -> Float[np.ndarray, "7"]:
+        """The lens as compiled functions take it: its kind, five coefficients and the radius of its fold."""
+        row = np.zeros(7)
+        row[0], row[6] = list(_COEFFICIENTS).index(self.kind), self._fold_radius()
+        row[1 : 1 + len(self.coefficients)] = self.coefficients
+        return row
+
+    def _image_points(self, directions: NDArray[np.float64], row: NDArray[np.float64]) -> NDArray[np.float64]:
+        rays = np.ascontiguousarray(directions, dtype=np.float64)
+        points = np.empty((*rays.shape[:-1], 2))
+        _distort_rays(row, rays.reshape(-1, 3), points.reshape(-1, 2))
+        return points
 
     def undistort(self, points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
         """Unit directions of the rays of image points: the inverse of `distort`.
@@ -126,13 +147,10 @@ class Lens:
         return np.where(across <= self._distorted(np.array(longest)), r, np.nan)
 
     def _brown(self, flat: NDArray[np.float64]) -> NDArray[np.float64]:
-        x, y = flat[..., 0], flat[..., 1]
-        _, _, p1, p2, _ = self.coefficients
-        square = x * x + y * y
-        radial = _polynomial(self._radial, square)
-        bent_x = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
-        bent_y = y * radial + p1 * (square + 2.0 * y * y) + 2.0 * p2 * x * y
-        return np.stack([bent_x, bent_y], axis=-1)
+        """Image points (*batch, 2) of tangents, beyond the fold too."""
+        row = self.row
+        row[6] = np.inf
+        return self._image_points(np.concatenate([flat, np.ones_like(flat[..., :1])], axis=-1), row)
 
     def _undistort_brown(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """The inverse of `_brown`: its radial part, then Newton's method in the plane; NaN where it fails."""
@@ -170,6 +188,72 @@ class Lens:
         step_x = (yy * residual[..., 0] - xy * residual[..., 1]) / determinant
         step_y = (xx * residual[..., 1] - xy * residual[..., 0]) / determinant
         return np.clip(np.stack([step_x, step_y], axis=-1), -0.5, 0.5)
+
+
+@kernel
+def distort_ray(lens: Any, x: float, y: float, z: float) -> tuple[float, float]:
+    """The image point of one ray [focal lengths]; NaN where the lens does not see.
+
+    Args:
+        lens: `Lens.row`.
+        x: Right, of a direction of any length in the camera's axes.
+        y: Down.
+        z: Ahead.
+    """
+    if lens[0] == _FISHEYE:
+        across = np.hypot(x, y)
+        theta = np.arctan2(across, z)
+        if not theta <= lens[6]:
+            return np.nan, np.nan
+        square = theta * theta
+        radial = 1.0 + (((lens[4] * square + lens[3]) * square + lens[2]) * square + lens[1]) * square
+        scale = theta * radial / across if across > 1e-12 else 1.0
+        return x * scale, y * scale
+    if not z > 0.0:
+        return np.nan, np.nan
+    u, v = x / z, y / z
+    if lens[0] == PINHOLE:
+        return u, v
+    square = u * u + v * v
+    if not square <= lens[6] * lens[6]:
+        return np.nan, np.nan
+    radial = 1.0 + ((lens[5] * square + lens[2]) * square + lens[1]) * square
+    p1, p2 = lens[3], lens[4]
+    return (
+        u * radial + 2.0 * p1 * u * v + p2 * (square + 2.0 * u * u),
+        v * radial + p1 * (square + 2.0 * v * v) + 2.0 * p2 * u * v,
+    )
+
+
+@kernel
+def distort_jacobian(lens: Any, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Derivatives of one ray's image point by x/z and y/z, row by row; see `distort_ray`."""
+    if lens[0] == PINHOLE:
+        return 1.0, 0.0, 0.0, 1.0
+    if not z > 0.0:
+        return np.nan, np.nan, np.nan, np.nan
+    u, v = x / z, y / z
+    right, left = distort_ray(lens, u + _STEP, v, 1.0), distort_ray(lens, u - _STEP, v, 1.0)
+    below, above = distort_ray(lens, u, v + _STEP, 1.0), distort_ray(lens, u, v - _STEP, 1.0)
+    width = 2.0 * _STEP
+    return (
+        (right[0] - left[0]) / width,
+        (below[0] - above[0]) / width,
+        (right[1] - left[1]) / width,
+        (below[1] - above[1]) / width,
+    )
+
+
+@kernel
+def _distort_rays(lens: Any, rays: Any, points: Any) -> None:
+    for n in range(len(rays)):
+        points[n, 0], points[n, 1] = distort_ray(lens, rays[n, 0], rays[n, 1], rays[n, 2])
+
+
+@kernel
+def _distort_jacobians(lens: Any, rays: Any, jacobians: Any) -> None:
+    for n in range(len(rays)):
+        jacobians[n] = distort_jacobian(lens, rays[n, 0], rays[n, 1], rays[n, 2])
 
 
 def _polynomial(coefficients: tuple[float, ...], square: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim._checks import check_array
+from handsim._checks import check_array, check_number, check_rng, check_type
 from handsim.errors import ArgumentError
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import HandModel, join_qpos, load_model
 from handsim.hand.motion import HandMotion
+from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_JOINTS
 from poses.motion.minimum_jerk import MotionConfig, held, minimum_jerk, straight_path
 from poses.motion.rest_paths import path_to_rest
@@ -30,26 +31,33 @@ _POSES_A_DRAW: Final = 8
 
 
 def sample_motion(
-    model: HandModel, duration: float, config: MotionConfig | None = None, *, rng: np.random.Generator
+    model: HandModel | HandShape | str,
+    duration: float,
+    config: MotionConfig | None = None,
+    *,
+    rng: np.random.Generator,
 ) -> HandMotion:
     """Random smooth motion of one hand through valid poses, valid at every frame.
 
     Args:
-        model: The hand.
+        model: The hand, its shape, or one of the sizes XS, S, M, L, XL.
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
         config: Speeds and positions; human ones by default.
         rng: Source of all randomness.
 
     Raises:
-        ArgumentError: The duration is not positive or less than a step.
+        ArgumentError: An argument is of another type, or the duration is not positive or less than a step.
         PoseError: This hand has no room for its fingers, or no path leads out of a pose.
     """
-    config = config or MotionConfig()
+    hand, config = load_model(model), config or MotionConfig()
+    check_type("config", config, MotionConfig, "a MotionConfig")
+    check_number("duration", duration, 0.0, above=True)
+    check_rng(rng)
     frames = count_frames(duration, config)
-    angles = sample_valid_angles(model, 1, rng=rng)
+    angles = sample_valid_angles(hand, 1, rng=rng)
     parts, count = [angles], 1
     while count < frames:
-        part = _next_path(model, parts[-1][-1], config, rng)
+        part = _next_path(hand, parts[-1][-1], config, rng)
         parts.append(part)
         count += len(part)
     return with_wrist(np.concatenate(parts)[:frames], config, rng=rng)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from handsim._checks import check_array
 from handsim.errors import PoseError
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import HandModel, join_qpos, load_model
+from handsim.hand.shape import HandShape
 from handsim.hand.topology import JOINTS, NUM_QPOS
 from poses.shapes.couplings import HIGH, LOW
 from poses.shapes.library import gesture
@@ -33,17 +34,17 @@ def is_valid(
     return inside & free
 
 
-def validate(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Bool[np.ndarray, "T"]:
+def validate(model: HandModel | HandShape | str, qpos: Float[np.ndarray, "T 27"]) -> Bool[np.ndarray, "T"]:
     """Which poses this hand can strike: in range, and at most 1 mm deep in itself (`MAX_PENETRATION`).
 
     Args:
-        model: The hand.
+        model: The hand, its shape, or one of the sizes XS, S, M, L, XL.
         qpos: Wrist position [m], wrist orientation (wxyz), joint angles [rad]; the wrist may be anywhere.
 
     Raises:
-        ArgumentError: `qpos` is not (T, 27) or not finite.
+        ArgumentError: `model` is none of these, or `qpos` is not (T, 27) or not finite.
     """
-    return is_valid(model, check_array("qpos", qpos, (None, NUM_QPOS))[:, 7:])
+    return is_valid(load_model(model), check_array("qpos", qpos, (None, NUM_QPOS))[:, 7:])
 
 
 def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:

@@ -20,8 +20,8 @@ from scipy.ndimage import uniform_filter1d
 from gloves.takes.take import Take
 from handsim.errors import ArgumentError, HandSimWarning, RigError, choices
 from handsim.hand.keypoints import hand_keypoints
-from handsim.space.camera import Camera, preset
-from handsim.space.cameras import load_rig, look_at
+from handsim.space.camera import Camera, look_at, preset
+from handsim.space.cameras import load_rig
 from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
 

@@ -20,13 +20,10 @@ from gloves.takes.take import STATUSES, RigidBody, Take
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
-from track.benchmark.answers import Answers, save_answers
-from track.benchmark.difficulties import Plan
-from track.benchmark.manifest import MANIFEST, capture_path, truth_path, user_path, write_manifest
 from track.bodies.body_file import save_body
 from track.bodies.rigid_body import RigidTemplate
 from track.streams.natnet import MarkerFrame, ServerInfo, pack_frame, pack_server_info
-from track.user import save_user
+from track.user import User
 
 FRAMES, COLUMNS = 4, 24
 SETTINGS = {"num_frames": 10, "glove": "dense19", "scenes": {"one": 1.0}}
@@ -106,14 +103,6 @@ def rig(folder: Path) -> list[Path]:
     camera = "[[camera]]\nposition = [{}, 0.0, 2.0]\ntarget = [0.0, 0.0, 1.1]\n"
     (folder / "rig.toml").write_text(top + camera.format(1.5) + camera.format(-1.5))
     return [folder / "rig.toml"]
-
-
-def sweep(folder: Path) -> list[Path]:
-    lists = 'gloves = ["dense19", "sparse13"]\nrigs = ["figure5"]\npeople = [0, 1]\nseeds = [3]\n'
-    tables = "[generate]\nnum_frames = 100\n[train]\nnetwork.width = 16\n[track]\nusers = 'calibrated'\n"
-    varied = '[vary]\n"train.rig_share" = [0, 0.5]\n"simulate.hands" = [["right"], ["left"]]\n'
-    (folder / "sweep.toml").write_text(lists + tables + varied)
-    return [folder / "sweep.toml"]
 
 
 def camera_files(folder: Path) -> list[Path]:
@@ -214,19 +203,13 @@ def tracked(folder: Path) -> list[Path]:
 
 
 def user(folder: Path) -> list[Path]:
-    save_user(folder / "user.json", hands(), "calibrated")
+    User(hands(), "calibrated").save(folder / "user.json")
     return [folder / "user.json"]
 
 
 def settings(folder: Path) -> list[Path]:
     (folder / "config.json").write_text(json.dumps(SETTINGS))
     return [folder / "config.json"]
-
-
-def receipt(folder: Path) -> list[Path]:
-    files = {f"rows-{number:05d}.npy": {"bytes": 5 * number, "sha256": "ab" * 32} for number in range(3)}
-    (folder / "00000.json").write_text(json.dumps({"files": files}))
-    return [folder / "00000.json"]
 
 
 def packets(folder: Path) -> list[Path]:
@@ -300,45 +283,3 @@ def checkpoint(folder: Path) -> list[Path]:
 
     state(folder).save(folder / "checkpoint.pt")
     return [folder / "checkpoint.pt"]
-
-
-RESULTS_OF = "hand-pen-easy-1"
-
-
-def benchmark_capture() -> Capture:
-    """Points on the grid of a benchmark's files, with a gap."""
-    positions = np.round(_rng().uniform(0.0, 0.2, size=(FRAMES, 5, 3)), 5)
-    positions[1, 3] = np.nan
-    return Capture(tuple(f"Unlabeled{number + 1}" for number in range(5)), positions, 120.0)
-
-
-def result_table(folder: Path) -> list[Path]:
-    rows = ["1,Unlabeled1,right:ThumbTip", "2,Unlabeled3,left:RingTip", "2,Unlabeled1,none"]
-    (folder / f"{RESULTS_OF}.csv").write_text("\n".join(["frame,point,label", *rows]) + "\n")
-    return [folder / f"{RESULTS_OF}.csv"]
-
-
-def result_arrays(folder: Path) -> list[Path]:
-    rng, labels = _rng(), np.full((FRAMES, 5), -1)
-    labels[:, :3] = [4, 20, 37]
-    answers = Answers(labels, rng.uniform(size=(FRAMES, 2, 21, 3)), rng.uniform(size=(FRAMES, 2, 20)))
-    save_answers(folder / f"{RESULTS_OF}.npz", answers)
-    return [folder / f"{RESULTS_OF}.npz"]
-
-
-def result_points(folder: Path) -> list[Path]:
-    found = benchmark_capture()
-    names = ("right:ThumbTip", "left:RingTip", *found.names[2:])
-    write_capture(folder / f"{RESULTS_OF}.trc", Capture(names, found.positions, found.rate))
-    return [folder / f"{RESULTS_OF}.trc"]
-
-
-def benchmark(folder: Path) -> list[Path]:
-    """A manifest, and the files of its one capture."""
-    plan = Plan("tiny", 1, FRAMES, kinds=("hand-pen",), difficulties=("easy",))
-    (one,) = plan.captures
-    for path in (capture_path(one.name), user_path(one.name), truth_path(one.name)):
-        (folder / path).parent.mkdir(exist_ok=True)
-        (folder / path).write_text("any")
-    write_manifest(folder, plan, [path(one.name) for path in (capture_path, user_path, truth_path)])
-    return [folder / MANIFEST]

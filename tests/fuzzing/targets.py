@@ -17,23 +17,17 @@ from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
 from gloves.takes.corrections import load_corrections
 from gloves.takes.take import load_take
-from handsim.app.executors.output import load_receipt
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import CameraRig, load_rig
 from handsim.space.objects import load_object
-from handsim.space.rig_formats.any_file import load_cameras, load_lab_cameras
-from handsim.space.rig_formats.rig_of_cameras import marker_cameras, rig_of_cameras
+from handsim.space.rig_formats.any_file import import_cameras, load_cameras
 from render.scenery.photographs import draw_photo, photo_files
 from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
 from tests.fuzzing.mutations import mutate_archive
-from track.benchmark.manifest import label_names, load_benchmark
-from track.benchmark.results import read_result
 from track.bodies.body_file import load_body
-from track.evaluation.sweep.cells import cells_of
-from track.evaluation.sweep.sweep_file import load_sweep
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
 
@@ -74,13 +68,13 @@ def _silence() -> Iterator[None]:
 
 
 def _read_weights(path: Path) -> None:
-    from train.labelers.storage import load_labeler
+    from train.glove_labeler import load_labeler
 
     load_labeler(path.parent).label_frames([_CLOUD])
 
 
 def _read_onnx(path: Path) -> None:
-    from train.labelers.storage import load_labeler
+    from train.glove_labeler import load_labeler
 
     load_labeler(path).label_frames([_CLOUD])
 
@@ -109,15 +103,7 @@ def _read_checkpoint(path: Path) -> None:
 def _read_calibration(path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
-        rig_of_cameras(path, marker_cameras(path, load_lab_cameras(path)))
-
-
-def _read_sweep(path: Path) -> None:
-    cells_of(load_sweep(path))
-
-
-def _read_result(path: Path) -> None:
-    read_result(path, seeds.benchmark_capture(), label_names())
+        CameraRig("lab", import_cameras(path))
 
 
 _ALL: Final = (
@@ -127,7 +113,6 @@ _ALL: Final = (
     Target("tsv", seeds.tsv, read_capture),
     Target("layout", seeds.layout, load_layout),
     Target("rig", seeds.rig, load_rig),
-    Target("sweep", seeds.sweep, _read_sweep),
     Target("cameras", seeds.camera_files, load_cameras),
     Target("calibrations", seeds.calibrations, _read_calibration),
     Target("poses", seeds.own_poses, lambda path: load_subject(PoseFile(path), seed=0), mutate_archive),
@@ -137,16 +122,11 @@ _ALL: Final = (
     Target("tracked", seeds.tracked, load_take, mutate_archive),
     Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
-    Target("benchmark", seeds.benchmark, lambda path: load_benchmark(path.parent)),
-    Target("result_table", seeds.result_table, _read_result),
-    Target("result_arrays", seeds.result_arrays, _read_result, mutate_archive),
-    Target("result_points", seeds.result_points, _read_result),
     Target("weights", seeds.weights, _read_weights),
     Target("onnx", seeds.onnx, _read_onnx),
     Target("dataset", seeds.dataset, _read_dataset),
     Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_archive),
     Target("settings", seeds.settings, _read_settings),
-    Target("receipt", seeds.receipt, load_receipt),
     Target("packet", seeds.packets, _read_packet, refusals=(DamagedPacket,)),
     Target("photo", seeds.photos, _read_photo),
 )

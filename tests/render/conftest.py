@@ -10,8 +10,7 @@ from gloves.layout import load_layout
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import Side
-from handsim.space.camera import Camera, pinhole
-from handsim.space.cameras import look_at
+from handsim.space.camera import Camera, look_at, pinhole
 from render.frames import PARTS_A_HAND, BodyTruth, HandTruth, Pictures, RenderedFrame
 
 

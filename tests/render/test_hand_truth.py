@@ -11,8 +11,7 @@ from gloves.layout import load_layout
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import DIGITS, PALM, bones_of
-from handsim.space.camera import Camera, pinhole
-from handsim.space.cameras import look_at
+from handsim.space.camera import Camera, look_at, pinhole
 from poses import sample_poses
 from render.frames import Pictures
 from render.hand_truth import hand_truth

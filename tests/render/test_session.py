@@ -24,13 +24,13 @@ from render.sensors.depth_noise import DepthNoiseConfig
 from render.session import SHEET, left_out_frames, render_take
 from render.skin.look import TONES
 from render.subject import subject_of_take
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
     file = tmp_path_factory.mktemp("take") / "take.truth.npz"
-    simulate_take(TakeConfig(kind="hand-controller", num_frames=48)).save(file)
+    simulate_take(kind="hand-controller", num_frames=48).save(file)
     return file
 
 

@@ -24,15 +24,16 @@ from handsim.errors import ArgumentError, CaptureError
 from handsim.space.objects import named_object
 from handsim.space.transforms import quaternion_matrix
 from track.bodies.rigid_body import RigidTemplate
-from track.capture_tracking import TakeRecorder, capture_frames, track_capture, track_stream
+from track.capture_tracking import track_capture
 from track.config import TrackerConfig
-from track.streams.frame_source import StreamedFrame
+from track.recorder import TakeRecorder
+from track.streams.addresses import open_source
+from track.streams.frame_source import capture_frames
 from track.streams.natnet_server import ReplayServer
-from track.streams.point_stream import open_stream
 from track.tracked_frame import Status
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 FRAMES = 60
 
@@ -44,7 +45,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def truth() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=FRAMES))
+    return simulate_take(kind="hand-controller", num_frames=FRAMES)
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +60,7 @@ def capture(truth) -> Capture:
 
 @pytest.fixture(scope="module")
 def tracked(capture, user, labeler) -> Take:
-    return track_capture(capture, Tracker(user, labeler))
+    return track_capture(capture, hands=user, labeler=labeler)
 
 
 def mostly_right(take: Take, labels: np.ndarray, last: int) -> bool:
@@ -96,48 +97,40 @@ def test_a_capture_is_tracked_as_its_truth_says(tracked, truth, user, tmp_path):
 def test_file_formats_change_nothing(suffix, tracked, capture, user, labeler, tmp_path):
     path = tmp_path / f"take{suffix}"
     write_capture(path, capture)
-    again = track_capture(read_capture(path), Tracker(user, labeler))
+    again = track_capture(read_capture(path), hands=user, labeler=labeler)
     np.testing.assert_array_equal(again.labels, tracked.labels)
     np.testing.assert_allclose(again.qpos, tracked.qpos, atol=1e-4)
-
-
-def test_a_column_is_an_id_until_its_point_is_lost(capture):
-    positions = np.full((5, 2, 3), np.nan)
-    positions[[0, 1, 3, 4], 0], positions[1:, 1] = 0.0, 1.0
-    frames = list(capture_frames(Capture(("a", "b"), positions, 100.0)))
-    assert [frame.ids.tolist() for frame in frames] == [[0], [0, 1], [1], [2, 1], [2, 1]]
-    assert [len(frame.points) for frame in frames] == [1, 2, 1, 2, 2]
-    np.testing.assert_allclose([frame.time for frame in frames], 0.01 * np.arange(5))
 
 
 def test_progress_is_told_frame_by_frame(capture, user, labeler):
     short = Capture(capture.names, capture.positions[:5], capture.rate)
     told = []
-    track_capture(short, Tracker(user, labeler), progress=lambda *done: told.append(done))
+    track_capture(short, hands=user, labeler=labeler, progress=lambda *done: told.append(done))
     assert told == [(n, 5) for n in range(1, 6)]
 
 
 def test_empty_frames_and_frames_without_hands_are_lost_not_wrong(user, labeler, rng):
     positions = np.full((4, 3, 3), np.nan)
     positions[2] = rng.normal(size=(3, 3))
-    take = track_capture(Capture(("a", "b", "c"), positions, 120.0), Tracker(user, labeler))
+    take = track_capture(Capture(("a", "b", "c"), positions, 120.0), hands=user, labeler=labeler)
     assert (take.status == LOST).all() and (take.labels == -1).all()
     assert np.isnan(take.qpos).all() and np.isnan(take.markers("left")).all()
-    nothing = track_capture(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), Tracker(user, labeler))
+    nothing = track_capture(Capture(("a",), np.full((2, 1, 3), np.nan), 120.0), hands=user, labeler=labeler)
     assert nothing.num_frames == 2
 
 
 def test_millimeters_are_told(capture, user, labeler):
     large = Capture(capture.names, 1e3 * capture.positions, capture.rate)
     with pytest.raises(ArgumentError, match="millimeters"):
-        track_capture(large, Tracker(user, labeler))
+        track_capture(large, hands=user, labeler=labeler)
 
 
 def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
     tracker = Tracker(user, labeler)
     recorder = TakeRecorder(tracker)
-    with ReplayServer.of_take(truth) as server, open_stream(server.url, silence=0.4) as stream:
-        for frame, one in track_stream(stream, tracker):
+    with ReplayServer(truth) as server, open_source(server.url, silence=0.4) as stream:
+        for frame in stream:
+            one = tracker.step(frame.points, frame.ids, frame.time)
             recorder.add(frame, one)
             if frame.silent:
                 break
@@ -154,29 +147,13 @@ def test_a_live_stream_gives_the_capture_s_take(truth, tracked, user, labeler):
     assert (take.ids[there] >= 0).all() and (take.ids[~there] == -1).all()
 
 
-class Echo:
-    """Says nothing but the time that it was told."""
-
-    def step(self, points, ids, time):
-        return time
-
-
-def test_time_goes_on_when_a_recording_begins_anew():
-    def frame(time: float) -> StreamedFrame:
-        return StreamedFrame(0, time, np.zeros((0, 3)), np.zeros(0, dtype=int))
-
-    frames = map(frame, [5.0, 5.1, 5.2, 0.1, 0.2, 0.1])
-    times = [told for _, told in track_stream(frames, Echo())]
-    np.testing.assert_allclose(times, [5.0, 5.1, 5.2, 5.21, 5.31, 5.32])
-
-
 def test_too_few_frames_have_no_rate(user, capture, labeler):
     tracker = Tracker(user, labeler)
     recorder = TakeRecorder(tracker)
     with pytest.raises(CaptureError, match="0 frames came, expected two or more"):
         recorder.take()
-    for frame, one in itertools.islice(track_stream(capture_frames(capture), tracker), 2):
-        recorder.add(frame, one)
+    for frame in itertools.islice(capture_frames(capture), 2):
+        recorder.add(frame, tracker.step(frame.points, frame.ids, frame.time))
         if recorder.num_frames == 1:
             with pytest.raises(CaptureError, match="1 frames came"):
                 recorder.take()
@@ -189,7 +166,7 @@ def test_bodies_are_kept_beside_the_hands(user, labeler, capture, truth):
     first = truth.hand_labels[-1].stop
     positions[:2][truth.labels[:2] >= first] = np.nan
     part = Capture(capture.names, positions, capture.rate)
-    take = track_capture(part, Tracker(user, labeler, (thing,)))
+    take = track_capture(part, hands=user, labeler=labeler, bodies=[thing])
     names = [STATUSES[status] for status in take.body_status[:, 0]]
     assert names == ["lost"] * 2 + ["found"] + ["tracked"] * (FRAMES - 3)
     assert np.isnan(take.body_poses[:2]).all() and np.isnan(take.body_rms[:2]).all()
@@ -213,21 +190,21 @@ from numba.core.registry import CPUDispatcher
 
 from gloves.fit import nominal_fit
 from gloves.layout import load_layout
-from track.capture_tracking import track_capture, warm_up
-from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from track.capture_tracking import track_capture
+from track.setup import warm_up
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 def ready():
     kernels = [one for one in gc.get_objects() if isinstance(one, CPUDispatcher)]
     return {(one.py_func.__qualname__, str(known)) for one in kernels for known in one.signatures}
 
-take = simulate_take(TakeConfig(kind="hand-hand", num_frames=40))
+take = simulate_take(kind="hand-hand", num_frames=40)
 hands = [nominal_fit(load_layout("dense19"), "M", side) for side in ("right", "left")]
 labeler = load_labeler("dense19")
 warm_up(hands, labeler)
 before = ready()
-track_capture(take.capture(), Tracker(hands, labeler))
+track_capture(take, hands=hands, labeler=labeler)
 for cloud in np.random.default_rng(1).uniform(0.0, 0.1, (20, 19, 3)):
     labeler.label_frames([cloud])
 assert before and ready() == before, ready() - before

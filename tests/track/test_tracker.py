@@ -7,13 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, nominal_fit
+from gloves.layout import load_layout
 from gloves.takes.take import Take
+from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +25,7 @@ def labeler():
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240))
+    return simulate_take(kind="hand-controller", num_frames=240)
 
 
 def users(take: Take) -> list[GloveFit]:
@@ -61,7 +63,7 @@ def test_hands_are_initialized_and_tracked(take, labeler):
 def test_gloves_with_few_markers_far_apart_are_tracked(seed):
     """Large hands in the sparse glove: stretched fingers are over 85 mm from the markers on the back."""
     kind = "single-hand" if seed == 0 else "hand-hand"
-    take = simulate_take(TakeConfig(kind=kind, num_frames=60, glove="sparse13", seed=seed))
+    take = simulate_take(kind=kind, num_frames=60, glove="sparse13", seed=seed)
     tracked = run(Tracker(users(take), load_labeler("sparse13")), take, range(60))
     right = [np.array_equal(frame.labels, seen(take, number)[2]) for number, frame in enumerate(tracked)]
     assert np.mean(right) > 0.95
@@ -94,3 +96,53 @@ def test_an_id_that_goes_over_to_another_marker_loses_its_label(take, labeler):
     ids = ids.copy()
     ids[[one, two]] = ids[[two, one]]
     assert np.array_equal(tracker.step(points, ids, 10 / 120).labels, labels)
+
+
+def test_points_without_ids_are_linked_from_frame_to_frame(take, labeler):
+    tracker, right = Tracker(users(take), labeler), []
+    for frame in range(40):
+        points, _, labels = seen(take, frame)
+        tracked = tracker.step(points, time=frame / take.rate)
+        right.append(np.array_equal(tracked.labels, labels))
+    assert np.mean(right) > 0.9
+    assert all(hand.status is Status.TRACKED for hand in tracked.hands)
+
+
+def test_a_labeler_may_be_named_or_left_to_the_glove(take):
+    points, ids, labels = seen(take, 0)
+    designed = [nominal_fit(load_layout("dense19"), "M", hand.side) for hand in take.hands]
+    assert np.array_equal(Tracker(users(take), "dense19").step(points, ids, 0.0).labels, labels)
+    named, left = (Tracker(designed, *name).step(points, ids, 0.0) for name in (("dense19",), ()))
+    np.testing.assert_array_equal(named.labels, left.labels)
+
+
+@pytest.mark.parametrize(
+    ("points", "ids", "time", "sentence"),
+    [
+        ("cloud", None, 0.0, "points is 'cloud', expected an array of numbers"),
+        (np.zeros((2, 3)), ["a", "b"], 0.0, "ids is ['a', 'b'], expected an array of numbers"),
+        (np.zeros((2, 3)), 7, 0.0, "points have shape (2, 3), expected (1, 3) for 1 IDs"),
+        (np.zeros(3), None, 0.0, "points have shape (3,), expected (3, 3) for 3 IDs"),
+        (np.zeros((2, 3)), [1, 2], None, "time is None, expected the time of the frame in seconds"),
+        (np.zeros((2, 3)), [1, 2], "now", "time is 'now', expected the time of the frame in seconds"),
+    ],
+)
+def test_a_frame_of_another_type_is_refused_in_one_sentence(take, labeler, points, ids, time, sentence):
+    with pytest.raises(ArgumentError) as error:
+        Tracker(users(take), labeler).step(points, ids, time)
+    assert str(error.value) == sentence
+
+
+def test_hands_labelers_and_settings_of_another_type_are_refused(take, labeler):
+    hands = users(take)
+    for given, sentence in (
+        ((3, labeler), "hands is 3, expected a User, or hands"),
+        (("right", labeler), "a hand is 'r', expected one in its glove"),
+        (([], labeler), "hands are [], expected a left hand"),
+        (([hands[0]] * 2, labeler), "expected a left hand, a right hand, or one of each"),
+        ((hands, 3), "labeler is 3, expected a Labeler"),
+        ((hands, labeler, (), {}), "config is {}, expected a TrackerConfig"),
+    ):
+        with pytest.raises(ArgumentError) as error:
+            Tracker(*given)
+        assert sentence in str(error.value)

@@ -15,7 +15,7 @@ from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import SIDES
-from track.user import UserError, load_user, save_user
+from track.user import User, UserError, load_user
 
 
 @pytest.fixture
@@ -31,9 +31,10 @@ def hands(rng):
 
 
 def test_hands_come_back_exactly(hands, tmp_path):
-    save_user(tmp_path / "user.json", hands, "drawn at random")
+    User(hands, "drawn at random").save(tmp_path / "user.json")
     again = load_user(tmp_path / "user.json")
-    assert [hand.side for hand in again] == ["left", "right"]
+    assert again.sides == ("left", "right") and again.notes == "drawn at random"
+    assert [hand.side for hand in again] == ["left", "right"] and list(again) == list(again.hands)
     for first, second in zip(hands, again, strict=True):
         assert first.attachment.layout == second.attachment.layout
         for name in ("points", "normals", "bone_indices", "bone_weights"):
@@ -45,13 +46,13 @@ def test_hands_come_back_exactly(hands, tmp_path):
 
 def test_what_cannot_be_saved_is_told(hands, tmp_path):
     with pytest.raises(ArgumentError, match="expected a left hand, a right hand, or one of each"):
-        save_user(tmp_path / "user.json", (hands[0], hands[0]))
+        User((hands[0], hands[0]))
     with pytest.raises(ArgumentError, match="expected a left hand"):
-        save_user(tmp_path / "user.json", ())
+        User(())
     with pytest.raises(ArgumentError, match="different gloves"):
-        save_user(tmp_path / "user.json", (hands[0], nominal_fit(load_layout("sparse13"), "M", "right")))
+        User((hands[0], nominal_fit(load_layout("sparse13"), "M", "right")))
     with pytest.raises(UserError, match="cannot be written"):
-        save_user(tmp_path, hands)
+        User(hands).save(tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -112,12 +113,12 @@ def spoil_distance(content):
         (spoil_bones, "whole numbers from 0 to 15"),
         (spoil_weights, "sum to one"),
         (spoil_key, "'hands' is missing"),
-        (spoil_sides, "two of one side"),
+        (spoil_sides, "expected a left hand, a right hand, or one of each"),
     ],
 )
 def test_damage_is_told_in_one_sentence(spoil, told, hands, tmp_path):
     path = tmp_path / "user.json"
-    save_user(path, hands)
+    User(hands).save(path)
     content = json.loads(path.read_text("utf-8"))
     spoil(content)
     path.write_text(json.dumps(content), "utf-8")

@@ -7,19 +7,16 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks.paper.take_evaluation import true_users
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
-from gloves.takes.tracked_take import load_tracked_take
 from handsim.cli.main import main
 from handsim.hand.keypoints import hand_keypoints
 from render import RenderConfig, draw
 from render.cameras.viewpoints import ViewConfig
 from track.capture_tracking import track_capture
-from track.evaluation.take_evaluation import true_users
-from track.tracker import Tracker
 from train.data.shards import Dataset
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("closed loop")]  # what they share is made once
 SMALL = [
@@ -94,21 +91,16 @@ def test_empty_frames_are_labeled_as_empty(run):
 
 
 def test_a_small_labeler_tracks_to_a_millimeter_and_pictures_agree(run):
-    truth = simulate_take(TakeConfig(num_frames=240))
-    truth.save(run / "one.truth.npz")
-    columns = tuple(f"*{number}" for number in range(truth.points.shape[1]))
-    capture = Capture(columns, truth.points, truth.rate)
-    tracker = Tracker(true_users(truth), load_labeler(run / "run"))
-    track_capture(capture, tracker).save(run / "tracked.npz")
-    tracked, true = load_tracked_take(run / "tracked.npz"), truth.hands[0]
-    mine = tracked.qpos[:, 0]
+    truth = simulate_take(num_frames=240)
+    tracked = track_capture(truth, hands=true_users(truth), labeler=run / "run")
+    model, mine, true = truth.hands[0].model, tracked.qpos[:, 0], truth.qpos[:, 0]
     there = np.isfinite(mine[:, 0])
     assert there.mean() > 0.95
-    off = hand_keypoints(true.fit.model, mine[there]) - hand_keypoints(true.fit.model, true.qpos[there])
+    off = hand_keypoints(model, mine[there]) - hand_keypoints(model, true[there])
     assert 1e3 * np.linalg.norm(off, axis=-1).mean() < 1.0
     config = RenderConfig(view=ViewConfig(distance=(0.5, 0.5)), passes=("depth", "ids"), depth_sensor=None)
     for frame in draw(tracked, config=config, frames=np.flatnonzero(there)[::60]):
-        points = hand_keypoints(true.fit.model, true.qpos[frame.number : frame.number + 1])[0]
+        points = hand_keypoints(model, true[frame.number : frame.number + 1])[0]
         assert np.linalg.norm(frame.camera.project(points) - frame.hands[0].keypoints, axis=-1).mean() < 2.0
         assert frame.hands[0].visible.sum() >= 5
 
@@ -130,9 +122,9 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        train_labeler(dataset, config, tmp_path / "killed", progress=kill, save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "killed", save_every=0.0)
-    train_labeler(dataset, config, tmp_path / "whole")
+        train_labeler(dataset, tmp_path / "killed", config, progress=kill, save_every=0.0)
+    train_labeler(dataset, tmp_path / "killed", config, save_every=0.0)
+    train_labeler(dataset, tmp_path / "whole", config)
     resumed, whole = (load_file(tmp_path / name / "labeler.safetensors") for name in ("killed", "whole"))
     for name, values in whole.items():
         np.testing.assert_allclose(resumed[name], values, atol=1e-6)

@@ -12,12 +12,13 @@ import torch
 from train.config import CNNConfig, default_config
 from train.data.augmentation import Corruption
 from train.data.shards import Dataset
-from train.evaluation.labeler_evaluation import evaluate_labeler
-from train.labelers.storage import CARD, WEIGHTS, load_labeler, load_network
+from train.evaluate import evaluate_labeler
+from train.glove_labeler import load_labeler
+from train.labelers.storage import CARD, WEIGHTS, load_network
 from train.loop import train_labeler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 
 CONFIG = dataclasses.replace(default_config("cnn"), samples=48, batch=16, average_every=2, precision="32")
 
@@ -29,7 +30,7 @@ FIXED = dataclasses.replace(CONFIG, cnn=CNNConfig(reject=0.04, spread=0.005))
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
     config = DatasetConfig(num_frames=200, seed=3, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
-    generate_dataset(config, out, workers=1)
+    make_dataset(config, out, workers=1)
     return Dataset(out)
 
 
@@ -42,10 +43,10 @@ def test_a_run_that_was_stopped_is_the_run_that_was_not(dataset, tmp_path):
         if done == 2 * CONFIG.batch:
             raise Stopped
 
-    train_labeler(dataset, FIXED, tmp_path / "whole")
+    train_labeler(dataset, tmp_path / "whole", FIXED)
     with pytest.raises(Stopped):  # after the first checkpoint, before the second
-        train_labeler(dataset, FIXED, tmp_path / "stopped", progress=stop, save_every=0.0)
-    train_labeler(dataset, FIXED, tmp_path / "stopped")
+        train_labeler(dataset, tmp_path / "stopped", FIXED, progress=stop, save_every=0.0)
+    train_labeler(dataset, tmp_path / "stopped", FIXED)
     whole, stopped = (load_network(tmp_path / name)[0].state_dict() for name in ("whole", "stopped"))
     for name, values in whole.items():
         assert torch.equal(values, stopped[name]), name
@@ -54,7 +55,7 @@ def test_a_run_that_was_stopped_is_the_run_that_was_not(dataset, tmp_path):
 
 def test_what_training_used_is_saved_with_the_network(dataset, tmp_path):
     config = dataclasses.replace(CONFIG, samples=16, cnn=CNNConfig(views="random", reject=0.033))
-    train_labeler(dataset, config, tmp_path)
+    train_labeler(dataset, tmp_path, config)
     card = json.loads((tmp_path / CARD).read_text())
     assert card["labeler"] == "cnn"
     assert card["network"]["views"] == "random" and card["network"]["reject"] == 0.033
@@ -69,7 +70,7 @@ def test_what_training_used_is_saved_with_the_network(dataset, tmp_path):
 @pytest.mark.slow
 def test_a_minute_of_training_labels_three_times_as_much_as_chance(dataset, tmp_path):
     recipe = {"learning_rate": 5e-4, "anisotropy": 0.0, "occlude": 0, "ghosts": 0}
-    train_labeler(dataset, dataclasses.replace(FIXED, samples=960, **recipe), tmp_path)
+    train_labeler(dataset, tmp_path, dataclasses.replace(FIXED, samples=960, **recipe))
     markers = dataset.rows()[:24]["markers"].astype(np.float64)
     report = evaluate_labeler(load_labeler(tmp_path), markers, Corruption(0, 0), rng=np.random.default_rng(0))
     assert report.figures["slot_accuracy"] > 3.0 / markers.shape[1]

@@ -15,11 +15,12 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
-from train.labelers.storage import WEIGHTS, load_labeler
+from train.glove_labeler import load_labeler
+from train.labelers.storage import WEIGHTS
 from train.loop import CHECKPOINT, train_labeler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.threads import TrainingThreads, label_on, labeling_threads
 from train.training_state import TrainingError
 
@@ -31,7 +32,7 @@ OPTIONS = ["--batch", "32", "--network.width", "8", "--network.gates", "2", "--n
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    generate_dataset(DatasetConfig(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(DatasetConfig(num_frames=300, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return Dataset(out)
 
 
@@ -71,16 +72,16 @@ def sending(number):
 
 
 def test_a_run_grows_and_its_learning_rate_is_that_of_the_new_length(dataset, tmp_path):
-    train_labeler(dataset, CONFIG, tmp_path / "run")
+    train_labeler(dataset, tmp_path / "run", CONFIG)
     steps = []
     longer = dataclasses.replace(CONFIG, samples=960)
-    card = train_labeler(dataset, longer, tmp_path / "run", progress=lambda *step: steps.append(step[0]))
+    card = train_labeler(dataset, tmp_path / "run", longer, progress=lambda *step: steps.append(step[0]))
     assert steps == list(range(672, 961, 32)) and card["train"]["samples"] == 960
     losses = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)["history"]["losses"]
     rates = {done: rate for done, _, rate in losses}
     assert rates[640] < 1e-4 < rates[672]
     with pytest.raises(WeightsError, match=r"train.samples: 960 there, 640 here.*may only grow"):
-        train_labeler(dataset, CONFIG, tmp_path / "run")
+        train_labeler(dataset, tmp_path / "run", CONFIG)
 
 
 def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_path, monkeypatch):
@@ -90,12 +91,12 @@ def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_pat
     with monkeypatch.context() as patch:
         patch.setattr("train.training_state.TrainingState.evaluate", cut)
         with pytest.raises(Stopped):
-            train_labeler(dataset, CONFIG, tmp_path / "cut")
+            train_labeler(dataset, tmp_path / "cut", CONFIG)
     done = done_in(tmp_path / "cut")
     assert 0 < done < 640
-    curve = train_labeler(dataset, CONFIG, tmp_path / "cut")["curve"]
+    curve = train_labeler(dataset, tmp_path / "cut", CONFIG)["curve"]
     assert [entry[0] for entry in curve] == [
-        entry[0] for entry in train_labeler(dataset, CONFIG, tmp_path / "whole")["curve"]
+        entry[0] for entry in train_labeler(dataset, tmp_path / "whole", CONFIG)["curve"]
     ]
     assert curve[0][0] == done
 
@@ -106,14 +107,14 @@ def test_a_loss_that_is_no_number_ends_the_run(dataset, tmp_path, monkeypatch):
         lambda *args, **kwargs: torch.tensor(float("nan"), requires_grad=True),
     )
     with pytest.raises(TrainingError, match=r"the loss is nan after 32 samples; .* below 0.002"):
-        train_labeler(dataset, CONFIG, tmp_path / "run")
+        train_labeler(dataset, tmp_path / "run", CONFIG)
     assert not (tmp_path / "run" / CHECKPOINT).exists()
 
 
 def test_what_a_run_writes_has_no_trace_of_the_process(dataset, tmp_path):
     before = os.umask(0o022)
     try:
-        train_labeler(dataset, CONFIG, tmp_path / "run")
+        train_labeler(dataset, tmp_path / "run", CONFIG)
     finally:
         os.umask(before)
     assert b"tmp-" not in (tmp_path / "run" / CHECKPOINT).read_bytes()
@@ -125,7 +126,7 @@ def test_what_a_run_writes_has_no_trace_of_the_process(dataset, tmp_path):
 
 @pytest.mark.parametrize("damage", ["cut", "nan", "count", "shape", "list"])
 def test_a_damaged_checkpoint_is_told(dataset, tmp_path, damage):
-    train_labeler(dataset, CONFIG, tmp_path)
+    train_labeler(dataset, tmp_path, CONFIG)
     path = tmp_path / CHECKPOINT
     content = torch.load(path, weights_only=True)
     name = next(iter(content["mean"]))
@@ -140,7 +141,7 @@ def test_a_damaged_checkpoint_is_told(dataset, tmp_path, damage):
             content["mean"][name] = torch.zeros(3)
         torch.save([content] if damage == "list" else content, path)
     with pytest.raises(WeightsError, match=r"checkpoint.pt is damaged; delete it to begin this run again"):
-        train_labeler(dataset, CONFIG, tmp_path)
+        train_labeler(dataset, tmp_path, CONFIG)
 
 
 def test_a_full_disk_is_one_sentence_and_the_checkpoint_stays(dataset, tmp_path, capsys):
@@ -220,8 +221,8 @@ def test_a_given_number_of_threads_holds(two_threads):
 
 def test_a_measurement_leaves_the_run_as_it_is(dataset, tmp_path, two_threads, monkeypatch):
     monkeypatch.setattr("train.threads._GAIN", 1e9)  # one thread is chosen whatever is measured
-    train_labeler(dataset, CONFIG, tmp_path / "measured")
-    train_labeler(dataset, CONFIG, tmp_path / "given", threads=1)
+    train_labeler(dataset, tmp_path / "measured", CONFIG)
+    train_labeler(dataset, tmp_path / "given", CONFIG, threads=1)
     measured, given = ((tmp_path / name / WEIGHTS).read_bytes() for name in ("measured", "given"))
     assert measured == given
 

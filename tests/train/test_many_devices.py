@@ -19,7 +19,7 @@ import torch
 from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, WeightsError
-from train.config import SetLabelerConfig, TrainConfig, default_config
+from train.config import SetLabelerConfig, TrainConfig, batch_recipe, default_config
 from train.data.batches import Part, draw_batch
 from train.data.shards import Dataset
 from train.devices.fabric_start import start_fabric
@@ -31,7 +31,7 @@ from train.loop import CHECKPOINT, train_labeler
 from train.reports.run_page import PAGE
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 
 pytestmark = pytest.mark.xdist_group("many devices")  # what they share is made once
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,7 +50,7 @@ SRUN |= {"SLURM_NODEID": "0"}
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
     config = DatasetConfig(num_frames=300, frames_per_hand=20, scenes=SceneMix(1.0, 0.0, 0.0))
-    generate_dataset(config, out, workers=1)
+    make_dataset(config, out, workers=1)
     return Dataset(out)
 
 
@@ -58,7 +58,7 @@ def dataset(tmp_path_factory):
 def one(dataset, tmp_path_factory):
     """A run on one device."""
     out = tmp_path_factory.mktemp("runs") / "one"
-    train_labeler(dataset, ONE, out, threads=1)
+    train_labeler(dataset, out, ONE, threads=1)
     return out
 
 
@@ -93,13 +93,13 @@ def stop_at(samples):
 @pytest.mark.parametrize(("first", "then"), [(TWO, ONE), (ONE, TWO)])
 def test_a_run_goes_on_with_another_number_of_devices(dataset, one, tmp_path, first, then):
     with pytest.raises(Stopped, match=r"of 640 samples are kept in .*checkpoint\.pt") as stopped:
-        train_labeler(dataset, first, tmp_path / "run", progress=stop_at(64), threads=1)
+        train_labeler(dataset, tmp_path / "run", first, progress=stop_at(64), threads=1)
     assert stopped.value.number == signal.SIGINT
     done = torch.load(tmp_path / "run" / CHECKPOINT, weights_only=True)["done"]
     assert 64 <= done < 640
     steps = []
     card = train_labeler(
-        dataset, then, tmp_path / "run", progress=lambda *step: steps.append(step[0]), threads=1
+        dataset, tmp_path / "run", then, progress=lambda *step: steps.append(step[0]), threads=1
     )
     assert steps == list(range(done + 32, 641, 32))
     assert card["train"]["devices"] == then.devices
@@ -187,20 +187,20 @@ def test_other_devices_than_there_are_processes_are_told(tmp_path, monkeypatch):
 
 def test_more_devices_than_clouds_are_told(dataset, tmp_path):
     with pytest.raises(ArgumentError, match="batch is 32, expected at least 33: a cloud for each device"):
-        train_labeler(dataset, dataclasses.replace(ONE, devices=33), tmp_path / "run")
+        train_labeler(dataset, tmp_path / "run", dataclasses.replace(ONE, devices=33))
     assert not (tmp_path / "run").exists()
 
 
 def test_a_run_of_an_earlier_version_with_its_number_of_devices_goes_on(dataset, tmp_path):
     short = dataclasses.replace(ONE, samples=64)
-    train_labeler(dataset, short, tmp_path)
+    train_labeler(dataset, tmp_path, short)
     settings = json.loads((tmp_path / "train.json").read_text())
     assert "devices" not in settings["train"]
     settings["train"]["devices"] = 4
     (tmp_path / "train.json").write_text(json.dumps(settings))
-    train_labeler(dataset, short, tmp_path)
+    train_labeler(dataset, tmp_path, short)
     with pytest.raises(WeightsError, match=r"\(train.seed: 0 there, 1 here\)"):
-        train_labeler(dataset, dataclasses.replace(short, seed=1), tmp_path)
+        train_labeler(dataset, tmp_path, dataclasses.replace(short, seed=1))
 
 
 @pytest.mark.parametrize("views", ["aligned", "random"])
@@ -216,7 +216,8 @@ def test_parts_of_a_batch_give_the_papers_network_the_loss_of_the_whole(dataset,
 
     def loss(part):
         rng = np.random.default_rng(3)
-        batch = draw_batch(dataset.mapped_rows(), config, rng=rng)
+        recipe = batch_recipe(config, len(dataset.marker_names))
+        batch = draw_batch(dataset.mapped_rows(), recipe, rng=rng)
         with torch.no_grad():
             return float(batch_loss(config, network, batch, fabric.device, rng=rng, part=part))
 

@@ -11,13 +11,13 @@ import pytest
 
 from gloves.captures.formats import read_capture
 from handsim._plugins import load_plugin
-from handsim.app.workers import in_processes
+from handsim.app.workers import run_jobs
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError
 from poses.shapes.sampling import load_sampler
 from train.data.own_corruption import own_cloud
 from train.data.shards import Dataset
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 
 SOURCE = '''
 import numpy as np
@@ -96,8 +96,7 @@ def folder(tmp_path_factory):
         patch.chdir(folder)
         patch.setattr(sys, "path", [*sys.path, str(folder)])
         yield folder
-    for cached in (load_plugin, load_sampler):
-        cached.cache_clear()
+    load_plugin.cache_clear()
     sys.modules.pop("own_ideas", None)
 
 
@@ -122,7 +121,7 @@ def test_a_training_set_has_the_samplers_poses(dataset, folder, capsys):
 def test_worker_processes_import_it_too(folder):
     load_sampler("own_ideas:Curled")  # as the command does before the work
     job = functools.partial(sys.modules["own_ideas"].job, "own_ideas:Curled")
-    assert sorted(in_processes(job, [0, 1, 2], 2)) == [0, 1, 2]
+    assert sorted(run_jobs(job, [0, 1, 2], 2)) == [0, 1, 2]
 
 
 @pytest.mark.parametrize(

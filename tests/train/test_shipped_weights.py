@@ -12,8 +12,9 @@ from gloves.captures.collection import read_markers
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError, WeightsError
 from train.data.augmentation import Corruption
-from train.evaluation.labeler_evaluation import evaluate_labeler
-from train.labelers.storage import load_labeler, shipped_labelers
+from train.evaluate import evaluate_labeler
+from train.glove_labeler import load_labeler
+from train.labelers.storage import shipped_labelers
 
 
 def test_cards_say_where_the_weights_come_from():

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from handsim.kernels.kernel import kernel
+from track.kinematics.levenberg_marquardt import eliminate, solve_positive
 from track.kinematics.marker_kinematics import (
     HandArrays,
     Workspace,
@@ -15,9 +16,7 @@ from track.kinematics.marker_kinematics import (
     compute_marker,
     marker_jacobian,
 )
-from track.kinematics.small_systems import eliminate, solve_positive
 
-# These four are compiled into fast-math kernels, so they are not part of `track.config.TrackerConfig`.
 _STEPS: Final = 10  # Levenberg-Marquardt steps at most; a digit needs about four
 _SMALL_GAIN: Final = 0.01  # of the cost (half squared standard deviations); no decision hangs on less
 _LIMIT_PRECISION: Final = np.deg2rad(2.0) ** -2  # [1/rad^2] of a hinge beyond its range: a soft limit

@@ -4,7 +4,7 @@ With the palm known, a digit has four hinges, and three markers on it leave five
 test. So the points near a digit can be labeled by trying all assignments. The score of a hypothesis is its
 log-odds against all points being strays: from the distances of the points from the fitted markers, from that
 of the hinges from their prior, from the Laplace approximation of the hinges' uncertainty, and from the
-evidence of IDs and queries.
+evidence of IDs and of the labeler's reviews.
 """
 
 from __future__ import annotations

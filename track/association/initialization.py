@@ -23,8 +23,8 @@ from track.association.assignment import match_log_odds, match_points, peak_log_
 from track.association.frame_state import targets_of
 from track.association.hand_state import HandState
 from track.config import TrackerConfig
+from track.finder.measures import longest_link
 from track.kinematics.pose_solver import PoseFit
-from train.hands.measures import longest_link
 from train.labelers.protocol import Labeler, Labeling
 
 MOST_POINTS: Final = 100
@@ -33,9 +33,7 @@ _LINK_DISTANCE: Final = 0.085  # [m] between neighboring markers of one hand, or
 _LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked
 _LEAST_SHARE: Final = 0.45  # of a hand's markers that must be labeled
 _FEWEST_POINTS: Final = 4  # labeled points of a hand; a pose needs as many
-_SPARE_POINTS: Final = (
-    6  # beyond a hand's markers from which on a group is cut in halves: two hands may touch
-)
+_SPARE_POINTS: Final = 6  # beyond a hand's markers, from which on a group may be two hands that touch
 _CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
 _MOST_FITS: Final = 8  # labeled clouds that are fitted, the most confident first
 _REFINEMENTS: Final = 2  # rounds of assigning points to the markers of a fitted hand
@@ -45,9 +43,7 @@ _FREE_COORDINATES: Final = 20.0  # degrees of freedom that a pose takes from its
 _LEAST_SPREAD: Final = 0.0003  # [m] that is estimated from a fit
 _LEAST_SCORE: Final = 50.0  # log-odds of a hand: about those of twelve points that are 5 mm off
 _CERTAIN_SCORE: Final = 10.0  # log-odds per marker after which no further cloud is tried
-_KNOWN_SPREAD_ATTEMPTS: Final = (
-    60  # in which a hand that was known must fit as well as before; 0.5 s at 120 Hz
-)
+_KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
 
 
 @dataclass(frozen=True, slots=True, eq=False)

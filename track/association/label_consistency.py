@@ -12,9 +12,7 @@ from handsim.kernels.kernel import kernel
 from track.association.frame_state import FrameState, targets_of
 from track.association.hand_state import HandEstimate, HandState, HandTrack, Prediction
 
-_GATE: Final = (
-    16.0  # squared Mahalanobis distance beyond which a point is not fitted: four standard deviations
-)
+_GATE: Final = 16.0  # squared Mahalanobis distance of a point that is fitted: four standard deviations
 _PREDICTION_SPREAD: Final = 0.004  # [m] least standard deviation of a predicted marker beside its own spread
 _PREDICTION_FACTOR: Final = 2.0  # the same over what the other markers show in this frame
 _MOST_GATED: Final = 0.3  # share of a hand's labels dropped at once; with more the prediction is wrong

@@ -27,16 +27,12 @@ from track.association.label_consistency import fit_labels
 from track.config import TrackerConfig
 from train.labelers.protocol import Labeler
 
-_RADIUS: Final = (
-    0.06  # [m] from a missing marker, within which points without a label are shown to the labeler
-)
+_RADIUS: Final = 0.06  # [m] from a missing marker, within which the labeler is shown points without a label
 _FIRST_WAIT: Final = 0.01  # [s] from a review that changed something to the next one
 _WAIT_FACTOR: Final = 1.6  # of that time after each review that changed nothing
 _SEEN_ELSEWHERE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
 _MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be likelier than those of the track
-_MUCH_NEARER: Final = (
-    0.85  # share of a point's distance from a marker left without its bias, to doubt the bias
-)
+_MUCH_NEARER: Final = 0.85  # share of a point's distance that is left without a bias, to doubt the bias
 _MOVED_LABEL: Final = 2.0  # log-odds that a point keeps the label that it has
 _PERSISTENCE: Final = 1.0  # log-odds added by each earlier review with the same labels
 _MOST_ANSWER_LOG_ODDS: Final = 7.0  # that the labeler's confidence in a label contributes

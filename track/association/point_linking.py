@@ -18,14 +18,9 @@ from scipy.optimize import linear_sum_assignment
 from handsim.space.transforms import rigid_fit
 from track.association.frame_state import FrameState, Numbering
 
-_LASTING_SHARE: Final = (
-    0.5  # of the last frame's IDs that must be there again for the stream's IDs to be used
-)
-_DISTANCES: Final = (
-    0.04,
-    0.025,
-    0.015,
-)  # [m] of a point from its prediction before and after hands are aligned
+_LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
+# Distance of a point from its prediction [m], before hands are aligned and after each alignment.
+_DISTANCES: Final = (0.04, 0.025, 0.015)
 _FEWEST_ALIGNED: Final = 5  # points with which a hand is aligned
 _BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point without a label moves with it
 

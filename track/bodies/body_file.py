@@ -17,6 +17,8 @@ from track.bodies.constellation import FEWEST
 from track.bodies.rigid_body import RigidTemplate
 
 SUFFIX: Final = ".toml"
+AnyBody = RigidTemplate | str | Path
+"""A rigid body, the name of one of handsim's objects, or the path of a .toml file."""
 _BODY_KEYS: Final = ("name", "description", "marker")
 _MARKER_KEYS: Final = ("name", "place_mm")
 
@@ -25,14 +27,18 @@ class BodyError(HandSimError):
     """A body's file that cannot be read or written."""
 
 
-def load_body(name_or_path: str | Path) -> RigidTemplate:
+def load_body(name_or_path: AnyBody) -> RigidTemplate:
     """The markers of one of handsim's objects by its name, or of any body by the path of a `.toml` file.
+
+    A body itself is given back.
 
     Raises:
         ArgumentError: There is no such object, or it has too few markers.
         BodyError: There is no such file, or it does not describe a body that can be tracked; the sentence
             names the file.
     """
+    if isinstance(name_or_path, RigidTemplate):
+        return name_or_path
     path = Path(name_or_path)
     if str(name_or_path) in object_names():
         return RigidTemplate.of(named_object(str(name_or_path)))
@@ -47,7 +53,7 @@ def load_body(name_or_path: str | Path) -> RigidTemplate:
         raise BodyError(f"{path}: {error}") from error
 
 
-def load_bodies(names_or_paths: Iterable[str | Path]) -> tuple[RigidTemplate, ...]:
+def load_bodies(names_or_paths: Iterable[AnyBody]) -> tuple[RigidTemplate, ...]:
     """Bodies that are tracked together.
 
     Raises:
@@ -59,8 +65,9 @@ def load_bodies(names_or_paths: Iterable[str | Path]) -> tuple[RigidTemplate, ..
         body = load_body(name_or_path)
         taken = (*SIDES, *(other.name for other in bodies))
         if body.name in taken:
+            owner = "" if body is name_or_path else f"{name_or_path}: "
             raise ArgumentError(
-                f"{name_or_path}: a body is named '{body.name}', expected a name of its own; taken are "
+                f"{owner}a body is named '{body.name}', expected a name of its own; taken are "
                 f"{', '.join(taken)}"
             )
         bodies.append(body)

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
-from track.bodies.body_pose import squared_distance
-from track.bodies.constellation import FEWEST, fit_inliers, nearest_free
+from track.bodies.constellation import FEWEST, fit_inliers, nearest_free, squared_distance
 
 _FLAT: Final = 0.1  # height of a triangle over its longest side, below which it determines no rotation
 

@@ -20,15 +20,18 @@ from gloves.takes.take import RigidBody
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
 from handsim.space.objects import RigidObject
-from track.bodies.body_pose import predict_pose, transform_markers, velocity_between, write_transform
 from track.bodies.constellation import (
     FEWEST,
     assign_by_id,
     assign_remaining,
     fit_inliers,
+    predict_pose,
     shift_to_points,
     track_by_ids,
+    transform_markers,
+    velocity_between,
     write_labels,
+    write_transform,
 )
 from track.bodies.constellation_search import search_constellation
 from track.tracked_frame import Status

@@ -7,7 +7,6 @@
 `energy`: the energy that is minimized, and its normal equations.
 `solver`: Levenberg-Marquardt with the poses eliminated.
 `report`: noise, standard errors, contact gaps and still joints.
-`hand_proportions`: a hand's proportions from a few frames, for hands that are not calibrated.
 `hand_size`: the size and proportions of hands from unlabeled points.
 `user_calibration`: calibration of a hand in its glove from labeled markers, all steps.
 `picture`: a picture of a calibration.

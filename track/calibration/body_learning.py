@@ -12,8 +12,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.plausibility import check_unit
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate, template_fault
 from track.calibration.frames import CalibrationError
-from track.capture_tracking import capture_frames
-from track.streams.frame_source import StreamedFrame
+from track.streams.frame_source import StreamedFrame, capture_frames
 
 _MOST_MARKERS: Final = 20
 _COUNT_QUANTILE: Final = 0.9  # of the frames' numbers of points: the body's number of markers

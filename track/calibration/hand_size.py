@@ -1,4 +1,4 @@
-"""The size and proportions of a user's hands from a few labeled frames.
+"""The size and proportions of a user's hands, measured in some frames of unlabeled points.
 
 Length and breadth of hands of mean proportions are searched first; then the proportions and the positions of
 the markers follow as far as the frames tell. `user_calibration` finds the rest from a longer capture.
@@ -6,7 +6,7 @@ the markers follow as far as the frames tell. `user_calibration` finds the rest 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -19,7 +19,11 @@ from gloves.layout import MarkerLayout
 from handsim.hand.model import HandModel
 from handsim.hand.shape import SIZES, shape_from_measures
 from handsim.hand.topology import Side
-from track.calibration.hand_proportions import fit_proportions
+from handsim.space.transforms import MIRROR
+from track.calibration.energy import Estimate, Problem
+from track.calibration.hand_parameters import NUM_PARAMETERS
+from track.calibration.skin_coordinates import nearest_coordinates
+from track.calibration.solver import levenberg_marquardt, user_hand
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
@@ -39,6 +43,9 @@ _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
 _PATIENCE: Final = 20  # frames with enough points for a hand, but none, after which another size is tried
 _WINDOWS: Final = 8  # parts of a capture that are looked at
 _WINDOW: Final = 30  # frames of each
+_FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
+_ROBUST_SCALE: Final = 0.015  # [m]
+_FIT_STEPS: Final = 15
 
 
 class _Measured(NamedTuple):
@@ -96,7 +103,7 @@ def fit_size(
         ):  # the labels are better with its own size
             found = _measure_from(found.measures[0], frames, layout, sides, labeler) or found
         if found is not None:
-            return SizeFit(*fit_proportions(found.markers, _hand(*found.measures, layout, "right")))
+            return SizeFit(*_fit_proportions(found.markers, _hand(*found.measures, layout, "right")))
     return None
 
 
@@ -174,3 +181,31 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
     """The argument between two bounds [m] with the least value of a function."""
     result = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": _PRECISION})
     return float(result.x)
+
+
+def _fit_proportions(
+    markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit
+) -> tuple[GloveFit, float]:
+    """One shape for all hands of a user, by a calibration without touches.
+
+    What the frames do not tell stays as it was.
+
+    Args:
+        markers: Labeled markers of each hand in the glove's order [m]; NaN where missing, at least four seen
+            in every frame.
+        start: A right hand of about the right length and breadth in the glove as designed.
+
+    Returns:
+        The right hand in its glove, and the median over frames of the RMS distance of its markers [m].
+    """
+    seen = np.concatenate([some @ MIRROR if side == "left" else some for side, some in markers.items()])
+    worn, shape = start.attachment, start.model.shape
+    coordinates = nearest_coordinates(worn.points, shape)
+    problem = Problem(
+        shape, coordinates, worn.layout.heights, seen, noise=_FIT_NOISE, robust_scale=_ROBUST_SCALE
+    )
+    poses = PoseSolver(start).solve(seen).qpos
+    estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
+    estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None)
+    hand = user_hand(start, problem, estimate)
+    return hand, float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))

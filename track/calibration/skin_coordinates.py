@@ -27,7 +27,7 @@ _OUTSIDE: Final = -1e-9  # barycentric coordinate below which a point is outside
 _CLOSE: Final = 1e-8  # [m] from the target, at which a projection ends
 
 
-class SkinMesh(NamedTuple):
+class SkinTopology(NamedTuple):
     """Topology and weights, the same for the skins of all hands."""
 
     subdivide: sparse.csr_array
@@ -76,7 +76,7 @@ class Skin(NamedTuple):
 
 
 @cache
-def skin_mesh() -> SkinMesh:
+def skin_mesh() -> SkinTopology:
     """Triangles and weights of the skin, subdivided once (cached)."""
     coarse = build_surface(named_shape("M"))
     half = len(coarse.faces) // 2
@@ -86,7 +86,9 @@ def skin_mesh() -> SkinMesh:
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     weights = np.zeros((len(coarse.vertices), NUM_BONES))
     np.add.at(weights, (np.arange(len(weights))[:, None], coarse.bone_indices), coarse.bone_weights)
-    return SkinMesh(step, faces, _adjacent_faces(faces), _vertex_faces(faces, step.shape[0]), step @ weights)
+    return SkinTopology(
+        step, faces, _adjacent_faces(faces), _vertex_faces(faces, step.shape[0]), step @ weights
+    )
 
 
 def _adjacent_faces(faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -258,7 +260,7 @@ def _clip_to_triangle(bary: NDArray[np.float64], moved: NDArray[np.float64]) -> 
 
 
 def _cross_edges(
-    mesh: SkinMesh,
+    mesh: SkinTopology,
     faces: NDArray[np.int64],
     bary: NDArray[np.float64],
     crossing: NDArray[np.int64],

@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -50,11 +50,12 @@ from track.calibration.report import (
 from track.calibration.skin_coordinates import SkinPatch, nearest_coordinates, skin_points
 from track.calibration.solver import Progress, levenberg_marquardt, user_hand
 
-__all__ = ["Calibration", "CalibrationError", "Touch", "calibrate", "calibrate_hands"]
+__all__ = ["Calibration", "CalibrationError", "Touch", "calibrate_hand", "calibrate_hands"]
 
 _WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # steps, as in the paper
-_MOST_STEPS: Final = 30  # in all
+MOST_STEPS: Final = 30
+"""Steps in all, at most."""
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
 _SIGNIFICANT: Final = 0.25  # weight above which a touch is significant
@@ -77,6 +78,22 @@ class Touch:
     """Contact points of thumb and finger on the calibrated rest hand, in the wrist's frame [m]."""
 
 
+class HeldOut(NamedTuple):
+    """How well hands fit frames of the capture that a calibration did not see."""
+
+    before: float
+    """Median over frames of the markers' RMS distance from the fitted hand without calibration [m]."""
+    after: float
+    """The same with calibration [m]."""
+    num_frames: int
+    """Number of frames."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether the calibrated hand fits better."""
+        return self.after < self.before
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """A calibrated hand and the diagnostics of its calibration."""
@@ -97,6 +114,8 @@ class Calibration:
     touches: tuple[Touch, ...]
     still_joints: tuple[str, ...]
     """Joints that moved too little to determine the bones on either side."""
+    held_out: HeldOut | None = None
+    """Whether it is better than no calibration on held-out frames; None if that was not measured."""
 
     @property
     def significant_touches(self) -> tuple[Touch, ...]:
@@ -126,7 +145,7 @@ class Calibration:
         return tuple(sentences)
 
 
-def calibrate(
+def calibrate_hand(
     markers: Float[np.ndarray, "T M 3"],
     start: GloveFit,
     rate: float,
@@ -161,7 +180,7 @@ def calibrate(
     rough_track = solve_frames(markers, rough, usable)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
-    estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, _MOST_STEPS, progress)
+    estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, MOST_STEPS, progress)
     done = user_hand(right, problem, estimate)
     before = _gaps_before(right, markers, touches, usable)
     final = solve_frames(markers, done, usable, rough_track.qpos)
@@ -193,7 +212,7 @@ def calibrate_hands(
             that is not in the capture.
         start: Where to begin, each side at most once; sides that `markers` lacks are left out.
         rate: Frames per second [Hz].
-        progress: Called after each step with the side and the values that `calibrate` gives.
+        progress: Called after each step with the side and the values that `calibrate_hand` gives.
 
     Raises:
         CalibrationError: The capture has no hand, or determines too little of one.
@@ -206,7 +225,7 @@ def calibrate_hands(
             f"the capture has no marker of the {sides} hand, expected half a minute of one"
         )
     return tuple(
-        calibrate(
+        calibrate_hand(
             markers[hand.side],
             hand,
             rate,

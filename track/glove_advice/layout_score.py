@@ -15,7 +15,8 @@ from track.glove_advice.joint_spread import joint_spreads
 from track.glove_advice.observed_hands import ObservedHand
 from train.data.augmentation import Corruption, corrupt
 from train.data.batches import paper_corruption
-from train.evaluation.labeler_evaluation import Report, evaluate_clouds, evaluate_labeler
+from train.evaluate import evaluate_labeler
+from train.evaluation.labeler_evaluation import Report, evaluate_clouds
 from train.labelers.protocol import Labeler
 from train.labelers.side import SideClassifier
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from handsim.hand.topology import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from poses.shapes.library import LIBRARIES, gestures_of
-from track.kinematics.small_systems import eliminate, invert_positive, solve_positive
+from track.kinematics.levenberg_marquardt import eliminate, invert_positive, solve_positive
 
 _JOINT_MEMORY: Final = 1.0  # [s] time constant of the process of the hinges; little is known of one after it
 _JOINT_SPREAD: Final = float(np.deg2rad(0.5))  # least standard deviation of a predicted hinge

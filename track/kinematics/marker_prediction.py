@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from handsim.hand.topology import NUM_JOINTS
 from handsim.kernels.kernel import kernel
 from handsim.kernels.rotations import write_quaternion_matrix
-from track.kinematics.levenberg_marquardt import marker_residuals
+from track.kinematics.levenberg_marquardt import invert_positive, marker_residuals, solve_positive
 from track.kinematics.marker_kinematics import (
     NUM_UNKNOWNS,
     HandArrays,
@@ -23,7 +23,6 @@ from track.kinematics.marker_kinematics import (
     compute_markers,
     workspace,
 )
-from track.kinematics.small_systems import invert_positive, solve_positive
 
 if TYPE_CHECKING:
     from track.kinematics.joint_prior import JointPrior

@@ -32,9 +32,7 @@ from track.kinematics.starting_poses import StartingShapes, starting_shapes
 
 _MOST_STEPS: Final = 30  # from each start
 _CONVERGED: Final = (1e-6 / MARKER_NOISE) ** 2  # of the cost: one marker nearer by a micron
-_ACCURATE: Final = (
-    3e-5 / MARKER_NOISE
-) ** 2  # of the cost, in real time: all markers together nearer by 30 um
+_ACCURATE: Final = (3e-5 / MARKER_NOISE) ** 2  # of the cost, in real time: all markers nearer by 30 um
 _NO_WRIST: Final = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])  # a pose, with precision zero
 
 

@@ -6,6 +6,5 @@
 `datagrams`: UDP: a document or an OSC bundle in each datagram.
 `websocket`: a WebSocket server on this machine.
 `lab_streaming`: a stream of the Lab Streaming Layer.
-`addresses`: opens what an address names.
-`sink_group`: several of them, of which none stops the tracker.
+`addresses`: opens what addresses name, as one group of which none stops the tracker.
 """

@@ -1,8 +1,7 @@
 """Live streams of points.
 
 `addresses`: opens the stream that an address names.
-`frame_source`: frames of points, and the protocol of what delivers them.
-`source_stream`: reads such a source in a thread of its own.
+`frame_source`: frames of points, of captures, live streams and sources of the user's own.
 `natnet`: packets of OptiTrack's NatNet protocol.
 `frame_order`: which frames of a stream go on, in which order.
 `point_stream`: a live stream of points from a NatNet server.

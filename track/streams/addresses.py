@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Final, Protocol
+from collections.abc import Callable
+from typing import Final
 
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError
 from track.network_address import split_address
-from track.streams.frame_source import SILENCE, FrameSource, StreamedFrame
+from track.streams.frame_source import SILENCE, FrameSource, LiveStream, SourceStream
 from track.streams.point_stream import open_stream
 from track.streams.qualisys import PORT, QualisysSource
-from track.streams.source_stream import SourceStream
 
 VALID: Final = ("natnet://host", "natnet://host:port", "qtm://host", "qtm://host:port", "module:name")
 """What an address may be."""
@@ -19,31 +18,13 @@ GROUP: Final = "handsim.frame_sources"
 """Entry points of packages that bring frame sources."""
 
 
-class LiveStream(Protocol):
-    """The frames of a stream, with silences; it ends by itself when it shall end."""
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """What became of the frames so far, by name."""
-        ...
-
-    def __iter__(self) -> Iterator[StreamedFrame]:
-        """The stream itself."""
-        ...
-
-    def __next__(self) -> StreamedFrame:
-        """Wait for the next frame; after each period of silence a silent frame."""
-        ...
-
-    def close(self) -> None:
-        """End the stream."""
-        ...
-
-
 def open_source(
     address: str, *, silence: float = SILENCE, ended: Callable[[], bool] = lambda: False
 ) -> LiveStream:
-    """Open a stream.
+    """Open a live stream, the frames of which are iterated in a `with` block.
+
+    A frame has `points` (N, 3) [m], `ids` (N,) and a `time` [s] that never goes back, as `Tracker.step` takes
+    them.
 
     Args:
         address: As in `VALID`; `module:name?option=value` gives options to a source of the user's own.
@@ -56,7 +37,7 @@ def open_source(
     """
     scheme = address.partition("://")[0] if "://" in address else ""
     if scheme == "natnet":
-        return open_stream(address, silence=silence, ended=ended)
+        return LiveStream(open_stream(address, silence=silence, ended=ended))
     if scheme == "qtm":
         parts = split_address(address, options={}, port=PORT)
         return _read(QualisysSource(parts.host, parts.port), address, silence, ended)
@@ -66,5 +47,5 @@ def open_source(
     return _read(make_plugin(address, group=GROUP, noun="frame source"), name, silence, ended)
 
 
-def _read(source: FrameSource, name: str, silence: float, ended: Callable[[], bool]) -> SourceStream:
-    return SourceStream(source, name, silence=silence, ended=ended)
+def _read(source: FrameSource, name: str, silence: float, ended: Callable[[], bool]) -> LiveStream:
+    return LiveStream(SourceStream(source, name, silence=silence, ended=ended))

@@ -6,16 +6,17 @@ import select
 import socket
 import threading
 import time
+from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, Protocol, Self
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.captures.capture import Capture
 from gloves.optics.identities import number_runs
-from gloves.takes.take import Take
 from handsim.errors import CaptureError, choices
+from track.given import read_points
 from track.streams import natnet
 from track.streams.natnet import DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
 
@@ -28,15 +29,34 @@ _WAIT: Final = 0.05  # [s] for a client's packet, after which the end is looked 
 _NUMBERS: Final = 1 << 31  # of frames and of IDs in a packet
 
 
+class PointFrames(Protocol):
+    """Points of frames with IDs, such as a take's."""
+
+    @property
+    def points(self) -> Float[np.ndarray, "T N 3"]:
+        """Points of all frames [m]; NaN where there is no point."""
+        ...
+
+    @property
+    def ids(self) -> Int[np.ndarray, "T N"]:
+        """ID of each point, -1 where it has none."""
+        ...
+
+    @property
+    def rate(self) -> float:
+        """Frames per second [Hz]."""
+        ...
+
+
 class ReplayServer:
     """Streams frames at their rate over NatNet, while there is a client.
 
     Without a client it waits. The end of a `with` block or `close` ends it.
 
     Args:
-        points: Points of all frames [m]; NaN where there is no point.
-        ids: ID of each point, -1 where it has none.
-        rate: Frames per second [Hz].
+        source: A capture, whose names are not sent and in which an ID lasts until its marker is lost; a take,
+            of which only points and IDs are sent; or the path of one.
+        rate: Frames per second [Hz]; those of the source when not given.
         version: NatNet version of the packets.
         host: Address to listen at; only this machine reaches the default.
         port: UDP port to listen at; a free one when not given.
@@ -44,21 +64,22 @@ class ReplayServer:
             ID goes on.
 
     Raises:
-        CaptureError: The arrays do not fit together, there are no frames or too many points, the version is
-            unknown, or the port is taken.
+        CaptureError: The file cannot be read, the arrays do not fit together, there are no frames or too many
+            points, the version is unknown, or the port is taken.
     """
 
     def __init__(
         self,
-        points: Float[np.ndarray, "T N 3"],
-        ids: Int[np.ndarray, "T N"],
-        rate: float,
+        source: Capture | PointFrames | str | Path,
         *,
+        rate: float | None = None,
         version: Version = natnet.NEWEST,
         host: str = LOOPBACK,
         port: int = 0,
         loop: bool = False,
     ) -> None:
+        points, ids, own_rate = _point_frames(source)
+        rate = own_rate if rate is None else rate
         if points.ndim != 3 or points.shape != (*ids.shape, 3):
             raise CaptureError(
                 f"points have shape {points.shape} and IDs {ids.shape}, expected (T, N, 3) and (T, N)"
@@ -86,52 +107,9 @@ class ReplayServer:
         self._thread = threading.Thread(target=self._serve, name="natnet replay", daemon=True)
         self._thread.start()
 
-    @classmethod
-    def of_capture(
-        cls,
-        capture: Capture,
-        *,
-        rate: float | None = None,
-        version: Version = natnet.NEWEST,
-        host: str = LOOPBACK,
-        port: int = 0,
-        loop: bool = False,
-    ) -> ReplayServer:
-        """Replay a marker file; names are not sent, an ID lasts until its marker is lost.
-
-        Args:
-            capture: Positions (T, N, 3) [m].
-            rate: Frames per second [Hz]; the capture's own when not given.
-            version: NatNet version of the packets.
-            host: Address to listen at.
-            port: UDP port to listen at.
-            loop: Whether it starts again at its end.
-
-        Raises:
-            CaptureError: As for the class.
-        """
-        ids = number_runs(np.isfinite(capture.positions[..., 0]))
-        rate = capture.rate if rate is None else rate
-        return cls(capture.positions, ids, rate, version=version, host=host, port=port, loop=loop)
-
-    @classmethod
-    def of_take(
-        cls,
-        take: Take,
-        *,
-        rate: float | None = None,
-        version: Version = natnet.NEWEST,
-        host: str = LOOPBACK,
-        port: int = 0,
-        loop: bool = False,
-    ) -> ReplayServer:
-        """Replay the points of a take with their IDs; its truth is not sent. See `of_capture`."""
-        rate = take.rate if rate is None else rate
-        return cls(take.points, take.ids, rate, version=version, host=host, port=port, loop=loop)
-
     @property
     def url(self) -> str:
-        """Address for `open_stream`."""
+        """Address for `open_source` and `handsim track --live`."""
         return f"natnet://{self._host}:{self._port}"
 
     @property
@@ -216,6 +194,17 @@ class ReplayServer:
             self._socket.sendto(packet, client)
         except OSError:
             pass  # the client is gone, or its buffer is full
+
+
+def _point_frames(
+    source: Capture | PointFrames | str | Path,
+) -> tuple[Float[np.ndarray, "T N 3"], Int[np.ndarray, "T N"], float]:
+    """Points [m], IDs and rate [Hz] of what is to be played."""
+    if isinstance(source, str | Path):
+        source = read_points(source)
+    if isinstance(source, Capture):
+        return source.positions, number_runs(np.isfinite(source.positions[..., 0])), source.rate
+    return source.points, source.ids, source.rate
 
 
 def _listen(host: str, port: int) -> socket.socket:

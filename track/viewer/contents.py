@@ -60,14 +60,16 @@ class Content(NamedTuple):
     """Its frames, where there are some."""
 
 
-def open_content(name: str, *, out: Path | None = None, size: str = "M", rig: str | None = None) -> Content:
+def open_content(
+    name: str, *, out: Path | None = None, size: str = "M", rig: CameraRig | str | None = None
+) -> Content:
     """Read what shall be shown.
 
     Args:
         name: A path, or the name of a shipped layout or rig.
         out: Where a changed layout is saved; a new name beside it when None.
         size: Size of the hand that wears a layout.
-        rig: Cameras of a capture or take: a shipped name or the path of a .toml file.
+        rig: Cameras of a capture or take: a rig, a shipped name or the path of a .toml file.
 
     Raises:
         ArgumentError: It is nothing that can be viewed, or an option is for something else.
@@ -106,7 +108,7 @@ def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector 
         return CaptureRecording(read_capture(path), rig), None
     if path.suffix.lower() == ".npz" or is_growing(path):
         take = load_take(path)
-        if is_growing(path) or "tracker" not in take.settings:  # it grows, or is no tracker's to correct
+        if is_growing(path) or not take.is_tracked:
             return TakeRecording(take, rig), None
         corrector = Corrector(path, take)
         for sentence in told(corrections_path(path), corrector.unfitting):
@@ -133,9 +135,8 @@ def _rig(name: str | Path) -> Content:
     def show(server: ViserServer) -> Run:
         show_rig(server, rig)
         show_volume(server, rig)
-        degrees = np.rad2deg(rig.field_of_view)
         server.gui.add_markdown(
-            f"**{rig.name}**: {len(rig.positions)} cameras of {degrees:.0f}° and {rig.resolution} px. "
+            f"**{rig.name}**: {len(rig.cameras)} cameras of {rig.pictures()}. "
             "Dots are seen by two cameras or more, blue ones by all. The green cube is where wrists move in "
             "training sets."
         )

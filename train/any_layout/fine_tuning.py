@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from gloves.layout import MarkerLayout
-from handsim.space.cameras import CameraRig, load_rig
+from handsim.space.cameras import CameraRig, as_rig
 from train.any_layout.layout_labeler import LayoutLabeler
 from train.any_layout.layout_network import layout_loss
-from train.config import TrainConfig
+from train.config import TrainConfig, batch_recipe
 from train.data.batches import draw_batch
 from train.data.shards import row_dtype
 from train.simulation.dataset_config import DatasetConfig
@@ -32,13 +32,17 @@ _MOST_GRADIENT: Final = 1.0
 
 
 def fine_tuned_labeler(
-    layout: MarkerLayout, rig: CameraRig | None = None, *, num_clouds: int = NUM_CLOUDS, seed: int = 0
+    layout: MarkerLayout,
+    rig: CameraRig | str = "figure5",
+    *,
+    num_clouds: int = NUM_CLOUDS,
+    seed: int = 0,
 ) -> LayoutLabeler:
     """A labeler for any layout that has learned more of this one.
 
     Args:
         layout: The glove.
-        rig: Cameras that see the frames; the paper's when not given.
+        rig: Cameras that see the frames: a rig, its name or its file; the paper's when not given.
         num_clouds: Clouds to learn from, of two thirds as many frames.
         seed: Of all randomness.
 
@@ -47,8 +51,9 @@ def fine_tuned_labeler(
     """
     rng = np.random.default_rng(seed)
     labeler = LayoutLabeler(layout, seed=seed)
-    rows = _simulated_rows(layout, load_rig("figure5") if rig is None else rig, 2 * num_clouds // 3, rng)
-    network, config = copy.deepcopy(labeler.network).train(), TrainConfig(batch=_BATCH)
+    rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
+    network = copy.deepcopy(labeler.network).train()
+    recipe = batch_recipe(TrainConfig(batch=_BATCH), layout.num_markers)
     optimizer = torch.optim.AdamW(network.parameters(), lr=_PEAK_RATE, weight_decay=1e-4, fused=True)
     steps = -(-num_clouds // _BATCH)
     with torch_threads(1):
@@ -56,7 +61,7 @@ def fine_tuned_labeler(
             rate = min(1.0, (step + 1) / _WARM_UP) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
             for group in optimizer.param_groups:
                 group["lr"] = float(_PEAK_RATE * rate)
-            cloud = draw_batch(rows, config, rng=rng).cloud
+            cloud = draw_batch(rows, recipe, rng=rng).cloud
             points, present = (
                 torch.from_numpy(cloud.points.astype(np.float32)),
                 torch.from_numpy(cloud.present),

@@ -7,16 +7,25 @@ Some batches keep what the simulated rig sees of them; the others get the corrup
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from handsim._checks import check_number, check_rng, check_type, shown_value
+from handsim.errors import ArgumentError
+
+_MOST: Final = 100  # points to add to a cloud or drop from it
+
 
 @dataclass(frozen=True, slots=True)
 class Corruption:
-    """The paper's corruption, as it is drawn for training and for tests."""
+    """The paper's corruption, as it is drawn for training and for tests.
+
+    Raises:
+        ArgumentError: A number is of another type or out of range.
+    """
 
     occlude: int = 5
     """Most draws of a marker to drop; drawn with replacement, as the paper's occlusion ratio implies."""
@@ -26,6 +35,13 @@ class Corruption:
     """Half width of the uniform noise on each coordinate [m]."""
     margin: float = 0.1
     """Growth of the box [share of its sides]."""
+
+    def __post_init__(self) -> None:
+        for name in ("occlude", "ghosts"):
+            check_type(name, getattr(self, name), (int, np.integer), "a whole number")
+            check_number(name, getattr(self, name), 0, _MOST)
+        check_number("jitter", self.jitter, 0.0, 0.1)
+        check_number("margin", self.margin, 0.0, 10.0)
 
 
 class Cloud(NamedTuple):
@@ -56,7 +72,14 @@ def corrupt(
 
     Returns:
         Points (B, N, 3) [m], which of them are there (B, N), and the marker of each (B, N), -1 for a ghost.
+
+    Raises:
+        ArgumentError: An argument is of another type or shape.
     """
+    check_type("corruption", corruption, Corruption, "a Corruption")
+    check_rng(rng)
+    if not isinstance(markers, np.ndarray) or markers.ndim != 3 or markers.shape[2] != 3:
+        raise ArgumentError(f"markers is {shown_value(markers)}, expected an array (B, M, 3) [m]")
     batch, count = markers.shape[:2]
     present = np.isfinite(markers).all(-1)
     positions = markers + rng.uniform(-corruption.jitter, corruption.jitter, markers.shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -10,10 +11,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.hand.topology import SIDES
-from train.config import TrainConfig
 from train.data.augmentation import Cloud, Corruption, corrupt
 from train.data.mapped_rows import MappedRows
-from train.data.own_corruption import own_cloud
+from train.data.own_corruption import OwnCorruption, draw_cloud
 
 
 class Weights(NamedTuple):
@@ -63,33 +63,48 @@ def paper_corruption(num_markers: int) -> Corruption:
     return Corruption(occlude=round(num_markers / 4), ghosts=2)
 
 
+@dataclass(frozen=True, slots=True)
+class BatchRecipe:
+    """How a batch is drawn."""
+
+    batch: int
+    """Clouds."""
+    corruption: Corruption | OwnCorruption | str
+    """What is done to clean markers, or whose: a function or its name."""
+    jitter: float = 0.0
+    """Largest half width of the uniform noise on each coordinate [m]; every batch draws its own."""
+    rig_share: float = 0.0
+    """Share of batches that are what the simulated rig sees."""
+    anisotropy: float = 0.0
+    """Log standard deviation of the stretch of each hand along three random directions."""
+
+
 def draw_batch(
-    rows: NDArray[np.void] | MappedRows, config: TrainConfig, *, rng: np.random.Generator
+    rows: NDArray[np.void] | MappedRows, recipe: BatchRecipe, *, rng: np.random.Generator
 ) -> Batch:
     """Random rows as corrupted clouds [m], centered; left hands are mirrored to right ones.
 
     Args:
         rows: Rows of a training set, see `train.data.shards.row_dtype`.
-        config: Size of the batch, and how to corrupt it.
+        recipe: Size of the batch, and how to corrupt it.
         rng: Source of all randomness.
     """
-    chosen = rows[rng.integers(len(rows), size=config.batch)]
+    chosen = rows[rng.integers(len(rows), size=recipe.batch)]
     markers = chosen["markers"].astype(np.float64)
     center = markers.mean(axis=1, keepdims=True)
-    stretch = _stretches(len(markers), config.anisotropy, rng)
+    stretch = _stretches(len(markers), recipe.anisotropy, rng)
     stretch = _mirrors(chosen["hand"]) @ stretch
     markers = (markers - center) @ stretch
-    jitter = config.jitter * rng.uniform()
-    if rng.random() < config.rig_share:
+    jitter = recipe.jitter * rng.uniform()
+    if rng.random() < recipe.rig_share:
         observed = (chosen["observed"].astype(np.float64) - center) @ stretch
         ghosts = (chosen["ghosts"].astype(np.float64) - center) @ stretch
         corruption = Corruption(occlude=0, ghosts=0, jitter=jitter)
         return Batch(corrupt(observed, corruption, ghosts=ghosts, rng=rng), markers)
-    if config.corruption is not None:
-        return Batch(own_cloud(config.corruption, markers, rng=rng), markers)
-    usual = paper_corruption(markers.shape[1]).occlude
-    occlude = usual if config.occlude is None else config.occlude
-    return Batch(corrupt(markers, Corruption(occlude, config.ghosts, jitter), rng=rng), markers)
+    own = recipe.corruption
+    if isinstance(own, Corruption):
+        own = dataclasses.replace(own, jitter=own.jitter + jitter)
+    return Batch(draw_cloud(own, markers, rng=rng), markers)
 
 
 def right_hands(

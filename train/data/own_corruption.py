@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from handsim._plugins import call_plugin, load_plugin
+from handsim._checks import check_callable
+from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError
-from train.data.augmentation import Cloud, shuffled
+from train.data.augmentation import Cloud, Corruption, corrupt, shuffled
 
 CORRUPTIONS: Final = "handsim.corruptions"
 """Group of entry points of corruptions."""
@@ -36,12 +37,26 @@ class OwnCorruption(Protocol):
         """
 
 
-def own_cloud(name: str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator) -> Cloud:
+def draw_cloud(
+    corruption: Corruption | OwnCorruption | str,
+    markers: Float[np.ndarray, "B M 3"],
+    *,
+    rng: np.random.Generator,
+) -> Cloud:
+    """Shuffled clouds (B, N) of clean markers [m] by our corruption or a user's, see `own_cloud`."""
+    if isinstance(corruption, Corruption):
+        return corrupt(markers, corruption, rng=rng)
+    return own_cloud(corruption, markers, rng=rng)
+
+
+def own_cloud(
+    corruption: OwnCorruption | str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.Generator
+) -> Cloud:
     """Shuffled clouds (B, N) of clean markers [m] by a user's corruption.
 
     Args:
-        name: `module:name` of a function like `OwnCorruption` or of a class whose instances are, or an entry
-            point of the group `handsim.corruptions`.
+        corruption: A function like `OwnCorruption`; `module:name` of one or of a class whose instances are;
+            or an entry point of the group `handsim.corruptions`.
         markers: Clean markers.
         rng: Source of all randomness.
 
@@ -50,8 +65,13 @@ def own_cloud(name: str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.
             another shape, labels that are none, or points that are half NaN or beyond 10 m.
         HandSimError: It raised an error.
     """
-    corruption = load_plugin(name, group=CORRUPTIONS, noun=_NOUN)
-    returned = call_plugin(corruption, name, _NOUN, markers.copy(), rng=rng)
+    if isinstance(corruption, str):
+        function = load_plugin(corruption, group=CORRUPTIONS, noun=_NOUN)
+    else:
+        check_callable(_NOUN, corruption, "a Corruption, a function (markers, *, rng), or its module:name")
+        function = corruption
+    name = plugin_name(corruption)
+    returned = call_plugin(function, name, _NOUN, markers.copy(), rng=rng)
     owner = f"{_NOUN} '{name}'"
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise ArgumentError(f"{owner} returns {type(returned).__name__}, expected the pair points, labels")
@@ -64,14 +84,14 @@ def own_cloud(name: str, markers: Float[np.ndarray, "B M 3"], *, rng: np.random.
     return shuffled(points, present, labels.astype(np.int64), rng=rng)
 
 
-def check_corruption(name: str, num_markers: int) -> None:
+def check_corruption(corruption: OwnCorruption | str, num_markers: int) -> None:
     """Load a corruption and try it on two clouds, before the work.
 
     Raises:
         HandSimError: As `own_cloud`.
     """
     rng = np.random.default_rng(0)
-    own_cloud(name, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
+    own_cloud(corruption, rng.uniform(-0.1, 0.1, (2, num_markers, 3)), rng=rng)
 
 
 def _check(

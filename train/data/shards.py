@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,9 +18,13 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Shaped
 from numpy.typing import NDArray
+from upath import UPath
 
+from gloves.layout import MarkerLayout, stored_layout
 from gloves.optics.ghosts import MAX_GHOSTS
-from handsim.errors import DatasetError, choices
+from handsim._checks import check_type
+from handsim.app.output import Place, place_of
+from handsim.errors import DatasetError, LayoutError, choices
 from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import checksum
@@ -192,19 +197,23 @@ def checked_manifest(file: Path, content: dict[str, Any]) -> Manifest:
 
 
 class Dataset:
-    """A finished training set, its rows memory-mapped.
+    """A finished training set of `len(dataset)` frames, its rows memory-mapped.
 
     A row is one frame of one hand. Its fields are `qpos` (27,) [m, rad], true `markers` (M, 3) [m], the
     `cameras` that see each marker, positions `observed` (M, 3) [m] and `ghosts` (4, 3) [m].
 
     Args:
-        path: The folder that `handsim generate` wrote: `.npy` shards and a `manifest.json`.
+        path: The folder that `handsim generate` wrote: `.npy` shards and a `manifest.json`. A folder of an
+            object store, as s3://bucket/prefix, is copied for as long as the set is open.
 
     Raises:
         DatasetError: Not a training set, unfinished, of another schema, or damaged (the file is named).
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: str | Place) -> None:
+        check_type("path", path, (str, Path, UPath), "the folder of a training set")
+        place = place_of(path)
+        path = place if isinstance(place, Path) else self._copied(place)
         self.manifest = load_manifest(path)
         for name, expected in self.manifest.files.items():
             file = path / name
@@ -226,6 +235,17 @@ class Dataset:
                 "delete it and run handsim generate again"
             )
 
+    def _copied(self, place: UPath) -> Path:
+        """A copy of the files of an object store, removed with the set."""
+        self._copy = tempfile.TemporaryDirectory(prefix="handsim-set-")
+        folder = Path(self._copy.name)
+        for name in (MANIFEST, CONFIG):
+            if (place / name).exists():
+                (folder / name).write_bytes((place / name).read_bytes())
+        for name in load_manifest(folder).files:
+            (folder / name).write_bytes((place / name).read_bytes())
+        return folder
+
     def _map_shards(self) -> list[NDArray[np.void]]:
         names = sorted(name for name in self.manifest.files if name.startswith("rows-"))
         dtype = row_dtype(len(self.manifest.marker_names))
@@ -238,6 +258,21 @@ class Dataset:
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.path, self.manifest = state["path"], state["manifest"]
         self.shards = self._map_shards()
+
+    def __len__(self) -> int:
+        return self.manifest.num_frames
+
+    @property
+    def layout(self) -> MarkerLayout:
+        """The glove of its hands.
+
+        Raises:
+            DatasetError: The manifest holds none.
+        """
+        try:
+            return stored_layout(self.manifest.config["layout"])
+        except (KeyError, TypeError, LayoutError) as error:
+            raise DatasetError(f"{self.path / MANIFEST} holds no layout: {error}") from error
 
     @property
     def marker_names(self) -> tuple[str, ...]:
@@ -255,6 +290,19 @@ class Dataset:
     def hands(self, shard: int) -> list[HandShape]:
         """The hands of a shard; the `hand` of its rows is an index into them."""
         return [unpack_hand(record) for record in _load_records(self.path / hands_name(shard), HAND_DTYPE)]
+
+
+def load_dataset(dataset: Dataset | str | Place) -> Dataset:
+    """A training set as it is, or by its folder.
+
+    Raises:
+        ArgumentError: It is neither.
+        DatasetError: As of `Dataset`.
+    """
+    if isinstance(dataset, Dataset):
+        return dataset
+    check_type("dataset", dataset, (str, Path, UPath), "a Dataset or the folder of one")
+    return Dataset(dataset)
 
 
 def _load_records(file: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:

@@ -1,29 +1,34 @@
-"""Processes on this machine, one a device, that end with the one that started them."""
+"""Processes on this machine, one a device, started by torch, that end with the one that asks for them."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import sys
 import tempfile
-import time
 import traceback
 import warnings
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final, Protocol
 
-from handsim.app.interrupts import InterruptFlag, Stopped, interrupt_flag, signals_raise
-from handsim.app.workers import end_processes, portable, spawn
+from torch import multiprocessing
+from torch.multiprocessing.spawn import ProcessContext, ProcessExitedException, start_processes
+
+from handsim.app.interrupts import Stopped, interrupt_flag, signals_raise
+from handsim.app.workers import portable, without_signals
 from handsim.errors import HandSimError
 from train.devices.agreement import PeerError
 from train.devices.world import RENDEZVOUS, World
 
-Progress = Callable[[int, int, float], None]
-"""Called with samples done, samples expected, and the loss."""
 _LOOK: Final = 0.2  # [s] between two looks for a signal
 _PATIENCE: Final = 5.0  # [s] that the other processes have when one has failed
+
+
+Progress = Callable[[int, int, float], None]
+"""Called with samples done, samples expected, and the loss."""
 
 
 class Job(Protocol):
@@ -31,10 +36,6 @@ class Job(Protocol):
 
     def __call__(self, *, progress: Progress) -> Any:
         """Do it, and report the progress; the result must survive a pipe."""
-
-
-class _Death(HandSimError):
-    """A process that ended without a word."""
 
 
 def in_local_processes(job: Job, count: int, *, progress: Progress | None) -> Any:
@@ -51,87 +52,96 @@ def in_local_processes(job: Job, count: int, *, progress: Progress | None) -> An
         Exception: What ended the first process that failed on its own.
         Stopped: A signal came.
     """
-    ranks: dict[Connection, tuple[int, SpawnProcess]] = {}
+    pipes = [multiprocessing.get_context("spawn").Pipe(duplex=False) for _ in range(count)]
+    words: dict[int, Any] = {}
+    ended, passed_on, death = False, False, None
     with tempfile.TemporaryDirectory(prefix="handsim-") as folder, interrupt_flag() as interrupted:
+        arguments = (job, Path(folder) / "rendezvous", [theirs for _, theirs in pipes])
+        with without_signals():
+            started: ProcessContext = start_processes(  # type: ignore[no-untyped-call]
+                _live, arguments, count, join=False, daemon=True
+            )
         try:
-            for rank in range(count):
-                world = World(rank, rank, count, count)
-                variables = {**world.variables(), RENDEZVOUS: str(Path(folder) / "rendezvous")}
-                channel, process = spawn(_live, job, variables)
-                ranks[channel] = rank, process
-            outcomes = _listen(ranks, progress, interrupted)
+            while not ended:
+                wait([*(ours for ours, _ in pipes), *started.sentinels], timeout=_LOOK)
+                _listen(pipes, words, progress)
+                if interrupted() and not passed_on:
+                    passed_on = True
+                    _terminate(started)
+                ended = started.join(timeout=0.0, grace_period=_PATIENCE)
+        except ProcessExitedException as error:
+            death = error
         finally:
-            end_processes({channel: process for channel, (_, process) in ranks.items()})
-    return _result(outcomes, interrupted.number)
+            _terminate(started)
+            for process in started.processes:
+                process.join()
+        _listen(pipes, words, progress)
+    return _result(words, interrupted.number, death)
+
+
+def _terminate(started: ProcessContext) -> None:
+    for process in started.processes:
+        process.terminate()
 
 
 def _listen(
-    ranks: dict[Connection, tuple[int, SpawnProcess]], progress: Progress | None, interrupted: InterruptFlag
-) -> dict[int, Any]:
-    """The last word of each process: its result, or what ended it."""
-    outcomes: dict[int, Any] = {}
-    waiting, passed_on, deadline = set(ranks), False, float("inf")
-    while waiting and time.monotonic() < deadline:
-        if interrupted() and not passed_on:
-            passed_on = True
-            for _, process in ranks.values():
-                process.terminate()
-        for channel in cast("list[Connection]", wait(list(waiting), timeout=_LOOK)):
-            rank, process = ranks[channel]
-            try:
-                is_last, word = channel.recv()
-            except (EOFError, OSError):
-                waiting.discard(channel)
-                is_last, word = True, outcomes[rank] if rank in outcomes else _death(rank, process)
+    pipes: list[tuple[Connection, Connection]], words: dict[int, Any], progress: Progress | None
+) -> None:
+    """Hand on the progress that there is, and keep the last word of each process."""
+    for rank, (ours, _) in enumerate(pipes):
+        while ours.poll():
+            is_last, word = ours.recv()
             if is_last:
-                outcomes[rank] = word
-                if isinstance(word, BaseException):
-                    deadline = min(deadline, time.monotonic() + _PATIENCE)
+                words[rank] = word
             elif progress is not None:
                 progress(*word)
-    return outcomes
 
 
-def _death(rank: int, process: SpawnProcess) -> _Death:
-    process.join(1.0)
-    code = process.exitcode or 0
-    how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-    return _Death(
-        f"process {rank} of the training {how} (out of memory?); run the same command again to go on from "
-        "the last checkpoint"
-    )
-
-
-def _result(outcomes: dict[int, Any], number: int) -> Any:
+def _result(words: dict[int, Any], number: int, death: ProcessExitedException | None) -> Any:
     """The result of the first process, or what ended the run: an error comes before a signal."""
-    ended = [word for _, word in sorted(outcomes.items()) if isinstance(word, BaseException)]
-    for error in ended:
-        if not isinstance(error, (PeerError, _Death, Stopped)):
-            raise error
-    dead = [error for error in ended if isinstance(error, _Death)]
+    ended = [word for _, word in sorted(words.items()) if isinstance(word, BaseException)]
     stopped = [stop for stop in ended if isinstance(stop, Stopped)]
+    dead = death is not None and death.error_index not in words
+    for error in ended:
+        if not isinstance(error, PeerError | Stopped):
+            raise error
     if number or (stopped and not dead):  # a process dies of a signal before it has a handler
         raise Stopped(number or stopped[0].number, next((stop.kept for stop in stopped if stop.kept), ""))
-    for error in (*dead, *ended):
+    if death is not None and dead:
+        how = death.signal_name or f"exit code {death.exit_code}"
+        raise HandSimError(
+            f"process {death.error_index} of the training was ended by {how} (out of memory?); run the same "
+            "command again to go on from the last checkpoint"
+        ) from death
+    for error in ended:
         raise error
-    return outcomes[0]
+    return words[0]
 
 
-def _live(job: Job, variables: dict[str, str], channel: Connection) -> None:
+def _live(rank: int, job: Job, rendezvous: Path, channels: list[Connection]) -> None:
     """The life of a process: do the job and say how it ended."""
-    os.environ.update(variables)
-    if variables["RANK"] != "0":
+    os.environ.update(World(rank, rank, len(channels), len(channels)).variables())
+    os.environ[RENDEZVOUS] = str(rendezvous)
+    if rank:
         warnings.simplefilter("ignore")  # the first one tells
 
+    def tell(is_last: bool, word: Any) -> None:
+        with contextlib.suppress(OSError):  # nobody is there to hear it
+            channels[rank].send((is_last, word))
+
     def report(done: int, expected: int, loss: float) -> None:
-        channel.send((False, (done, expected, loss)))
+        tell(False, (done, expected, loss))
 
     try:
         with signals_raise():
-            word = job(progress=report)
+            if hasattr(signal, "pthread_sigmask"):  # the parent's death sends one, too
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGHUP})
+            tell(True, job(progress=report))
+            return
     except KeyboardInterrupt as stop:
-        word = stop if isinstance(stop, Stopped) else Stopped()
+        word: Exception | Stopped = stop if isinstance(stop, Stopped) else Stopped()
     except Exception as error:
         error.add_note(traceback.format_exc())
         word = portable(error)
-    channel.send((True, word))
+    tell(True, word)
+    sys.exit(1)

@@ -13,11 +13,10 @@ from scipy.spatial import cKDTree
 
 from gloves.optics.ghosts import GHOST_REACH
 from gloves.takes.take import Take
-from handsim.errors import CaptureError
-from train.data.augmentation import Cloud, Corruption, corrupt
+from train.data.augmentation import Cloud, Corruption
 from train.data.batches import paper_corruption
-from train.evaluation.metrics import LabelCounts
-from train.evaluation.reliability import error_without, expected_calibration_error
+from train.data.own_corruption import OwnCorruption, draw_cloud
+from train.evaluation.metrics import LabelCounts, error_without, expected_calibration_error
 from train.labelers.protocol import Labeler
 
 _CHUNK: Final = 4096
@@ -28,7 +27,7 @@ class Report:
     """The result of an evaluation."""
 
     figures: dict[str, float]
-    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.reliability` the expected
+    """Shares in [0, 1], see `train.evaluation.metrics`; and from `train.evaluation.metrics` the expected
     calibration error and the share of points labeled wrongly without the 2 % of least confidence."""
     slot_accuracy_by_marker: Float[np.ndarray, "M"]
     num_frames: int
@@ -42,30 +41,16 @@ class Report:
     """Slots, points, occlusions and ghosts counted, see `train.evaluation.metrics.LabelCounts.numbers`."""
 
 
-def evaluate_labeler(
+def evaluate_markers(
     labeler: Labeler,
     markers: Float[np.ndarray, "T M 3"],
-    corruption: Corruption,
+    corruption: Corruption | OwnCorruption | str,
     *,
     rng: np.random.Generator,
 ) -> Report:
-    """Corrupt known markers, label them and count errors.
-
-    Args:
-        labeler: The labeler to evaluate.
-        markers: True markers (T, M, 3) [m] in the labeler's order, NaN where missing.
-        corruption: Occlusion, ghosts and jitter to draw.
-        rng: Source of all randomness.
-
-    Returns:
-        Figures as shares in [0, 1], by their names, and the counts that they come from.
-
-    Raises:
-        ArgumentError: `markers` are not in meters.
-    """
-    count = _Count(labeler)
-    for first in range(0, len(markers), _CHUNK):
-        count.add_cloud(corrupt(markers[first : first + _CHUNK], corruption, rng=rng))
+    """Corrupt known markers [m], NaN where missing, label them and count errors."""
+    count = LabelingCount(labeler)
+    count.add_markers(markers, corruption, rng=rng)
     return count.report()
 
 
@@ -76,7 +61,7 @@ def evaluate_clouds(labeler: Labeler, cloud: Cloud) -> Report:
         labeler: The labeler to evaluate.
         cloud: Clouds of hands [m].
     """
-    count = _Count(labeler)
+    count = LabelingCount(labeler)
     count.add_cloud(cloud)
     return count.report()
 
@@ -85,36 +70,7 @@ def paper_report(labeler: Labeler, rows: NDArray[np.void]) -> Report:
     """Evaluation of a labeler on these rows with the paper's corruption, the same each time."""
     markers = rows["markers"].astype(np.float64)
     corruption = paper_corruption(markers.shape[1])
-    return evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(0))
-
-
-def evaluate_takes(labeler: Labeler, takes: Sequence[Take]) -> Report:
-    """Label every hand of every frame of simulated takes, separated by the truth, and count errors.
-
-    Args:
-        labeler: The labeler to evaluate.
-        takes: Takes with truth.
-
-    Returns:
-        Figures as shares in [0, 1], by their names, and the counts that they come from. The ghosts of a hand
-        are those within 0.1 [m] of its markers.
-
-    Raises:
-        CaptureError: A take's glove has other markers than the labeler knows.
-    """
-    count = _Count(labeler)
-    for take in takes:
-        for hand in range(len(take.hands)):
-            names = take.hands[hand].layout.names
-            if names != labeler.marker_names:
-                raise CaptureError(
-                    f"the take's glove has markers {', '.join(names)}, the labeler knows "
-                    f"{', '.join(labeler.marker_names)}"
-                )
-            clouds, truths = hand_clouds(take, hand)
-            for first in range(0, len(clouds), _CHUNK):
-                count.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
-    return count.report()
+    return evaluate_markers(labeler, markers, corruption, rng=np.random.default_rng(0))
 
 
 def hand_clouds(take: Take, hand: int) -> tuple[list[Float[np.ndarray, "N 3"]], list[Int[np.ndarray, "N"]]]:
@@ -145,7 +101,7 @@ def _nearest_marker(take: Take, label: range) -> Float[np.ndarray, "T N"]:
     return distance
 
 
-class _Count:
+class LabelingCount:
     """Labels clouds and counts errors."""
 
     def __init__(self, labeler: Labeler) -> None:
@@ -158,18 +114,39 @@ class _Count:
         self.right: list[NDArray[np.bool_]] = [np.zeros(0, dtype=np.bool_)]
 
     def add_cloud(self, cloud: Cloud) -> None:
+        """Label clouds [m] and count."""
         self.add(
             [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)],
             [truth[here] for truth, here in zip(cloud.truth, cloud.present, strict=True)],
         )
 
+    def add_markers(
+        self,
+        markers: Float[np.ndarray, "T M 3"],
+        corruption: Corruption | OwnCorruption | str,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        """Corrupt markers [m], label the clouds and count."""
+        for first in range(0, len(markers), _CHUNK):
+            self.add_cloud(draw_cloud(corruption, markers[first : first + _CHUNK], rng=rng))
+
+    def add_take(self, take: Take) -> None:
+        """Label every hand of every frame of a take, separated by the truth."""
+        for hand in range(len(take.hands)):
+            clouds, truths = hand_clouds(take, hand)
+            for first in range(0, len(clouds), _CHUNK):
+                self.add(clouds[first : first + _CHUNK], truths[first : first + _CHUNK])
+
     def add(self, clouds: Sequence[Float[np.ndarray, "N 3"]], truths: Sequence[Int[np.ndarray, "N"]]) -> None:
+        """Label points [m] and count; a truth is the marker of each, -1 for a ghost."""
         for labeling, truth in zip(self.labeler.label_frames(clouds), truths, strict=True):
             self.right_by_marker += self.counts.add(labeling.labels, truth, self.num_labels)
             self.confidences.append(labeling.confidence)
             self.right.append(labeling.labels == truth)
 
     def report(self) -> Report:
+        """Figures of all that was counted."""
         frames = self.counts.frames
         confidences, right = np.concatenate(self.confidences), np.concatenate(self.right)
         figures = {

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from train.config import CNNConfig, NetworkConfig, TrainConfig
+from train.config import CNNConfig, NetworkConfig, TrainConfig, batch_recipe
 from train.data.batches import Batch, Part, draw_batch
 from train.data.mapped_rows import MappedRows
 from train.labelers.batch_network import BatchNetwork
@@ -35,7 +35,8 @@ def prepare_network(network: nn.Module, rows: NDArray[np.void] | MappedRows) -> 
     """Give an untrained network what it must know of a training set before the first step."""
     if isinstance(network, DeepLabelCNN):
         rng = np.random.default_rng(0)
-        batch = draw_batch(rows, TrainConfig(batch=_PREPARED, rig_share=0.0, anisotropy=0.0), rng=rng)
+        config = TrainConfig(batch=_PREPARED, rig_share=0.0, anisotropy=0.0)
+        batch = draw_batch(rows, batch_recipe(config, network.config.num_labels), rng=rng)
         hand = MeanHand.of_clouds(batch.markers, batch.cloud.points, batch.cloud.present)
         network.mean_hand.set(hand)
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
 from gloves.captures.plausibility import check_unit
-from handsim._plugins import call_plugin, load_plugin
+from handsim._plugins import call_plugin, load_plugin, plugin_name
 from handsim.errors import ArgumentError, WeightsError
 from train.matching.pose_prior import PosePrior
 from train.matching.verification import match_scores
@@ -33,7 +33,7 @@ class Labeling:
     labels: Int[np.ndarray, "N"]
     """Index of each point's marker in the layout, -1 for a ghost; no marker twice."""
     confidence: Float[np.ndarray, "N"]
-    """Confidence of each label, 0 to 1."""
+    """Confidence of each label, a probability from 0 to 1."""
 
 
 class Labeler(Protocol):
@@ -164,16 +164,19 @@ class OwnLabeler:
     """A user's `Labeler` behind checks.
 
     Args:
-        name: `module:name` of a labeler or of a class of them, or an entry point of the group
+        labeler: A labeler; `module:name` of one or of a class of them; or an entry point of the group
             `handsim.labelers`.
 
     Raises:
         ArgumentError: There is none of that name, or it lacks `marker_names` or `label_frames`.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, labeler: Labeler | str) -> None:
+        name = plugin_name(labeler)
         self._name = name
-        self._labeler = load_plugin(name, group=LABELERS, noun=_NOUN)
+        self._labeler: Any = labeler
+        if isinstance(labeler, str):
+            self._labeler = load_plugin(labeler, group=LABELERS, noun=_NOUN)
         names = getattr(self._labeler, "marker_names", None)
         if not callable(getattr(self._labeler, "label_frames", None)) or not isinstance(names, list | tuple):
             raise ArgumentError(

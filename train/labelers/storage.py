@@ -11,6 +11,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from gloves.layout import list_layouts
 from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import HandSimError, WeightsError, choices
 from handsim.files.atomic import atomic_write
@@ -39,10 +40,8 @@ def shipped_labelers() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.safetensors") if path.stem != _ANY_LAYOUT))
 
 
-def load_labeler(name_or_path: str | Path) -> Labeler:
+def load_stored_labeler(name_or_path: str | Path) -> Labeler:
     """A labeler: the shipped one of a glove, one that was trained or exported, or one of your own.
-
-    Only shipped ones and folders need torch.
 
     Args:
         name_or_path: A glove with a shipped labeler, a folder that `handsim train` wrote, an .onnx file,
@@ -79,8 +78,11 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     else:
         weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
         if not weights.is_file() or not card.is_file():
-            unknown = choices(str(name_or_path), shipped_labelers(), noun="labeler")
-            raise WeightsError(f"{unknown}, a folder that handsim train wrote, an .onnx file, or module:name")
+            unknown = choices(str(name_or_path), list_layouts(), noun="labeler or glove")
+            raise WeightsError(
+                f"{unknown}, a layout's .toml file, a folder that handsim train wrote, an .onnx file, or "
+                "module:name"
+            )
     return _read_network(weights, card)
 
 

@@ -14,7 +14,7 @@ from gloves.captures.gaps import run_lengths
 from handsim.app.page import Section, write_page
 from handsim.errors import DatasetError
 from handsim.hand.topology import JOINTS, SIDES
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import as_rig
 from train.data.shards import Dataset, hands_name
 from train.reports import dataset_plots as _plots
 from train.reports.plot_style import picture
@@ -199,7 +199,7 @@ def _angles_section(rows: Shaped[np.ndarray, "T"]) -> Section:
 def _sight_section(rows: Shaped[np.ndarray, "T"], dataset: Dataset) -> Section:
     manifest = dataset.manifest
     lost = 1.0 - np.isfinite(rows["observed"][..., 0]).mean(axis=0)
-    shares = camera_shares(rows, len(load_rig(manifest.config["rig"]).positions))
+    shares = camera_shares(rows, len(as_rig(manifest.config["rig"]).positions))
     draw = partial(
         _plots.draw_visibility,
         names=manifest.marker_names,

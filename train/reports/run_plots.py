@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Int
 
-from train.evaluation.reliability import BINS, Reliability
+from train.evaluation.metrics import BINS, Reliability
 from train.history import History
 from train.reports.plot_style import BAND, BLUE, INK, LINE, PALE, SOFT, WARM
 

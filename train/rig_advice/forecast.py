@@ -1,21 +1,23 @@
-"""The forecast of a rig: what captures of hands at work will miss, by simulated takes' optical system."""
+"""The forecast of a rig: what captures of hands at work will miss, by simulated takes' optical system.
+
+The error of points is a covariance, from the noise of blobs in the pictures.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from gloves.captures.gaps import run_lengths
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from gloves.optics.strays import StrayConfig
 from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
-from train.rig_advice.point_error import ErrorEllipsoid, covariances, ellipsoid
 from train.simulation.light_sources import LightSources, sample_light_sources
 from train.simulation.motion import SceneMotion
 from train.simulation.room import label_false_points
@@ -25,6 +27,17 @@ from train.simulation.sight import SceneSight
 _ERRORS: Final = 4000  # marker-frames of a scene from which the error is taken
 ROOM: Final = RoomConfig(strays=StrayConfig(number=0.0))
 """A well-kept optical system; how many stray reflections a room has does not depend on its cameras."""
+
+
+class ErrorEllipsoid(NamedTuple):
+    """The error of points, averaged."""
+
+    axes: Float[np.ndarray, "3"]
+    """Standard deviations along the directions, the longest first [m]; NaN without points."""
+    directions: Float[np.ndarray, "3 3"]
+    """Unit vectors in the world, one in each row."""
+    mean: float
+    """Root mean square of the distance from the truth, averaged over the points [m]."""
 
 
 class LitScene(NamedTuple):
@@ -143,8 +156,7 @@ def camera_losses(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> 
         )
         without = None
         if len(rig.positions) > FEWEST_CAMERAS:
-            fewer = dataclasses.replace(rig, T_world_camera=np.delete(rig.T_world_camera, camera, axis=0))
-            without = forecast([one.without(camera) for one in lit], fewer, seed=seed)
+            without = forecast([one.without(camera) for one in lit], rig.without(camera), seed=seed)
         found.append(CameraLoss(seen / total, needed / total, without))
     return found
 
@@ -188,3 +200,43 @@ def _count(one: LitScene, rig: CameraRig, optics: OpticsConfig, rng: np.random.G
         run_lengths(~present) / rate,
         covariances(sources.positions[rows, columns], one.seen[rows, columns], rig, noise),
     )
+
+
+def covariances(
+    points: Float[np.ndarray, "N 3"],
+    seen: Bool[np.ndarray, "N C"],
+    rig: CameraRig,
+    noise: Float[np.ndarray, "N"],
+) -> Float[np.ndarray, "N 3 3"]:
+    """Covariance of each triangulated point [m^2], the one nearest to its rays, which all count alike.
+
+    Args:
+        points: In the world [m].
+        seen: Which cameras see each: two or more, from different directions.
+        rig: The cameras.
+        noise: Standard deviation of each point's blob per axis [px].
+    """
+    total, shifts = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, 3))
+    for number, camera in enumerate(rig.cameras):
+        rays = points - camera.T_world_camera[:3, 3]
+        distances = np.linalg.norm(rays, axis=1)
+        directions = rays / distances[:, None]
+        across = (np.eye(3) - directions[:, :, None] * directions[:, None]) * seen[:, number, None, None]
+        total += across
+        # A pixel to the right or down moves the ray at the point's depth by so much, across the ray.
+        local = camera.local(points)
+        tangents = np.linalg.inv(camera.lens.jacobian(local)) / camera.focal_lengths
+        moved = across @ camera.T_world_camera[:3, :2] @ tangents * (local[:, 2] * noise)[:, None, None]
+        shifts += moved @ moved.transpose(0, 2, 1)
+    inverse = np.linalg.inv(total)
+    spread: NDArray[np.float64] = inverse @ shifts @ inverse
+    return spread
+
+
+def ellipsoid(spread: Float[np.ndarray, "N 3 3"]) -> ErrorEllipsoid:
+    """The mean of some points' covariances [m^2]."""
+    if not len(spread):
+        return ErrorEllipsoid(np.full(3, np.nan), np.eye(3), float("nan"))
+    values, vectors = np.linalg.eigh(spread.mean(axis=0))
+    mean = float(np.sqrt(np.trace(spread, axis1=1, axis2=2)).mean())
+    return ErrorEllipsoid(np.sqrt(np.maximum(values[::-1], 0.0)), vectors.T[::-1], mean)

@@ -10,7 +10,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from handsim.space.cameras import HAND_REACH, look_at
+from handsim.space.camera import look_at
+from handsim.space.cameras import HAND_REACH
 
 Mount = Literal["walls", "truss", "tripods"]
 MOUNTS: Final[tuple[Mount, ...]] = get_args(Mount)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
@@ -10,11 +11,11 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
+from handsim.space.camera import Camera
 from handsim.space.cameras import CameraRig
-from train.rig_advice.candidate_views import view_candidates
 from train.rig_advice.forecast import Forecast, forecast, light
 from train.rig_advice.mounts import Mount, places
-from train.rig_advice.planning import Planning
+from train.rig_advice.planning import Planning, view_candidates
 from train.rig_advice.work import sample_work
 from train.simulation.motion import SceneMotion
 
@@ -22,15 +23,6 @@ _PEOPLE: Final = 3  # of each kind of work
 _FRAMES: Final = 900  # of each
 _SKIPPED: Final = 12  # every so many frames count
 _JUDGED: Final = 600  # frames of a person that the plan did not see
-
-
-class LensKind(NamedTuple):
-    """What all cameras of a rig share."""
-
-    field_of_view: float
-    """[rad]"""
-    resolution: int
-    """[px]"""
 
 
 class Plan(NamedTuple):
@@ -51,7 +43,7 @@ def plan(
     layout: MarkerLayout,
     center: Float[np.ndarray, "3"],
     sides: Float[np.ndarray, "3"],
-    lens: LensKind,
+    camera: Camera,
     kept: CameraRig | None = None,
     *,
     name: str,
@@ -67,7 +59,7 @@ def plan(
         layout: The glove.
         center: Middle of the volume that hands work in [m].
         sides: Its sides [m].
-        lens: Of every camera.
+        camera: What every new camera is, but for its pose.
         kept: Cameras that stay.
         name: Of the rig.
         told: Called with what is going on.
@@ -75,21 +67,26 @@ def plan(
 
     Raises:
         ArgumentError: There is no room for so many cameras.
-        RigError: No camera has such a lens.
     """
-    CameraRig(name, np.stack([np.eye(4), _moved(np.eye(4))]), *lens)  # raises what is out of range
     free = places(room, mounts, center, sides)
-    old = np.empty((0, 4, 4)) if kept is None else kept.T_world_camera
-    poses = np.concatenate([old, free.T_world_camera])
-    targets = np.concatenate([old[:, :3, 3] + old[:, :3, 2], free.targets])
+    old = () if kept is None else tuple(kept.cameras)
+    candidates = [*old, *(camera.at(pose) for pose in free.T_world_camera)]
+    ahead = [one.T_world_camera[:3, 3] + one.T_world_camera[:3, 2] for one in old]
+    targets = np.array([*ahead, *free.targets])
     rng = np.random.default_rng(seed)
     scenes = [one.faster(_SKIPPED) for one in _scenes(layout, center, sides, _FRAMES, _PEOPLE, rng)]
     told(f"what cameras at {len(free.targets)} places would see")
-    views = view_candidates(scenes, poses, lens.field_of_view, lens.resolution, rng=rng)
-    search = Planning(views, poses[:, :3, 3], range(len(old)))
+    views = view_candidates(scenes, candidates, rng=rng)
+    positions = np.stack([one.T_world_camera[:3, 3] for one in candidates])
+    search = Planning(views, positions, range(len(old)))
     search.grow(num_cameras)
     search.exchange(lambda value: told(f"moving cameras: {value:.4f}"))
-    rig = CameraRig(name, poses[search.chosen], *lens)
+    chosen = [candidates[number] for number in search.chosen]
+    new = [
+        dataclasses.replace(one, name=f"camera{number}")
+        for number, one in enumerate(chosen[len(old) :], len(old) + 1)
+    ]
+    rig = CameraRig(name, [*old, *new])
     told("forecasting")
     fresh = _scenes(layout, center, sides, _JUDGED, 1, np.random.default_rng(seed + 1))
     before = None if kept is None else _forecast(fresh, kept, seed)
@@ -110,9 +107,3 @@ def _scenes(
 
 def _forecast(scenes: Sequence[SceneMotion], rig: CameraRig, seed: int) -> Forecast:
     return forecast(light(scenes, rig, rng=np.random.default_rng(seed)), rig, seed=seed)
-
-
-def _moved(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    moved = pose.copy()
-    moved[0, 3] = 1.0
-    return moved

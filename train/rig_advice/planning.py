@@ -1,16 +1,26 @@
-"""The search for a rig: cameras are chosen one after the other, then exchanged while that helps."""
+"""The search for a rig: what candidate cameras see of hands at work, and which of them are chosen.
+
+Cameras are chosen one after the other, then exchanged while that helps. What a candidate sees are bits of
+marker-frames, and what it tells of points.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt64
 from numpy.typing import NDArray
 
+from gloves.optics.blobs import MARKER_RADIUS
 from handsim.errors import ArgumentError
-from train.rig_advice.candidate_views import CandidateViews
+from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
+from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, CameraRig
+from train.rig_advice.forecast import ROOM
+from train.simulation.light_sources import marker_radii
+from train.simulation.motion import SceneMotion
+from train.simulation.sight import SceneSight
 
 WEIGHTS: Final = (0.02, 0.4, 0.6, 0.05)
 """What the shares of marker-frames that one, two, three and four cameras see are worth. A point begins with
@@ -21,6 +31,50 @@ _LONGEST: Final = 1.5  # error of points that no two cameras see, or only along 
 _APART: Final = 0.3  # of two cameras [m]
 _GAIN: Final = 1e-5  # of an exchange, at least
 _EXCHANGES: Final = 200
+_WIDE: Final = pinhole("wide", (1280, 1280), focal_of_angle(1280, np.deg2rad(170.0)))
+"""A camera in whose view hands are wherever it is aimed."""
+_SAMPLED: Final = 1200  # marker-frames whose error is looked at
+
+
+class CandidateViews(NamedTuple):
+    """K candidate cameras before N marker-frames."""
+
+    bits: UInt64[np.ndarray, "K W"]
+    """Marker-frames that each sees, 64 in a word."""
+    num_marker_frames: int
+    told: Float[np.ndarray, "6 K S"]
+    """What each tells of S of the marker-frames, the inverse of a covariance [1/mm^2]: xx, xy, xz, yy, yz,
+    zz; 0 where it does not see."""
+
+
+def view_candidates(
+    scenes: Sequence[SceneMotion],
+    candidates: Sequence[Camera],
+    *,
+    rng: np.random.Generator,
+) -> CandidateViews:
+    """Cast the lines of sight from every marker to every candidate, once for candidates at one position.
+
+    Args:
+        scenes: Hands at work.
+        candidates: The cameras.
+        rng: Source of visible spots, and of the marker-frames whose error is looked at.
+    """
+    centers_of = np.stack([one.T_world_camera[:3, 3] for one in candidates])
+    positions, which = np.unique(centers_of.round(6), axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    seen, points, noise = [], [], []
+    for scene in scenes:
+        free, centers, radii = _free_views(scene, positions, rng)
+        inside = np.stack([one.in_view(centers) for one in candidates])
+        seen.append(free[:, which].T & inside)
+        points.append(centers)
+        noise.append(ROOM.optics.noise * np.sqrt(MARKER_RADIUS / radii))
+    views, centers = np.concatenate(seen, axis=1), np.concatenate(points)
+    sampled = rng.choice(len(centers), min(_SAMPLED, len(centers)), replace=False)
+    focals = np.array([one.focal_length for one in candidates])
+    told = _told(centers[sampled], centers_of, np.concatenate(noise)[sampled] / focals[:, None])
+    return CandidateViews(_packed(views), len(centers), told * views[:, sampled])
 
 
 class Planning:
@@ -126,3 +180,42 @@ def _mean_error(told: Float[np.ndarray, "6 K S"]) -> NDArray[np.float64]:
     squared = np.where(known, minors, _LONGEST**2) / np.where(known, determinant, 1.0)
     mean: NDArray[np.float64] = np.sqrt(np.clip(squared, 0.0, _LONGEST**2)).mean(axis=-1, dtype=np.float64)
     return mean
+
+
+def _free_views(
+    scene: SceneMotion, positions: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Of the hands' markers in all frames: which positions see them (N, P), where (N, 3), how large (N,)."""
+    count = sum(hand.fit.layout.num_markers for hand in scene.hands)
+    parts = []
+    for begin in range(0, len(positions), MAX_CAMERAS):
+        few = positions[begin : begin + MAX_CAMERAS]
+        # A rig has two cameras at least: where one is left, it comes with another that is cut off again.
+        some = few if len(few) >= FEWEST_CAMERAS else np.concatenate([few, few + np.array([0.0, 0.0, 1.0])])
+        middle = scene.hands[0].qpos[:, :3].mean(axis=0)
+        rig = CameraRig("candidates", [_WIDE.at(look_at(one, middle)) for one in some])
+        sight = SceneSight(scene, rig)
+        radii = marker_radii(scene, ROOM.optics)
+        visible = sight.visible_markers(ROOM.optics.partial * radii, rng=rng)
+        parts.append(visible[:, :count, : len(few)].reshape(-1, len(few)))
+    centers = sight.markers[0][:, :count].reshape(-1, 3)
+    return np.concatenate(parts, axis=1), centers, np.tile(radii[:count], scene.num_frames)
+
+
+def _told(
+    points: NDArray[np.float64], positions: NDArray[np.float64], noise: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """What a ray with noise [rad] tells across itself (6, K, S) [1/mm^2]."""
+    rays = points - positions[:, None]
+    distances = np.linalg.norm(rays, axis=-1)
+    x, y, z = np.moveaxis(rays / distances[..., None], -1, 0)
+    weight = 1e-6 / (noise * distances) ** 2
+    parts = (1.0 - x * x, -x * y, -x * z, 1.0 - y * y, -y * z, 1.0 - z * z)
+    return np.stack([(weight * part).astype(np.float32) for part in parts])
+
+
+def _packed(views: NDArray[np.bool_]) -> NDArray[np.uint64]:
+    """Rows of flags (K, N) as bits, 64 in a word, the last word filled with zeros."""
+    padded = np.zeros((len(views), -(-views.shape[1] // 64) * 64), dtype=bool)
+    padded[:, : views.shape[1]] = views
+    return np.packbits(padded, axis=1).view(np.uint64)

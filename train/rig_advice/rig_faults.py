@@ -112,7 +112,8 @@ def _coverage(rig: CameraRig, point: NDArray[np.float64]) -> Iterator[str]:
 def pixels_of_a_marker(rig: CameraRig, point: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
     """Diameter (C,) of the paper's marker at a point [m] in each picture [px]."""
     distances = np.linalg.norm(point - rig.positions, axis=1)
-    return np.asarray(2 * MARKER_RADIUS * rig.focal_length / np.maximum(distances, 1e-9))
+    focals = np.array([one.focal_length for one in rig.cameras])
+    return np.asarray(2 * MARKER_RADIUS * focals / np.maximum(distances, 1e-9))
 
 
 def _distances(positions: NDArray[np.float64]) -> NDArray[np.float64]:

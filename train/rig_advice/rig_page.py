@@ -1,21 +1,29 @@
-"""The page of a rig's score, and its tables: advice, figures of the work, cameras, the volume."""
+"""The page of a rig's score in pictures and tables: advice, figures of the work, cameras, the volume."""
 
 from __future__ import annotations
 
 from functools import partial
 from html import escape
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from handsim.app.page import Section, write_page
-from train.reports.plot_style import picture
-from train.rig_advice.forecast import Forecast
-from train.rig_advice.rig_picture import MAP_SIZE, WORTH_SIZE, draw_map, draw_worth
-from train.rig_advice.rig_score import RigScore
-from train.rig_advice.rig_sentences import sentences
+from handsim.space.cameras import CameraRig
+from train.reports.plot_style import BLUE, CARD, INK, LINE, PALE, SOFT, WARM, picture
+from train.rig_advice.forecast import CameraLoss, Forecast
+from train.rig_advice.rig_score import RigScore, sentences
+from train.rig_advice.volume_map import GRID, VolumeMap
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MAP_SIZE: Final = (9.6, 4.6)  # of the pictures [inch]
+_WORTH_SIZE: Final = (8.4, 3.2)
+_VIEWS: Final = (("from above", 0, 1), ("from the front", 0, 2))
+_ARROW: Final = 0.3  # length of a camera's direction [m]
 _NOTHING: Final = "-"
 _COLUMNS: Final = (
     "by 2 [%]",
@@ -46,10 +54,8 @@ def write_rig_page(path: Path, score: RigScore, *, work: str) -> None:
         work: Whose hands did what, in words.
     """
     rig = score.rig
-    lead = (
-        f"{len(rig.positions)} cameras, field of view {np.rad2deg(rig.field_of_view):.0f} degrees, "
-        f"{rig.resolution} pixels across it; {score.whole.marker_frames:,} marker-frames of {work}."
-    )
+    seen = f"{score.whole.marker_frames:,} marker-frames of {work}"
+    lead = f"{len(rig.cameras)} cameras of {rig.pictures()}; {seen}."
     items = "".join(f"<li>{escape(one)}</li>" for one in sentences(score))
     sections = [
         Section("What to do", f"<ol>{items}</ol>"),
@@ -76,20 +82,20 @@ def camera_table(score: RigScore) -> list[list[str]]:
 
 
 def _cameras_section(score: RigScore) -> Section:
-    draw = partial(draw_worth, losses=score.losses, missing=score.whole.missing)
+    draw = partial(_draw_worth, losses=score.losses, missing=score.whole.missing)
     text = (
         "The same hands without one camera. Sees, needed: share of the marker-frames that the camera sees, "
         "and that it sees and fewer than two others."
     )
     caption = "Marker-frames that are missing without each camera, and with all."
     return Section(
-        "Cameras", text, table=camera_table(score), pictures=[(picture(WORTH_SIZE, draw), caption)]
+        "Cameras", text, table=camera_table(score), pictures=[(picture(_WORTH_SIZE, draw), caption)]
     )
 
 
 def _volume_section(score: RigScore) -> Section:
     volume = score.volume
-    draw = partial(draw_map, volume=volume, rig=score.rig)
+    draw = partial(_draw_map, volume=volume, rig=score.rig)
     caption = "Disks are cameras, numbered, with their directions. Colors are averages along the view."
     rows = [
         [
@@ -112,8 +118,77 @@ def _volume_section(score: RigScore) -> Section:
     text = "Hands in poses of the work, set at each point of a grid in the volume, each alone."
     return Section(
         "The volume", text, table=[["a hand's markers", "mean", "worst", "at [m]"], *rows],
-        pictures=[(picture(MAP_SIZE, draw), caption)],
+        pictures=[(picture(_MAP_SIZE, draw), caption)],
     )  # fmt: skip
+
+
+def _draw_map(figure: Figure, volume: VolumeMap, rig: CameraRig) -> None:
+    """Draw the volume colored by the share of markers that two cameras see, averaged along the view.
+
+    Args:
+        figure: Where to draw, of `_MAP_SIZE`.
+        volume: The map.
+        rig: Its cameras.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    panels = figure.subplots(1, 2)
+    colors = LinearSegmentedColormap.from_list("seen", [WARM, "#d9a441", PALE, BLUE])
+    norm = Normalize(0, 100)
+    shares = 100 * volume.seen_by_two.reshape(GRID, GRID, GRID)
+    points = volume.points.reshape(GRID, GRID, GRID, 3)
+    for panel, (title, right, up) in zip(panels, _VIEWS, strict=True):
+        flat = shares.mean(axis=3 - right - up)
+        panel.pcolormesh(
+            np.unique(points[..., right]), np.unique(points[..., up]), flat.T,
+            cmap=colors, norm=norm, shading="nearest", rasterized=False,
+        )  # fmt: skip
+        _draw_cameras(panel, rig, right, up)
+        panel.set_title(title, color=SOFT)
+        panel.set_xlabel("x [m]")
+        panel.set_ylabel(f"{'xyz'[up]} [m]")
+        panel.set_aspect("equal", adjustable="datalim")
+    bar = figure.colorbar(ScalarMappable(norm, colors), ax=panels, shrink=0.7)
+    bar.set_label("markers seen by two cameras [%]")
+    bar.outline.set_visible(False)
+
+
+def _draw_worth(figure: Figure, losses: list[CameraLoss], missing: float) -> None:
+    """Draw what is missing without each camera, beside what is missing with all.
+
+    Args:
+        figure: Where to draw, of `_WORTH_SIZE`.
+        losses: Of each camera.
+        missing: Share of marker-frames that is missing with all cameras.
+    """
+    panel = figure.subplots()
+    numbers = np.arange(1, len(losses) + 1)
+    without = [100.0 if one.without is None else 100 * one.without.missing for one in losses]
+    panel.bar(numbers, without, color=PALE)
+    panel.axhline(100 * missing, color=WARM, linewidth=1.2)
+    panel.annotate(
+        "with all cameras",
+        (numbers[-1] + 0.5, 100 * missing),
+        color=WARM,
+        ha="right",
+        va="bottom",
+        fontsize=8,
+    )
+    panel.set_xticks(numbers)
+    panel.set_xlabel("without camera")
+    panel.set_ylabel("marker-frames missing [%]")
+
+
+def _draw_cameras(panel: Axes, rig: CameraRig, right: int, up: int) -> None:
+    for number, pose in enumerate(rig.T_world_camera, 1):
+        begin, ahead = pose[[right, up], 3], pose[[right, up], 2]
+        end = begin + _ARROW * ahead
+        panel.plot(*np.stack([begin, end]).T, color=LINE, linewidth=2.0, zorder=2)
+        panel.plot(*begin, "o", color=CARD, markeredgecolor=INK, markersize=11, zorder=3)
+        panel.annotate(
+            str(number), begin, ha="center", va="center_baseline", fontsize=6.5, color=INK, zorder=4
+        )
 
 
 def _cells(one: Forecast) -> list[str]:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from gloves.fit import GlovedHand
 from gloves.optics.blobs import MARKER_RADIUS
 from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
-from train.rig_advice.forecast import ROOM
-from train.rig_advice.point_error import covariances
+from train.rig_advice.forecast import ROOM, covariances
 from train.rig_advice.rig_faults import cube_points
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion

@@ -17,6 +17,6 @@ Takes, continuous and with IDs:
 Training sets, frame by frame:
 - frame_scenes: poses of one hand, two hands, or a hand with an object.
 - training_frames: such poses through sight and optics into rows.
-- generation: `generate_dataset` writes rows in shards, with a manifest.
+- generation: `make_dataset` writes rows in shards, with a manifest.
 - held_out: test frames that no training set holds.
 """

@@ -14,7 +14,7 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.topology import NUM_JOINTS
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import CameraRig, as_rig, rig_setting
 from poses.motion.minimum_jerk import MotionConfig
 from poses.motion.motions import angles_through, count_frames, sample_motion
 from poses.motion.rest_paths import can_be_left
@@ -43,8 +43,8 @@ class CalibrationTakeConfig:
     """Free motion [s]."""
     rounds: int = 3
     """How often the thumb goes to each of the other fingertips in turn."""
-    rig: str = "figure5"
-    """Camera rig: a shipped name or the path of a .toml file."""
+    rig: CameraRig | str = "figure5"
+    """Camera rig: a shipped name, the path of a .toml file, or the rig itself."""
     turning: float = 0.7
     """Standard deviation of the wrist's rotation about each axis [rad]."""
 
@@ -74,8 +74,9 @@ def simulate_calibration(
     """
     config = config or CalibrationTakeConfig()
     scene = sample_calibration_scene(hands, config, rng=rng)
-    settings = {"kind": "calibration", **dataclasses.asdict(config)}
-    return record_take(scene, load_rig(config.rig), RoomConfig(), settings, rng=rng)
+    rig = as_rig(config.rig)
+    settings = {"kind": "calibration", **dataclasses.asdict(config), "rig": rig_setting(rig)}
+    return record_take(scene, rig, RoomConfig(), settings, rng=rng)
 
 
 def sample_calibration_scene(

@@ -4,26 +4,34 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 
+from gloves.layout import MarkerLayout, list_layouts
 from gloves.optics.ghosts import GhostConfig
 from gloves.optics.reconstruction import OpticsConfig
-from handsim._checks import check_number, check_span
+from handsim._checks import check_number, check_span, check_type, fill_settings
 from handsim.errors import DatasetError
 from handsim.hand.shape import Population
+from handsim.space.cameras import CameraRig, list_rigs
 from poses.shapes.samplers import PoseMix
+from poses.shapes.sampling import PoseSampler, checked_sampler
 from train.simulation.frame_scenes import SceneMix
 
 
 @dataclass(frozen=True, slots=True)
 class DatasetConfig:
-    """Everything that decides the bytes of a training set."""
+    """Everything that decides the bytes of a training set.
 
-    glove: str = "dense19"
+    A group of settings, such as `scenes`, may be given as a mapping of those that differ from its default:
+    `scenes={"together": 0.0, "holding": 0.0}`.
+    """
+
+    glove: MarkerLayout | str | Path = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
     num_frames: int = 170_330
     """Frames; the default is the paper's number."""
     seed: int = 0
-    rig: str = "figure5"
+    rig: CameraRig | str | Path = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     min_cameras: int = 2
     """Cameras that must see a marker before it exists."""
@@ -37,7 +45,7 @@ class DatasetConfig:
     """Half side of the cube the wrist moves in [m], around 1.1 m above the floor."""
     population: Population = dataclasses.field(default_factory=lambda: Population(children=0.2))
     poses: PoseMix = dataclasses.field(default_factory=PoseMix)
-    sampler: str | None = None
+    sampler: PoseSampler | str | None = None
     """A pose sampler of your own for hands that are alone, instead of that mix: module:name, or the name of
     an entry point."""
     scenes: SceneMix = dataclasses.field(default_factory=SceneMix)
@@ -49,6 +57,15 @@ class DatasetConfig:
     """Least and greatest chance per frame that some cameras lose their pictures."""
 
     def __post_init__(self) -> None:
+        wanted = "a MarkerLayout, or the name or path of one"
+        check_type("glove", self.glove, (MarkerLayout, str, Path), wanted, list_layouts())
+        wanted = "a CameraRig, or the name or path of one"
+        check_type("rig", self.rig, (CameraRig, str, Path), wanted, list_rigs())
+        if self.sampler is not None:
+            checked_sampler(self.sampler)
+        for name in ("num_frames", "seed", "min_cameras", "frames_per_hand"):
+            check_type(name, getattr(self, name), int, "a whole number")
+        fill_settings(self)
         for name in ("num_frames", "min_cameras", "frames_per_hand"):
             if getattr(self, name) < 1:
                 raise DatasetError(f"{name} is {getattr(self, name)}, expected at least 1")

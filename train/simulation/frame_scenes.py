@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
 from handsim.space.cameras import ROOM_CENTER
 from handsim.space.objects import RigidObject, named_object, object_names
 from handsim.space.transforms import random_quaternions
@@ -72,7 +73,7 @@ def sample_frame_scene(
         scenes: How often each kind of scene is drawn.
         poses: How single hands are posed.
         volume: Half side of the cube the wrist is in [m].
-        sampler: Draws the angles of single hands instead.
+        sampler: Draws the poses of single hands instead.
         redrawn: Counts the scenes that became one of a hand alone, by reason.
         rng: Source of all randomness.
     """
@@ -101,12 +102,20 @@ def sample_single_hand(
     sampler: PoseSampler | None = None,
     rng: np.random.Generator,
 ) -> FrameScene:
-    """Poses of one hand in any orientation, in a cube of half side `volume` [m]."""
+    """Poses of one hand in any orientation, in a cube of half side `volume` [m].
+
+    The wrists are those of a sampler of whole poses, unless it leaves all of them at the origin, as
+    `poses.sample_poses` does.
+    """
     position = ROOM_CENTER + rng.uniform(-volume, volume, size=(num_frames, 3))
     if sampler is None:
         angles = sample_valid_angles(model, num_frames, poses, rng=rng)
     else:
-        angles = make_valid(model, sampler(model, num_frames, rng=rng))
+        drawn = sampler(model, num_frames, rng=rng)
+        angles = make_valid(model, drawn[:, -NUM_JOINTS:])
+        if drawn.shape[1] == NUM_QPOS and drawn[:, :3].any():
+            qpos = np.concatenate([drawn[:, :-NUM_JOINTS], angles], axis=1)
+            return FrameScene((model,), (qpos,))
     quaternion = random_quaternions(num_frames, rng=rng)
     return FrameScene((model,), (join_qpos(angles, position=position, quaternion=quaternion),))
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.layout import load_layout
-from handsim.space.cameras import load_rig
+from handsim.space.cameras import as_rig
 from train.data.shards import row_dtype
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.people import sample_hands
@@ -26,7 +26,7 @@ def held_out_markers(glove: str, num_frames: int, *, seed: int) -> Float[np.ndar
         seed: Seed of the people and poses.
     """
     config = DatasetConfig(glove=glove, num_frames=num_frames, seed=seed)
-    layout, rig = load_layout(glove), load_rig(config.rig)
+    layout, rig = load_layout(glove), as_rig(config.rig)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(_SPAWN_KEY,)))
     rows = np.zeros(num_frames, dtype=row_dtype(layout.num_markers))
     for first in range(0, num_frames, config.frames_per_hand):

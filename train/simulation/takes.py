@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, cast
+from pathlib import Path
+from typing import Any, Final, cast
 
 import numpy as np
 
 from gloves.fit import GlovedHand, GloveFit
-from gloves.layout import MarkerLayout, load_layout
+from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take
+from handsim._checks import check_type, fill_settings
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.topology import SIDES, Side
-from handsim.space.cameras import ROOM_CENTER, check_outside_volume, load_rig
+from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
 from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
 from train.simulation.motion import RATE, SceneMotion, sample_scene_motion
 from train.simulation.people import sample_adult_hands, wear_gloves
@@ -51,9 +53,9 @@ class TakeConfig:
     num_frames: int | None = None
     """Frames; when not given the paper's number for this kind, 3000 for real-like and free, and for
     calibration touches and 40 s of free motion."""
-    glove: str = "dense19"
+    glove: MarkerLayout | str | Path = "dense19"
     """Marker layout: a shipped name or the path of a .toml file."""
-    rig: str = "figure5"
+    rig: CameraRig | str | Path = "figure5"
     """Camera rig: a shipped name or the path of a .toml file."""
     seed: int = 0
     optics: OpticsOptions = field(default_factory=OpticsOptions)
@@ -63,6 +65,17 @@ class TakeConfig:
     hand-pen, hand-controller and real-like."""
 
     def __post_init__(self) -> None:
+        check_type("kind", self.kind, str, "the name of a kind of capture", SIMULATED_KINDS)
+        wanted = "a MarkerLayout, or the name or path of one"
+        check_type("glove", self.glove, (MarkerLayout, str, Path), wanted, list_layouts())
+        wanted = "a CameraRig, or the name or path of one"
+        check_type("rig", self.rig, (CameraRig, str, Path), wanted, list_rigs())
+        check_type("seed", self.seed, int, "a whole number")
+        if self.num_frames is not None:
+            check_type("num_frames", self.num_frames, int, "a whole number, or None for the kind's own")
+        check_type("hands", self.hands, (str, tuple, list), "right, left or both", SIDES)
+        object.__setattr__(self, "hands", (self.hands,) if isinstance(self.hands, str) else tuple(self.hands))
+        fill_settings(self)
         if self.kind not in SIMULATED_KINDS:
             raise ArgumentError(choices(self.kind, SIMULATED_KINDS, noun="kind of capture"))
         if self.num_frames is not None and self.num_frames < 1:
@@ -87,8 +100,45 @@ class TakeConfig:
         return TWINS[_ALIKE.get(self.kind, self.kind)].room
 
 
-def simulate_take(config: TakeConfig) -> Take:
-    """A simulated capture of two hands with its truth: points (T, N, 3) [m], labels, IDs and motion.
+def simulate_take(
+    kind: SimulatedKind = "single-hand",
+    *,
+    glove: MarkerLayout | str | Path = "dense19",
+    num_frames: int | None = None,
+    rig: CameraRig | str | Path = "figure5",
+    seed: int = 0,
+    hands: Sequence[Side] = BOTH,
+    optics: Mapping[str, Any] | None = None,
+) -> Take:
+    """A simulated capture of one hand or two with its truth: points (T, N, 3) [m], labels, IDs and motion.
+
+    Args:
+        kind: What the hands do: single-hand, hand-hand, hand-pen or hand-controller, as in the paper's
+            captures; real-like; calibration, what a user does to be calibrated by; or free.
+        glove: The marker layout, or its name or path.
+        num_frames: Frames; when not given the paper's number for this kind, 3000 for real-like and free, and
+            for calibration touches and 40 s of free motion.
+        rig: The cameras, or the name or path of a rig.
+        seed: Seed of people, motion and losses.
+        hands: Both, or for single-hand, calibration and free one of them.
+        optics: What differs from the optical system fitted to this kind, as `handsim simulate --help` lists
+            it: `{"blob_loss": 0.1}`.
+
+    Returns:
+        A take at 120 [Hz]; the same arguments give the same take.
+
+    Raises:
+        LayoutError: The glove is unknown, does not fit, or is for one hand and the other is simulated too.
+        RigError: The rig is unknown or damaged.
+        ArgumentError: An argument is of another type or out of range, or a camera stands in the hands' way.
+        PoseError: None of the people drawn can do what this kind of capture asks for.
+    """
+    options: Any = {} if optics is None else optics
+    return record_config(TakeConfig(kind, num_frames, glove, rig, seed, options, hands))  # type: ignore[arg-type]
+
+
+def record_config(config: TakeConfig) -> Take:
+    """As `simulate_take`.
 
     Args:
         config: What the hands do, for how long, in which glove and under which cameras.
@@ -104,14 +154,19 @@ def simulate_take(config: TakeConfig) -> Take:
     kind = config.kind
     key = SIMULATED_KINDS.index(kind), TWINS[kind].draw if kind in TWINS else 0
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=key))
-    rig, layout = load_rig(config.rig), load_layout(config.glove)
+    rig, layout = as_rig(config.rig), load_layout(config.glove)
     for side in config.hands:
         layout.check_side(side)
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
     scene = _sample_scene(config, layout, rng)
     optics = config.optics.applied(config.room.optics).worn(layout.radius)
     room = dataclasses.replace(config.room, optics=optics)
-    settings = dataclasses.asdict(config) | {"room": dataclasses.asdict(room)}
+    named = dataclasses.replace(
+        config,
+        glove=layout.name if isinstance(config.glove, MarkerLayout) else str(config.glove),
+        rig=rig.name,
+    )
+    settings = dataclasses.asdict(named) | {"rig": rig_setting(rig), "room": dataclasses.asdict(room)}
     del settings["optics"]  # the room has all of them
     if set(config.hands) == set(BOTH):
         del settings["hands"]

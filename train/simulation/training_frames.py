@@ -22,7 +22,7 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import SIDES
 from handsim.space.cameras import CameraRig
 from handsim.space.objects import named_object
-from poses.shapes.sampling import load_sampler
+from poses.shapes.sampling import checked_sampler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import FrameScene, sample_frame_scene
 from train.simulation.people import wear_gloves
@@ -72,7 +72,7 @@ def simulate_frames(
         config.scenes,
         config.poses,
         config.volume,
-        sampler=None if config.sampler is None else load_sampler(config.sampler),
+        sampler=None if config.sampler is None else checked_sampler(config.sampler),
         redrawn=redrawn,
         rng=rng,
     )

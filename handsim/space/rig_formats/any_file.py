@@ -1,4 +1,4 @@
-"""The cameras of a file of any kind, by its ending and its content."""
+"""The cameras of a file of any kind, by its ending and its content; those that see markers."""
 
 from __future__ import annotations
 
@@ -7,20 +7,23 @@ import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final, Literal
+
+import numpy as np
 
 from handsim.errors import HandSimError, HandSimWarning, RigError
-from handsim.space.camera_file import checked_cameras, read_camera_file
+from handsim.space.camera import Camera
+from handsim.space.rig_file import checked_cameras, read_rig_file
 from handsim.space.rig_formats import motive_mcal, qualisys_calibration, vicon_xcp
 from handsim.space.rig_formats.colmap_file import CAMERAS, IMAGES, read_colmap_cameras
 from handsim.space.rig_formats.lab_camera import LabCamera, Skipped, camera_names
 from handsim.space.rig_formats.opencv_file import read_opencv_cameras
 from handsim.space.rig_formats.xml_tree import read_xml
 
-if TYPE_CHECKING:
-    from handsim.space.camera import Camera
-
-
+Up = Literal["y", "z"]
+_Y_TO_Z: Final = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+"""A turn about x that makes y up into z up."""
+_LEVEL: Final = 0.3  # least share of the cameras' tops, on average, along the axis that points up
 _OPENCV: Final = (".yml", ".yaml", ".json")
 _XML: Final = (".xcp", ".xml", ".txt", ".mcal")
 _READERS: Final[dict[str, Callable[[ET.Element], list[LabCamera | Skipped]]]] = {
@@ -52,6 +55,38 @@ def load_cameras(path: str | Path) -> tuple[Camera, ...]:
     return tuple(one.camera for one in load_lab_cameras(path))
 
 
+def import_cameras(path: str | Path, up: Up | None = None) -> tuple[Camera, ...]:
+    """The cameras of a calibration that see markers, in a world with z up.
+
+    Those that take pictures are left out where there are others, and named in a warning.
+
+    Args:
+        path: As for `load_cameras`.
+        up: The axis that points up in the file; when not given y where its format says so, else z.
+
+    Raises:
+        RigError: As `load_cameras`; or no camera is calibrated.
+    """
+    found = load_lab_cameras(path)
+    seeing = [one for one in found if not one.video] or list(found)
+    if len(seeing) < len(found):
+        named = ", ".join(one.camera.name for one in found if one.video)
+        _tell(f"{path}: video cameras see no markers and are left out: {named}")
+    axis = up or ("y" if all(one.y_up for one in seeing) else "z")
+    turn = _Y_TO_Z if axis == "y" else np.eye(4)
+    cameras = tuple(one.camera.at(turn @ one.camera.T_world_camera) for one in seeing)
+    if -np.mean([one.T_world_camera[2, 1] for one in cameras]) < _LEVEL:
+        _tell(
+            f"{path}: with {axis} up, the tops of its cameras' pictures do not point up on average; is "
+            "another axis up? --up says which"
+        )
+    return cameras
+
+
+def _tell(sentence: str) -> None:
+    warnings.warn(sentence, HandSimWarning, stacklevel=3)
+
+
 def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
     """The cameras of a file as `load_cameras` gives them, with what the file says of each.
 
@@ -60,7 +95,7 @@ def load_lab_cameras(path: str | Path) -> tuple[LabCamera, ...]:
     """
     path, ending = Path(path), Path(path).suffix.lower()
     if ending == ".toml":
-        return _plain(read_camera_file(path))
+        return _plain(checked_cameras(path, read_rig_file(path).cameras))
     if ending in _OPENCV:
         return _plain(read_opencv_cameras(path))
     if path.is_dir() or path.name in (CAMERAS, IMAGES):

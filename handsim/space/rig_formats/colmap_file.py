@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from handsim.errors import HandSimError, RigError, choices
 from handsim.files.inputs import read_bytes
 from handsim.space.camera import Camera
-from handsim.space.camera_file import checked_cameras
 from handsim.space.lens import Lens
+from handsim.space.rig_file import checked_cameras
 from handsim.space.transforms import quaternion_matrix
 
 CAMERAS: Final = "cameras.txt"

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from handsim.errors import HandSimError, RigError
 from handsim.files.inputs import read_bytes
 from handsim.space.camera import Camera
-from handsim.space.camera_file import checked_cameras
 from handsim.space.lens import Lens
+from handsim.space.rig_file import checked_cameras
 from handsim.space.rig_formats.lab_camera import camera_names, nearest_rotation, rigid
 from handsim.space.transforms import quaternion_matrix, vector_quaternions
 

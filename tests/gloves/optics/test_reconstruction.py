@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 from gloves.optics.identities import number_runs, pack_columns
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
 from handsim.errors import ArgumentError
-from handsim.space.cameras import CameraRig, look_at, named_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import CameraRig, named_rig
+from tests.rigs import square_rig
 
 STILL = OpticsConfig(noise=0.0, blob_loss=0.0, dropout=0.0)
 RIG = named_rig("figure5")
@@ -44,7 +46,9 @@ def test_noise_is_that_of_least_squares(rng: np.random.Generator) -> None:
     for pose in RIG.T_world_camera:
         ray, axis = sources[0, 0] - pose[:3, 3], pose[:3, 2]
         across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
-        sigma = config.noise * (axis @ ray) / RIG.focal_length  # in the plane of the picture, at the marker
+        sigma = (
+            config.noise * (axis @ ray) / RIG.cameras[0].focal_length
+        )  # in the plane of the picture, at the marker
         weights += across
         spread += sigma**2 * across @ (np.eye(3) - np.outer(axis, axis)) @ across
     covariance = np.linalg.inv(weights) @ spread @ np.linalg.inv(weights)
@@ -68,7 +72,7 @@ def test_too_few_rays_make_no_point(rng: np.random.Generator) -> None:
 
 def test_two_rays_along_one_line_make_no_point(rng: np.random.Generator) -> None:
     poses = np.stack([look_at(MIDDLE + np.array(at), MIDDLE) for at in ((1.5, 0, 0), (1.5, 0.1, 0))])
-    rig = CameraRig("narrow", poses, field_of_view=1.0)
+    rig = square_rig("narrow", poses, 1.0)
     sources = _grid(1, 1, 0.0)
     found = reconstruct(sources, _all_seen(sources, rig), rig, STILL, continuous=False, rng=rng)
     assert found.rays[0, 0] == 0

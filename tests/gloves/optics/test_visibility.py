@@ -8,13 +8,21 @@ import pytest
 
 from gloves.attachment import attach_markers
 from gloves.layout import load_layout
-from gloves.optics.visibility import free_rays, pack_cameras, unpack_cameras, visible_cameras
+from gloves.optics.visibility import (
+    MAX_FACING,
+    facing_cameras,
+    free_rays,
+    pack_cameras,
+    unpack_cameras,
+    visible_cameras,
+)
 from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.space.cameras import CameraRig, named_rig
 from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
+from tests.rigs import mixed_rig
 
 
 @pytest.fixture(params=["right", "left"])
@@ -54,7 +62,7 @@ def test_every_ray_agrees_with_mujoco(scene):
 def test_a_camera_sees_alike_whatever_others_there_are(scene):
     model, _, markers, normals, segments = scene
     rig = named_rig("figure5")
-    few = CameraRig("few", rig.T_world_camera[[3, 7, 11]], rig.field_of_view)
+    few = CameraRig("few", [rig.cameras[number] for number in (3, 7, 11)])
     everyone = visible_cameras(markers, normals, rig, segments, model.capsules.radii)
     np.testing.assert_array_equal(
         visible_cameras(markers, normals, few, segments, model.capsules.radii), everyone[..., [3, 7, 11]]
@@ -72,6 +80,16 @@ def test_markers_that_face_away_or_lie_outside_the_view_are_not_seen(scene):
     assert not visible_cameras(markers, normals, rig, segments, model.capsules.radii)[~seen].any()
 
 
+def test_facing_cameras_are_those_with_the_marker_in_their_picture_and_on_its_outward_side(scene):
+    _, _, markers, normals, _ = scene
+    rig = mixed_rig()
+    to_camera = rig.positions - markers[..., None, :]
+    cosines = np.einsum("tmci,tmi->tmc", to_camera, normals) / np.linalg.norm(to_camera, axis=-1)
+    expected = rig.in_view(markers) & (cosines > np.cos(MAX_FACING))
+    np.testing.assert_array_equal(facing_cameras(markers, normals, rig), expected)
+    assert expected.any(axis=(0, 1)).all()
+
+
 def test_packing_round_trip(rng):
     seen = rng.random((5, 7, 16)) < 0.5
     np.testing.assert_array_equal(unpack_cameras(pack_cameras(seen), 16), seen)
@@ -79,6 +97,6 @@ def test_packing_round_trip(rng):
 
 def test_bad_rigs_are_told():
     with pytest.raises(RigError, match="rig 'lonely' has 1 cameras, expected 2 to 32"):
-        CameraRig("lonely", np.eye(4)[None], 1.0)
+        CameraRig("lonely", named_rig("six").cameras[:1])
     with pytest.raises(ArgumentError, match="unknown camera rig 'figure6'"):
         named_rig("figure6")

@@ -15,7 +15,7 @@ from handsim.cli.main import main
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import sample_shape
 from handsim.hand.topology import JOINT_NAMES
-from track.user import load_user, save_user
+from track.user import User, load_user
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
@@ -77,7 +77,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     layout = load_layout("dense19")
     model = HandModel(sample_shape(rng=rng))
     fit = GloveFit(model, wear(layout, model, along=0.002, around=0.05, rng=rng))
-    save_user(folder / "user.json", [fit, fit.with_side("left")])
+    User((fit, fit.with_side("left"))).save(folder / "user.json")
     hand = attach(layout, HandModel(sample_shape(side="left", rng=rng)))
     Take.of_poses([hand], join_qpos(np.zeros((3, 20)))[:, None], rate=120.0).save(folder / "one.truth.npz")
     return folder

@@ -157,7 +157,7 @@ def test_our_own_mistakes_are_one_line_and_a_log(
     )
     assert found is not None, said
     log = Path(found[1])
-    assert "Traceback (most recent call last)" in log.read_text() and "test_cli.py" in log.read_text()
+    assert "Traceback (most recent call last)" in log.read_text() and "test_main.py" in log.read_text()
     log.unlink()
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import tyro
 
-from handsim.app.executors.executor import Processes
 from handsim.cli import render as command
 from handsim.cli.render import RenderOptions
 from handsim.errors import HandSimError
@@ -44,7 +43,7 @@ def test_every_option_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     tyro.cli(command.render, args=line.split())
     take, out, formats, config, workers = given[0]
-    assert (take, out, formats, workers) == (Path("take.npz"), Path("pics"), ("coco", "png"), Processes(1))
+    assert (take, out, formats, workers) == (Path("take.npz"), Path("pics"), ("coco", "png"), 1)
     assert dataclasses.astuple(config.view) == ("head", "sr300", 2, (0.5, 0.6), "eight", None)
     assert (config.passes, config.dress, config.tones) == (("depth",), "glove", (-52.0, 10.0))
     assert config.background == BackgroundConfig(plain=1, gradient=0, noise=0, clutter=0, room=1)

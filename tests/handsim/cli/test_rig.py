@@ -1,18 +1,22 @@
-"""`handsim rig list`, `new` and `check`, as they are typed."""
+"""`handsim rig list`, `new`, `check` and `import`, as they are typed."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from handsim.cli.main import main
+from handsim.errors import HandSimWarning
 from handsim.space.cameras import list_rigs, load_rig
+from handsim.space.rig_formats.any_file import import_cameras
+from tests.handsim.space.rig_formats.known_rig import MCAL, PIXELS, POINT, XCP, written
 
 
 def test_every_shipped_rig_is_listed_with_what_it_is(capsys):
     assert main(["rig", "list"]) == 0
     told = capsys.readouterr().out
     assert all(name in told for name in list_rigs())
-    assert "16" in told and "Figure 5" in told and "[deg]" in told
+    assert "16" in told and "Figure 5" in told and "1280 x 1280 pixels" in told
 
 
 def test_a_new_rig_can_be_read_and_has_nothing_suspicious(tmp_path, capsys):
@@ -38,3 +42,48 @@ def test_a_camera_that_looks_away_is_told(tmp_path, capsys):
 def test_names_that_are_no_rig_are_refused(name, capsys):
     assert main(["rig", "check", name]) == 1
     assert "or the path of a .toml file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["vicon", "qualisys", "motive", "extri", "json"])
+def test_a_calibration_becomes_a_rig(tmp_path, capsys, kind):
+    file, out = written(tmp_path)[kind], tmp_path / "rig.toml"
+    assert main(["rig", "import", str(file), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert f"{out}: 2 cameras of 1000 x 800 pixels, 44 x 37 degrees" in said.out.replace("\n", " ")
+    assert said.err == ""
+    np.testing.assert_allclose(load_rig(out).project(POINT), PIXELS, atol=1e-3)
+
+
+def test_lenses_are_kept_and_what_is_left_out_is_told(tmp_path, capsys):
+    video = XCP[XCP.index("<Camera ") : XCP.index("</Cameras>")].replace("Vantage", "Vue")
+    bent = XCP.replace('VICON_RADIAL="0 0"', 'VICON_RADIAL="4e-8 0"').replace(
+        "</Cameras>", video + "</Cameras>"
+    )
+    (tmp_path / "lab.xcp").write_text(bent)
+    assert main(["rig", "import", str(tmp_path / "lab.xcp"), "--out", str(tmp_path / "rig.toml")]) == 0
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert "video cameras see no markers and are left out: 2100_3, 2101_4" in sentence
+    rig = load_rig(tmp_path / "rig.toml")
+    assert [(one.name, one.lens.kind) for one in rig.cameras] == [("2100", "brown"), ("2101", "pinhole")]
+    with pytest.warns(HandSimWarning, match="are left out"):
+        assert rig.cameras == import_cameras(tmp_path / "lab.xcp")
+
+
+def test_an_imported_rig_with_another_axis_up(tmp_path, capsys):
+    (tmp_path / "lab.mcal").write_bytes(MCAL.encode("utf-16"))
+    out = tmp_path / "rig.toml"
+    assert main(["rig", "import", str(tmp_path / "lab.mcal"), "--out", str(out), "--up", "z"]) == 0
+    assert "do not point up on average; is another axis up? --up says which" in capsys.readouterr().err
+    np.testing.assert_allclose(load_rig(out).positions, [[0, 1, 3], [4, 2, -1]])
+
+
+def test_wrong_names_of_files_to_import(tmp_path, capsys):
+    file = written(tmp_path)["vicon"]
+    assert main(["rig", "import", str(file), "--out", str(tmp_path / "rig.json")]) == 1
+    assert "expected a file name that ends in .toml" in capsys.readouterr().err
+    assert main(["rig", "import", str(tmp_path / "lab.cal"), "--out", str(tmp_path / "rig.toml")]) == 1
+    assert "Motive's .cal is a closed format; load it in Motive 3.2" in capsys.readouterr().err
+    (tmp_path / "rig.toml").write_text("mine")
+    assert main(["rig", "import", str(tmp_path / "rig.toml"), "--out", str(tmp_path / "rig.toml")]) == 1
+    assert "is the input" in capsys.readouterr().err
+    assert (tmp_path / "rig.toml").read_text() == "mine"

@@ -8,7 +8,7 @@ import pytest
 
 from handsim.cli.main import main
 from handsim.space.cameras import load_rig
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 def test_a_score_is_printed_drawn_and_written(tmp_path, capsys):
@@ -23,7 +23,7 @@ def test_a_score_is_printed_drawn_and_written(tmp_path, capsys):
 
 def test_hands_of_a_take_are_scored_where_they_are(tmp_path, capsys):
     take, page = tmp_path / "take.truth.npz", tmp_path / "page.html"
-    simulate_take(TakeConfig("single-hand", num_frames=60, glove="tips8")).save(take)
+    simulate_take("single-hand", num_frames=60, glove="tips8").save(take)
     assert main(["rig", "score", "eight", "--take", str(take), "--out", str(page), "--frames", "60"]) == 0
     assert "960 marker-frames of the take take.truth.npz" in page.read_text("utf-8")
 
@@ -61,7 +61,7 @@ def test_a_planned_rig_is_written_and_told(tmp_path, capsys):
         (["--cameras", "6", "--room", "4", "0", "3"], "--room is 4 0 3, expected three lengths"),
         (
             ["--cameras", "6", "--room", "4", "4", "3", "--field-of-view", "180"],
-            "field_of_view is 180 degrees, expected 1 to 170",
+            "--field-of-view is 180 degrees, expected 1 to 170",
         ),
         (
             ["--cameras", "6", "--room", "0.8", "0.8", "1.5", "--mounts", "walls", "--volume", "2", "2", "3"],

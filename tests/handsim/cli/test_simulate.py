@@ -1,4 +1,4 @@
-"""`handsim simulate`, `handsim reproduce` and `handsim evaluate` of a take, through the command line."""
+"""`handsim simulate` and `handsim evaluate` of a take, through the command line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gloves.layout import load_layout
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from train.simulation.held_out import held_out_markers
-from train.simulation.room_settings import KINDS, TWINS
+from train.simulation.room_settings import KINDS
 
 FRAMES = 60
 
@@ -129,7 +129,7 @@ def test_an_unknown_kind_is_a_usage_error(tmp_path, capsys):
 def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsys):
     truth, figures = taken.with_suffix(".truth.npz"), tmp_path / "figures.json"
     assert main(["evaluate", str(truth), "--json", str(figures)]) == 0
-    assert "1 takes, 120 frames of one hand" in capsys.readouterr().out
+    assert "120 frames" in capsys.readouterr().out
     found = json.loads(figures.read_text())
     assert found["frames"] == 2 * FRAMES
     assert found["figures"]["slot_accuracy"] > 0.8
@@ -139,7 +139,7 @@ def test_a_take_is_evaluated_with_its_own_gaps_and_ghosts(taken, tmp_path, capsy
         said = capsys.readouterr().err
         assert said.count("\n") == 1 and "leave out --occlude, --ghosts and --every" in said
     assert main(["evaluate", str(truth), str(truth)]) == 0
-    assert "2 takes, 240 frames of one hand" in capsys.readouterr().out
+    assert "240 frames" in capsys.readouterr().out
 
 
 def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
@@ -150,7 +150,7 @@ def test_every_nth_frame_of_a_capture_is_evaluated(taken, tmp_path, capsys):
     found = json.loads(figures.read_text())
     assert (found["every"], found["frames"]) == (15, 3)
     assert main(["evaluate", str(capture), "--every", "0"]) == 1
-    assert "every 0, expected at least 0 and 1" in capsys.readouterr().err
+    assert "every is 0, expected at least 1" in capsys.readouterr().err
 
 
 def test_a_take_and_a_capture_are_not_measured_together(taken, capsys):
@@ -166,28 +166,6 @@ def test_a_glove_that_the_labeler_does_not_know_is_told(tmp_path, capsys):
     assert main(["evaluate", str(out.with_suffix(".truth.npz"))]) == 1
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "the labeler knows" in said
-
-
-def test_table_3_has_a_row_a_capture_with_the_papers_figures(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "120")
-    assert main(["reproduce", "table3"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    for kind in KINDS:
-        row, by_marker = (line for line in lines if line.split("│")[1:2] and kind in line.split("│")[1])
-        paper, ghosts = TWINS[kind].paper, TWINS[kind].ghost_ratio
-        frames, gaps, length, missing, share = (cell.strip() for cell in row.split("│")[2:7])
-        assert frames == f"{paper.frames} ({paper.frames})"
-        for cell, wanted in (
-            (gaps, paper.gaps),
-            (length, paper.average_length),
-            (missing, paper.average_missing),
-        ):
-            ours, theirs = cell.rstrip(")").split(" (")
-            assert float(theirs) == pytest.approx(wanted)
-            assert float(ours) == pytest.approx(wanted, rel=0.4), f"{kind}: {cell}"
-        assert share.endswith(f"({100 * ghosts:.2f} %)")
-        assert by_marker.count("%") == 3
-    assert any("real finger markers" in line for line in lines)
 
 
 def test_a_capture_that_no_memory_holds_is_refused_at_once(tmp_path, capsys):

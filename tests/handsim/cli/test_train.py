@@ -13,7 +13,7 @@ from train.data.augmentation import Corruption
 from train.data.batches import paper_corruption
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.training_state import _rate
 
 FRAMES = 16
@@ -22,7 +22,7 @@ FRAMES = 16
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    generate_dataset(DatasetConfig(num_frames=FRAMES, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(DatasetConfig(num_frames=FRAMES, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return out
 
 
@@ -33,7 +33,7 @@ def config_of(dataset, tmp_path, monkeypatch):
     def config_of(*options: str) -> TrainConfig:
         configs = []
 
-        def keep(rows, config, out, *, threads, progress):
+        def keep(rows, out, config, *, threads, progress):
             configs.append(config)
             return {"held_out_simulated": {"random": {"accuracy": 1.0}}}
 

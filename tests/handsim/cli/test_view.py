@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gloves.takes.take import load_take
 from handsim.cli.main import main
 from track.streams.natnet_server import ReplayServer
 from track.viewer import live_view
@@ -76,7 +75,7 @@ def test_a_live_tracker_is_shown_and_frames_are_never_dropped(capture, capsys, m
         plain(self, frame, tracked)
 
     monkeypatch.setattr(live_view.LiveView, "offer", offer)
-    with ReplayServer.of_take(load_take(capture.with_suffix(".truth.npz"))) as server:
+    with ReplayServer(capture.with_suffix(".truth.npz")) as server:
         thread = ended_after(lambda: len(offered) > 60 and shown[-1].pictures > 5)
         assert main(["view", "--live", server.url, "--size", "L", "--port", "0"]) == 0
         thread.join()

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from handsim.kernels.rotations import (
+    align_rigid,
     multiply_rotations,
     quaternion_product,
     rotate_about_axis,
@@ -15,6 +16,7 @@ from handsim.kernels.rotations import (
     write_axis_angle_matrix,
     write_quaternion_matrix,
 )
+from handsim.space.transforms import quaternion_matrix, rigid_fit
 
 SEEDS = st.integers(0, 100_000)
 
@@ -72,3 +74,20 @@ def test_no_rotation_leaves_an_orientation_as_it_is():
     after = np.empty(4)
     rotate_quaternion(np.array([0.6, 0.0, 0.8, 0.0]), np.zeros(3), after)
     np.testing.assert_allclose(after, [0.6, 0.0, 0.8, 0.0], atol=1e-16)
+
+
+def test_rigid_fits_are_the_best_ones():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        source, target = rng.normal(size=(2, 19, 3))
+        target[rng.choice(19, size=5, replace=False)] = np.nan
+        weights, pose = rng.integers(1, 4, size=19).astype(float), np.zeros(27)
+        squares = align_rigid(source, target, weights, pose)
+        there = np.repeat(
+            np.arange(19), weights.astype(int) * np.isfinite(target[:, 0])
+        )  # weights by counting
+        rotation, translation = rigid_fit(source[there], target[there])
+        np.testing.assert_allclose(quaternion_matrix(pose[3:7]), rotation, atol=1e-9)
+        np.testing.assert_allclose(pose[:3], translation, atol=1e-9)
+        left = source[there] @ rotation.T + translation - target[there]
+        np.testing.assert_allclose(squares, (left**2).sum(), rtol=1e-9)

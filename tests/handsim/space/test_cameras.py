@@ -10,6 +10,7 @@ import os
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -18,17 +19,20 @@ from hypothesis import strategies as st
 from handsim.errors import ArgumentError, RigError
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population, sample_shape
+from handsim.space.camera import look_at
 from handsim.space.cameras import (
     HAND_REACH,
     CameraRig,
+    as_rig,
     check_outside,
     check_outside_volume,
     list_rigs,
     load_rig,
-    look_at,
     named_rig,
+    rig_setting,
     save_rig,
 )
+from tests.rigs import mixed_rig, square_rig
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests" / "golden"
@@ -44,12 +48,13 @@ def test_shipped_rigs_hold_what_their_names_say():
     assert counts == {"eight": 8, "figure5": 16, "six": 6}
     for name in list_rigs():
         assert named_rig(name).name == name
-        assert named_rig(name).resolution == 1280
+        assert {one.size for one in named_rig(name).cameras} == {(1280, 1280)}
 
 
 def test_figure5_stays_where_training_sets_were_made_with_it():
     saved, rig = json.loads((GOLDEN / "figure5.json").read_text()), named_rig("figure5")
-    assert rig.field_of_view == saved["field_of_view"]
+    angle = saved["field_of_view"]  # of the round cone that its square pictures hold
+    assert {one.focal_lengths for one in rig.cameras} == {(640 / np.tan(angle / 2),) * 2}
     np.testing.assert_array_equal(rig.positions, np.array(saved["T_world_camera"])[:, :3, 3])
     # another processor may round a norm otherwise in the last bit
     np.testing.assert_allclose(rig.T_world_camera, saved["T_world_camera"], rtol=0, atol=5e-16)
@@ -68,23 +73,37 @@ def test_a_file_of_ones_own(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(f"{TOP}resolution = 2048\n{FIRST}[[camera]]\nT_world_camera = {pose.tolist()}\n")
     rig = load_rig(path)
-    assert (rig.name, rig.resolution) == ("mine", 2048)
-    assert rig.field_of_view == pytest.approx(np.deg2rad(50.0))
+    assert rig.name == "mine" and {one.size for one in rig.cameras} == {(2048, 2048)}
+    assert rig.cameras[0].angles == pytest.approx(np.deg2rad([50.0, 50.0]))
     np.testing.assert_array_equal(rig.positions, [[1.0, 0.0, 2.0], [-1.0, 0.5, 2.0]])
     path.write_text(TOP + FIRST + SECOND)
     np.testing.assert_allclose(load_rig(str(path)).T_world_camera, rig.T_world_camera, atol=1e-15)
-    assert load_rig(path).resolution == 1280
-    np.testing.assert_array_equal(load_rig("six").T_world_camera, named_rig("six").T_world_camera)
+    assert load_rig(path).cameras[0].size == (1280, 1280)
+    assert load_rig("six") == named_rig("six")
 
 
-def test_a_saved_rig_has_the_same_cameras(tmp_path):
-    for name in list_rigs():
-        rig = named_rig(name)
-        save_rig(tmp_path / "rig.toml", rig)
-        again = load_rig(tmp_path / "rig.toml")
-        np.testing.assert_allclose(again.T_world_camera, rig.T_world_camera, atol=1e-9)
-        assert (again.name, again.resolution) == (rig.name, rig.resolution)
-        assert again.field_of_view == pytest.approx(rig.field_of_view)
+def test_whatever_stands_for_a_rig_gives_it(tmp_path):
+    rig = mixed_rig()
+    path = tmp_path / "mixed.toml"
+    save_rig(path, rig)
+    record = json.loads(json.dumps(rig.record()))
+    for source in (rig, path, str(path), record):
+        assert as_rig(source) == rig and rig_setting(source) == record
+    for source in ("six", named_rig("six"), named_rig("six").record()):
+        assert as_rig(source) == named_rig("six") and rig_setting(source) == "six"
+    assert load_rig(rig) is rig
+    other = CameraRig("six", rig.cameras)  # a shipped name, but other cameras
+    assert as_rig(rig_setting(other)) == other
+    with pytest.raises(ArgumentError, match="a rig is int, expected a CameraRig, a name"):
+        as_rig(3)
+    with pytest.raises(RigError, match="a damaged record of a rig"):
+        as_rig({"name": "six"})
+
+
+@pytest.mark.parametrize("given", [[np.eye(4)] * 2, "ab", 3])
+def test_what_are_no_cameras_is_told(given):
+    with pytest.raises(ArgumentError, match=r"rig 'mine' has .* as cameras, expected a sequence of Camera"):
+        CameraRig("mine", given)
 
 
 def test_the_documented_file_says_what_the_document_says(capsys):
@@ -93,9 +112,9 @@ def test_the_documented_file_says_what_the_document_says(capsys):
     exec(script[1], {})
     assert capsys.readouterr().out.split("\n") == [
         "[ True  True]",
-        "[[-52.3 -80.5]",
-        " [-60.2 -60.2]]",
-        "1204",
+        "[[587.7 431.5]",
+        " [579.8 451.8]]",
+        "1204 px, 56 x 46 degrees",
         "",
     ]
 
@@ -110,27 +129,61 @@ def test_a_camera_sees_its_target_in_the_middle_of_an_upright_picture(position, 
         return
     pose = look_at(position, target)
     other = look_at(position + [5.0, 0.0, 0.0], target)
-    rig = CameraRig("two", np.stack([pose, other]), 1.0)
-    np.testing.assert_allclose(rig.project(target)[0], 0.0, atol=1e-6)
+    rig = square_rig("two", [pose, other])
+    np.testing.assert_allclose(rig.project(target)[0], 640.0, atol=1e-6)
     assert rig.in_view(target)[0]
     if abs(pose[2, 2]) < 0.99:
         above = rig.project(target + [0.0, 0.0, 1e-3])[0]
-        assert above[1] < 0, "up in the world is up in the picture, where pixels count downwards"
+        assert above[1] < 640.0, "up in the world is up in the picture, where pixels count downwards"
 
 
-def test_pixels_are_the_pinhole_cameras():
-    rig = CameraRig("two", np.stack([np.eye(4), look_at(np.ones(3), np.zeros(3))]), np.deg2rad(90.0), 1000)
-    assert rig.focal_length == pytest.approx(500.0)
+def opencv_pixels(camera, points):
+    """What OpenCV makes of world points; it counts pixels from the first one's center, we from the corner."""
+    R, t = camera.T_world_camera[:3, :3].T, -camera.T_world_camera[:3, :3].T @ camera.T_world_camera[:3, 3]
+    K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    coefficients = np.array(camera.lens.coefficients or [0.0] * 4)
+    project = cv2.fisheye.projectPoints if camera.lens.kind == "fisheye" else cv2.projectPoints
+    rvec = cv2.Rodrigues(R)[0]
+    return project(points.reshape(-1, 1, 3), rvec, t, K, coefficients)[0].reshape(-1, 2) + 0.5
+
+
+def test_pixels_of_unlike_cameras_are_opencvs(rng):
+    rig = mixed_rig()
+    points = CENTER + rng.uniform(-0.6, 0.6, (40, 5, 3))
+    pixels = rig.project(points)
+    assert pixels.shape == (40, 5, 6, 2)
+    for number, camera in enumerate(rig.cameras):
+        expected = opencv_pixels(camera, points).reshape(40, 5, 2)
+        np.testing.assert_allclose(pixels[:, :, number], expected, atol=1e-6)
+        rays = points - rig.positions[number]
+        ours = camera.unproject(pixels[:, :, number]) @ camera.T_world_camera[:3, :3].T
+        np.testing.assert_allclose(ours, rays / np.linalg.norm(rays, axis=-1, keepdims=True), atol=1e-7)
+
+
+def test_in_view_is_inside_the_picture_and_in_front(rng):
+    rig = mixed_rig()
+    points = CENTER + rng.uniform(-3.5, 3.5, (20_000, 3))
+    seen = rig.in_view(points)
+    assert (0.02 < seen.mean(axis=0)).all() and (seen.mean(axis=0) < 0.5).all()
+    for number, camera in enumerate(rig.cameras):
+        ahead = (points - rig.positions[number]) @ camera.T_world_camera[:3, 2] > 1e-6
+        pixels = camera.project(points)
+        expected = ahead & ((pixels >= 0) & (pixels < camera.size)).all(axis=1)
+        np.testing.assert_array_equal(seen[:, number], expected)
+        np.testing.assert_array_equal(camera.in_view(points), expected)
+        inside = expected & (np.linalg.norm(camera.local(points)[:, :2], axis=1) < camera.local(points)[:, 2])
+        theirs = opencv_pixels(camera, points[inside])
+        assert ((theirs > -1e-6) & (theirs < np.array(camera.size) + 1e-6)).all()
+    assert not rig.in_view(np.full((3, 3), np.nan)).any()
+
+
+def test_points_behind_a_camera_have_no_pixel():
+    rig = square_rig("two", [np.eye(4), look_at(np.ones(3), np.zeros(3))], np.deg2rad(90.0), 1000)
     points = np.array([[[0.2, -0.1, 2.0], [2.0, 0.0, 2.0]], [[0.0, 0.0, 0.5], [0.1, 0.0, -1.0]]])
     pixels = rig.project(points)
-    assert pixels.shape == (2, 2, 2, 2)
-    np.testing.assert_allclose(pixels[0, :, 0], [[50.0, -25.0], [500.0, 0.0]])
-    np.testing.assert_allclose(pixels[1, 0, 0], 0.0)
-    assert np.isnan(pixels[1, 1, 0]).all(), "behind the camera"
-    # the edge of the view cone is the edge of the picture
-    off = np.array([np.sin(np.deg2rad(44.9)), 0.0, np.cos(np.deg2rad(44.9))])
-    assert rig.in_view(off)[0]
-    assert 498 < rig.project(off)[0, 0] < 500
+    np.testing.assert_allclose(pixels[0, :, 0], [[550.0, 475.0], [1000.0, 500.0]])
+    np.testing.assert_allclose(pixels[1, 0, 0], 500.0)
+    assert np.isnan(pixels[1, 1, 0]).all()
 
 
 MISTAKES = {
@@ -144,7 +197,8 @@ MISTAKES = {
     "a camera that looks at itself": TOP + FIRST + SECOND.replace("[-1.0, 0.5, 2.0]", "[0.0, 0.0, 1.0]"),
     "millimeters": TOP + FIRST + SECOND.replace("[-1.0, 0.5, 2.0]", "[-1000.0, 500.0, 2000.0]"),
     "damaged": TOP + FIRST + SECOND + "target = [0.0,",
-    "no name": "field_of_view = 50.0\n" + FIRST + SECOND,
+    "name of another type": "name = 3\n" + FIRST + SECOND,
+    "no field of view": 'name = "mine"\n' + FIRST + SECOND,
     "unknown key": TOP + FIRST + SECOND.replace("target", "targets"),
     "no target": TOP + FIRST + SECOND.split("target", maxsplit=1)[0],
     "too much": TOP + FIRST + SECOND + "T_world_camera = [[1.0]]\n",
@@ -155,7 +209,7 @@ MISTAKES = {
     + "[[camera]]\nT_world_camera = [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]\n",
     "field of view in radians": TOP.replace("50.0", "0.87") + FIRST + SECOND,
     "resolution of half a pixel": TOP + "resolution = 640.5\n" + FIRST + SECOND,
-    "resolution of a dot": TOP + "resolution = 1\n" + FIRST + SECOND,
+    "resolution of nothing": TOP + "resolution = 0\n" + FIRST + SECOND,
     "camera is no table": TOP + "camera = 3\n",
 }
 
@@ -197,7 +251,10 @@ def test_cameras_in_the_hand_are_refused():
         ArgumentError, match=r"camera 3 of rig 'six' is .* m from the pen, expected at least 3 m"
     ):
         check_outside(
-            CameraRig("six", rig.T_world_camera[[3, 4, 0]], 1.0), [2.0, 0.0, 3.5], clearance=3.0, what="pen"
+            CameraRig("six", [rig.cameras[number] for number in (3, 4, 0)]),
+            [2.0, 0.0, 3.5],
+            clearance=3.0,
+            what="pen",
         )
 
 

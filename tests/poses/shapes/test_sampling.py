@@ -55,7 +55,7 @@ def test_mistakes_are_named(rng):
     with pytest.raises(ArgumentError, match="num_poses is 0, expected a positive number"):
         sample_poses(model, 0, rng=rng)
     with pytest.raises(
-        ArgumentError, match=r"the sampler's angles has shape \(2, 20\), expected \(..., 3, 20\)"
+        ArgumentError, match=r"<lambda>' returns has shape \(2, 20\), expected \(3, 20\) joint angles"
     ):
         sample_poses(model, 3, lambda model, num_poses, *, rng: np.zeros((2, 20)), rng=rng)
     with pytest.raises(ArgumentError, match=r"qpos has shape \(1, 20\), expected \(..., any, 27\)"):

@@ -9,17 +9,16 @@ import pytest
 
 from gloves.takes.take import LOST, Take
 from handsim.errors import ArgumentError, HandSimWarning, RigError
-from handsim.space.camera import pinhole
-from handsim.space.cameras import look_at
+from handsim.space.camera import look_at, pinhole
 from handsim.space.transforms import quaternion_matrix
 from render.cameras.viewpoints import PLACEMENTS, ViewConfig, Viewpoints, check_hands_in_view, hand_centers
 from render.subject import subject_of_poses
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=60))
+    return simulate_take(kind="hand-controller", num_frames=60)
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)

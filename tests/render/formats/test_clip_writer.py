@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from handsim.space.camera import Camera, pinhole
-from handsim.space.cameras import look_at
+from handsim.space.camera import Camera, look_at, pinhole
 from handsim.space.transforms import quaternion_matrix
 from render.formats.annotations.common import to_json
 from render.formats.clip_writer import crop_camera, crops_record

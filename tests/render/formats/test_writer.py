@@ -14,7 +14,7 @@ import pytest
 
 from handsim.errors import DatasetError, HandSimError
 from handsim.hand.model import HandModel
-from handsim.space.cameras import look_at
+from handsim.space.camera import look_at
 from render.formats.exr import read_exr
 from render.formats.png_depth import decode_depth, read_depth
 from render.formats.writer import FORMATS, FrameWriter, open_writer

@@ -11,7 +11,7 @@ from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from handsim.space.cameras import look_at
+from handsim.space.camera import look_at
 from poses.shapes.library import gesture
 from render.illustrations.scene import (
     Balls,

@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from handsim.space.camera import Camera, preset
-from handsim.space.cameras import look_at, named_rig
+from handsim.space.camera import Camera, look_at, preset
+from handsim.space.cameras import named_rig
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
 from render.drawing import draw
 from render.frames import Pictures, RenderedFrame
 from render.scenery.backgrounds import KINDS, Background
 from render.scenery.enclosures import Enclosure, draw_surroundings, enclose
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 DRAWN = [kind for kind in KINDS if kind != "photo"]
 MIDDLE = np.array([0.1, -0.2, 1.1])
@@ -97,7 +97,7 @@ def test_furniture_keeps_away_from_hands_and_cameras() -> None:
     "view", [ViewConfig(views=2), ViewConfig("head", views=2), ViewConfig("rig", rig="six")]
 )
 def test_takes_of_several_cameras_have_one_background(view: ViewConfig) -> None:
-    take = simulate_take(TakeConfig(kind="hand-hand", num_frames=13))
+    take = simulate_take(kind="hand-hand", num_frames=13)
     config = RenderConfig(view=view, depth_sensor=None, color_sensor=None, painter="compiled", vary="frame")
     frames = list(draw(take, config=config, frames=[0, 12]))
     cameras = len(frames) // 2

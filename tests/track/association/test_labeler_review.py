@@ -9,12 +9,12 @@ from gloves.fit import nominal_fit
 from gloves.layout import load_layout
 from handsim.hand.model import join_qpos
 from poses.shapes.validity import resting_angles
-from track.association.frame_state import FrameState, Numbering, targets_of
+from track.association.frame_state import FrameState, targets_of
 from track.association.hand_state import HandState, HandTrack
 from track.association.labeler_review import LabelerReview
 from track.config import TrackerConfig
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeling
-from train.labelers.storage import load_labeler
 
 TIP, OTHER_TIP = 6, 9  # of the index and the middle finger
 KNUCKLE = 4  # of the index finger
@@ -35,30 +35,8 @@ class CountingLabeler:
 
 
 @pytest.fixture
-def state() -> HandState:
+def state(followed) -> HandState:
     return followed()
-
-
-def followed(off: np.ndarray | float = 0.0) -> HandState:
-    """A hand that was followed for half a second at rest, its markers 1 mm off at random, its knuckle off."""
-    user = nominal_fit(load_layout("dense19"), "M", "right")
-    state, rng = HandState(user), np.random.default_rng(0)
-    qpos = join_qpos(resting_angles(user.model)[None])[0]
-    target = state.solver.marker_positions(qpos)
-    target[KNUCKLE] += off
-    state.initialize(qpos, target, 0.0)
-    for frame in range(1, 60):
-        prediction = state.predict(frame / RATE)
-        seen = target + 0.001 * rng.standard_normal(target.shape)
-        state.update(state.fit(seen, prediction.qpos, prediction), np.ones(19, dtype=bool), frame / RATE)
-    return state
-
-
-def frame_of(points, labels, time, *, ids=None, first_seen=0.0) -> FrameState:
-    count = len(points)
-    numbers = np.arange(count) if ids is None else ids
-    seen, numbering = np.full(count, first_seen), Numbering([19])
-    return FrameState(points, numbers, labels, np.zeros(count), np.ones(count), seen, time, numbering)
 
 
 def reviewed(review: LabelerReview, state: HandState, frame: FrameState):
@@ -70,7 +48,7 @@ def reviewed(review: LabelerReview, state: HandState, frame: FrameState):
     return None if after[0] is frame and after[1] is hand else after
 
 
-def test_exchanged_labels_are_found_and_right_ones_stay(state):
+def test_exchanged_labels_are_found_and_right_ones_stay(state, frame_of):
     points = state.solver.marker_positions(state.qpos)
     labeler = CountingLabeler()
     review = LabelerReview(labeler, 1, TrackerConfig())
@@ -84,7 +62,7 @@ def test_exchanged_labels_are_found_and_right_ones_stay(state):
     assert 0.5 < frame.confidence[[TIP, OTHER_TIP]].max() < 1.0 and frame.confidence[KNUCKLE] == 1.0
 
 
-def test_a_marker_that_waits_gets_its_label_and_a_ghost_does_not(state):
+def test_a_marker_that_waits_gets_its_label_and_a_ghost_does_not(state, frame_of):
     points = state.solver.marker_positions(state.qpos)
     labels = np.arange(19)
     labels[TIP] = -1
@@ -97,7 +75,7 @@ def test_a_marker_that_waits_gets_its_label_and_a_ghost_does_not(state):
     assert reviewed(again, state, frame_of(ghost, labels, 0.5, first_seen=0.5)) is None
 
 
-def test_reviews_become_rarer_until_a_new_point_comes(state):
+def test_reviews_become_rarer_until_a_new_point_comes(state, frame_of):
     points = state.solver.marker_positions(state.qpos)
     labeler = CountingLabeler()
     review = LabelerReview(labeler, 1, TrackerConfig())
@@ -115,7 +93,7 @@ def test_reviews_become_rarer_until_a_new_point_comes(state):
         before = labeler.times
 
 
-def test_a_hand_in_a_crowd_of_strays_is_not_reviewed(state):
+def test_a_hand_in_a_crowd_of_strays_is_not_reviewed(state, frame_of):
     """No labeler takes so many points."""
     points, rng = state.solver.marker_positions(state.qpos), np.random.default_rng(1)
     labels = np.concatenate([np.arange(19), np.full(700, -1)])
@@ -126,7 +104,7 @@ def test_a_hand_in_a_crowd_of_strays_is_not_reviewed(state):
     assert labeler.times == 0
 
 
-def test_a_hand_that_was_initialized_is_reviewed_in_the_next_frame(state):
+def test_a_hand_that_was_initialized_is_reviewed_in_the_next_frame(state, frame_of):
     points, labeler = state.solver.marker_positions(state.qpos), CountingLabeler()
     review = LabelerReview(labeler, 1, TrackerConfig())
     for frame in range(120):
@@ -140,9 +118,11 @@ def test_a_hand_that_was_initialized_is_reviewed_in_the_next_frame(state):
 
 
 @pytest.mark.parametrize("age", [0.0, 0.4])
-def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age):
+def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age, followed, frame_of):
     """The true marker was hidden, and a ghost beside it had its label."""
-    state = followed(np.array([0.0, 0.01, 0.01]))
+    off = np.zeros((19, 3))
+    off[KNUCKLE] = 0.0, 0.01, 0.01
+    state = followed(off=off)
     user = nominal_fit(load_layout("dense19"), "M", "right")
     points = HandState(user).solver.marker_positions(join_qpos(resting_angles(user.model)[None])[0])
     labels = np.arange(19)
@@ -153,18 +133,3 @@ def test_a_bias_that_was_learned_from_a_ghost_yields_to_a_point_that_lasts(age):
         assert found is None
     else:
         np.testing.assert_array_equal(found[0].labels, np.arange(19))
-
-
-def test_biases_are_forgotten_and_recalled():
-    state, designed = followed(np.array([0.0, 0.01, 0.01])), HandState(followed().hand).adapted.positions
-    biased, variance = state.adapted.positions.copy(), state.variance.copy()
-    biases = state.biases
-    state.forget(np.array([KNUCKLE]))
-    np.testing.assert_array_equal(state.adapted.positions[KNUCKLE], designed[KNUCKLE])
-    others = np.delete(np.arange(19), KNUCKLE)
-    np.testing.assert_array_equal(state.adapted.positions[others], biased[others])
-    assert state.variance[KNUCKLE] > variance[KNUCKLE]
-    state.recall(biases)
-    np.testing.assert_array_equal(state.adapted.positions, biased)
-    np.testing.assert_array_equal(state.variance, variance)
-    assert np.linalg.norm(biased[KNUCKLE, 0] - designed[KNUCKLE, 0]) > 0.003

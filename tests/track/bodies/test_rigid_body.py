@@ -14,10 +14,10 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix, random_quaternions
-from track.bodies.body_pose import predict_pose, transform_markers, velocity_between
+from track.bodies.constellation import predict_pose, transform_markers, velocity_between
 from track.bodies.rigid_body import BodyFrame, BodyTracker, RigidTemplate
 from track.tracked_frame import Status
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 NAMES = ("controller", "ball", "box", "mug")
 STEP = 1.0 / 120.0
@@ -26,7 +26,7 @@ NOISE = 0.0002  # [m]
 
 @functools.cache
 def twin() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240, seed=5))
+    return simulate_take(kind="hand-controller", num_frames=240, seed=5)
 
 
 def frames(take: Take):

@@ -15,14 +15,14 @@ from handsim.space.objects import named_object
 from handsim.space.transforms import rigid_fit
 from track.calibration.body_learning import learn_body
 from track.calibration.frames import CalibrationError
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 FRAMES = 240
 
 
 @functools.cache
 def twin() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=FRAMES))
+    return simulate_take(kind="hand-controller", num_frames=FRAMES)
 
 
 def capture_of(points: np.ndarray) -> Capture:

@@ -12,7 +12,7 @@ from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
 from poses.motion.motions import sample_motion
 from track.calibration.hand_size import fit_size, sample_frames, usual_breadth
 from track.streams.frame_source import StreamedFrame
-from train.labelers.storage import load_labeler
+from train.glove_labeler import load_labeler
 
 RATE = 120.0
 

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.paper.hand_errors import hand_errors
 from gloves.attachment import attach_markers
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
@@ -19,9 +20,8 @@ from handsim.space.transforms import MIRROR
 from poses.motion.wrist_paths import WristConfig, wrist_path
 from track.calibration.picture import save_picture
 from track.calibration.skin_coordinates import displace_markers
-from track.calibration.user_calibration import Calibration, CalibrationError, calibrate, calibrate_hands
-from track.evaluation.hand_errors import hand_errors
-from track.user import load_user, save_user
+from track.calibration.user_calibration import Calibration, CalibrationError, calibrate_hand, calibrate_hands
+from track.user import User, load_user
 from train.simulation.calibration_take import CalibrationTakeConfig, calibration_angles
 
 LAYOUT = load_layout("dense19")
@@ -133,7 +133,7 @@ def test_a_finger_that_does_not_move_is_told():
 
 def test_the_result_can_be_kept_and_drawn(tmp_path):
     _, result, _ = calibrated()["left"]
-    save_user(tmp_path / "user.json", (result.hand,))
+    User((result.hand,)).save(tmp_path / "user.json")
     (again,) = load_user(tmp_path / "user.json")
     np.testing.assert_array_equal(again.attachment.points, result.hand.attachment.points)
     save_picture(tmp_path / "picture.png", result)
@@ -171,4 +171,4 @@ def test_a_hand_that_does_not_move_is_told(rng):
 )
 def test_what_cannot_be_calibrated_is_told(markers, rate, told):
     with pytest.raises(HandSimError, match=told):
-        calibrate(markers, nominal_fit(LAYOUT, "M", "right"), rate)
+        calibrate_hand(markers, nominal_fit(LAYOUT, "M", "right"), rate)

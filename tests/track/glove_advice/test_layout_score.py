@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from gloves.layout import load_layout
+from gloves.takes.take import Take
 from handsim.errors import CaptureError
 from handsim.space.cameras import load_rig
 from track.glove_advice.observed_hands import observe_motion, observe_poses
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 def test_seen_and_near_are_counted(tips, tips_hands, tips_score):
@@ -39,7 +40,7 @@ def test_joints_are_known_less_without_a_marker(tips, tips_score):
 
 def test_a_blind_rig_sees_fewer_markers(tips):
     rig = load_rig("six")
-    pair = dataclasses.replace(rig, T_world_camera=rig.T_world_camera[:2])
+    pair = dataclasses.replace(rig, cameras=rig.cameras[:2])
     shares = [
         np.isfinite(
             np.concatenate(
@@ -52,7 +53,7 @@ def test_a_blind_rig_sees_fewer_markers(tips):
 
 
 def test_the_hands_of_a_take_wear_the_layout(tips):
-    take = simulate_take(TakeConfig("hand-hand", num_frames=60))
+    take = simulate_take("hand-hand", num_frames=60)
     hands = observe_motion(take, tips, load_rig("figure5"), 20, rng=np.random.default_rng(3))
     assert [hand.fit.side for hand in hands] == [hand.side for hand in take.hands]
     assert all(hand.frames.markers.shape == (20, tips.num_markers, 3) for hand in hands)

@@ -7,6 +7,7 @@ import itertools
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,14 +23,14 @@ from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import ReplayServer
 from track.streams.point_stream import open_stream
 from track.tracked_frame import Status
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 LOOPBACK = "127.0.0.1"
 
 
 @functools.cache
 def twin() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=60, seed=5))
+    return simulate_take(kind="hand-controller", num_frames=60, seed=5)
 
 
 class Puppet:
@@ -82,7 +83,7 @@ def frame(number: int, version: tuple[int, int]) -> bytes:
 def test_a_take_arrives_whole(version):
     take = twin()
     start = time.monotonic()  # before the greeting: the server plays from then on, whoever is slow to read
-    with ReplayServer.of_take(take, version=version) as server, open_stream(server.url) as stream:
+    with ReplayServer(take, version=version) as server, open_stream(server.url) as stream:
         assert stream.server.version == version and stream.server.application == "handsim replay"
         got = list(itertools.islice(stream, take.num_frames))
         assert time.monotonic() - start >= (take.num_frames - 1) / take.rate, "in real time"
@@ -98,7 +99,7 @@ def test_a_take_arrives_whole(version):
 def test_a_body_is_tracked_live():
     take = twin()
     tracker = BodyTracker(RigidTemplate.of(named_object("controller")))
-    with ReplayServer.of_take(take) as server, open_stream(server.url) as stream:
+    with ReplayServer(take) as server, open_stream(server.url) as stream:
         words = [
             tracker.step(one.points, one.ids, one.time).status
             for one in itertools.islice(stream, take.num_frames)
@@ -110,7 +111,7 @@ def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
     positions = np.arange(24.0).reshape(4, 2, 3) / 100.0
     positions[1, 0] = np.nan
     with (
-        ReplayServer.of_capture(Capture(("a", "b"), positions, 100.0)) as server,
+        ReplayServer(Capture(("a", "b"), positions, 100.0)) as server,
         open_stream(server.url) as stream,
     ):
         ids = [list(one.ids) for one in itertools.islice(stream, 4)]
@@ -119,7 +120,7 @@ def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
 
 def test_a_stream_that_stops_says_so():
     take = twin()
-    server = ReplayServer(take.points[:3], take.ids[:3], take.rate)
+    server = ReplayServer(SimpleNamespace(points=take.points[:3], ids=take.ids[:3], rate=take.rate))
     with server, open_stream(server.url, silence=0.2) as stream:
         got = list(itertools.islice(stream, 5))
     assert [one.silent for one in got] == [False] * 3 + [True] * 2
@@ -280,12 +281,14 @@ def test_what_cannot_be_replayed_is_told():
         ((np.zeros((1, 2000, 3)), np.zeros((1, 2000), dtype=int), 100.0), {}, "expected at most 1500"),
     ):  # fmt: skip
         with pytest.raises(CaptureError) as caught:
-            ReplayServer(*arguments, **options)
+            ReplayServer(
+                SimpleNamespace(**dict(zip(("points", "ids", "rate"), arguments, strict=True))), **options
+            )
         assert words in str(caught.value)
-    with ReplayServer(points, ids, 100.0) as server:
+    with ReplayServer(Capture(("a",), points[:, :1], 100.0)) as server:
         port = int(server.url.rpartition(":")[2])
         with pytest.raises(CaptureError, match=f"port {port} cannot be listened at"):
-            ReplayServer(points, ids, 100.0, port=port)
+            ReplayServer(Capture(("a",), points[:, :1], 100.0), port=port)
 
 
 def test_only_the_server_s_ports_are_heard():

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.paper.take_evaluation import true_users
 from gloves.fit import GloveFit
 from gloves.takes.take import Take
-from track.evaluation.take_evaluation import true_users
 from track.tracker import Tracker
-from train.labelers.storage import load_labeler
-from train.simulation.takes import TakeConfig, simulate_take
+from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 
 @pytest.fixture(scope="session")
@@ -19,7 +19,7 @@ def labeler():
 
 @pytest.fixture(scope="session")
 def take() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller", num_frames=240))
+    return simulate_take(kind="hand-controller", num_frames=240)
 
 
 @pytest.fixture(scope="session")

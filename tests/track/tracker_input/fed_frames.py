@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from benchmarks.paper.take_evaluation import seen_frame
 from gloves.takes.take import Take
 from handsim.hand.model import HandModel
-from track.evaluation.take_evaluation import seen_frame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
 

@@ -16,7 +16,8 @@ from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import named_rig
-from track.user import save_user
+from tests.rigs import mixed_rig
+from track.user import User
 from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings.captures import CaptureRecording
 from track.viewer.recordings.datasets import DatasetRecording
@@ -53,7 +54,7 @@ def files(tmp_path, tracked, simulated, capture, training_set):
     (tmp_path / "e.toml").write_text(starter_layout())
     cameras = "\n".join(f"[[camera]]\nposition = [{x}, 0, 1]\ntarget = [0, 0, 1]" for x in (-1, 1))
     (tmp_path / "f.toml").write_text(f'name = "pair"\nfield_of_view = 60\n{cameras}\n')
-    save_user(tmp_path / "g.json", [tracked.hands[0], tracked.hands[0].with_side("left")])
+    User((tracked.hands[0], tracked.hands[0].with_side("left"))).save(tmp_path / "g.json")
     return {
         "take": tmp_path / "a.npz",
         "take truth": tmp_path / "b.npz",
@@ -131,8 +132,10 @@ def test_a_training_set_shows_its_rows_and_who_sees_them(training_set):
             assert row["cameras"][number] >> eye & 1
 
 
-def test_a_rig_of_a_take_is_shown_only_if_it_is_shipped(simulated):
+def test_a_rig_of_a_take_is_shown_if_it_is_shipped_or_in_the_take(simulated):
     assert TakeRecording(simulated).rig.name == "six"
+    own = dataclasses.replace(simulated, settings={"rig": mixed_rig().record()})
+    assert TakeRecording(own).rig == mixed_rig()
     for name in ("/etc/passwd", 3, None):
         assert TakeRecording(dataclasses.replace(simulated, settings={"rig": name})).rig is None
 

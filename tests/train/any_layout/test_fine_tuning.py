@@ -9,7 +9,7 @@ from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler, shipped_network
 from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
-from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.evaluate import evaluate_labeler
 
 
 def test_a_glove_of_tips_is_labeled_better_after_some_steps():

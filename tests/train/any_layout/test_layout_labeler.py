@@ -14,8 +14,8 @@ from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler, save_layout_network, shipped_network
 from train.any_layout.worn_markers import sample_worn_markers
 from train.data.augmentation import Corruption
-from train.evaluation.labeler_evaluation import evaluate_labeler
-from train.glove_labeler import labeler_for_glove
+from train.evaluate import evaluate_labeler
+from train.glove_labeler import load_labeler
 from train.labelers.storage import shipped_labelers
 
 
@@ -52,7 +52,7 @@ def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, monkeyp
     layout = load_layout("starter6")
     save_layout(tmp_path / "mine.toml", layout)
     with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):
-        found = labeler_for_glove(str(tmp_path / "mine.toml"), None)
+        found = load_labeler(str(tmp_path / "mine.toml"), None)
     assert isinstance(found, LayoutLabeler) and found.marker_names == layout.names
     assert "any_layout" not in shipped_labelers()
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from train.config import TrainConfig
+from train.config import TrainConfig, batch_recipe
 from train.data.batches import Part, draw_batch
 from train.data.mapped_rows import MappedRows
 from train.data.shards import Dataset, row_dtype
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 
 
 def shards_of(sizes):
@@ -48,7 +48,7 @@ def test_spans_numbers_and_fields_are_those_of_the_rows_in_memory(sizes, data):
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    generate_dataset(DatasetConfig(num_frames=120, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
+    make_dataset(DatasetConfig(num_frames=120, scenes=SceneMix(1.0, 0.0, 0.0)), out, workers=1)
     return Dataset(out)
 
 
@@ -63,9 +63,9 @@ def test_a_set_that_is_handed_on_is_its_files(dataset):
 @pytest.mark.parametrize("share", [0.0, 1.0])
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_parts_are_the_batch_of_one_device_shared_out(dataset, share, count):
-    config = TrainConfig(batch=32, rig_share=share)
+    recipe = batch_recipe(TrainConfig(batch=32, rig_share=share), 19)
     whole, again = (
-        draw_batch(rows, config, rng=np.random.default_rng(5))
+        draw_batch(rows, recipe, rng=np.random.default_rng(5))
         for rows in (dataset.rows(), dataset.mapped_rows())
     )
     parts = [Part(first, count).of(again) for first in range(count)]

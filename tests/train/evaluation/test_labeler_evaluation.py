@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from train.data.augmentation import Corruption
-from train.evaluation.labeler_evaluation import evaluate_labeler
+from train.evaluate import evaluate_labeler
 from train.labelers.protocol import Labeling
 
 

@@ -8,9 +8,9 @@ import torch
 
 from train.config import CNNConfig
 from train.data.augmentation import Corruption, corrupt
+from train.glove_labeler import load_labeler
 from train.labelers import batch_network
 from train.labelers.kinds import labeler_of, new_network
-from train.labelers.storage import load_labeler
 from train.simulation.held_out import held_out_markers
 
 NAMES = tuple(f"m{number}" for number in range(19))

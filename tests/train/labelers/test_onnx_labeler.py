@@ -15,9 +15,9 @@ from gloves.layout import load_layout
 from handsim.cli.main import main
 from handsim.errors import HandSimError, WeightsError
 from train.config import CNNConfig, SetLabelerConfig
+from train.glove_labeler import load_labeler
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx, sign_model
-from train.labelers.storage import load_labeler
 from train.labelers.views import MeanHand
 
 NO_TORCH = """

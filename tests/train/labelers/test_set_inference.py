@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from train.config import SetLabelerConfig
+from train.glove_labeler import load_labeler
 from train.labelers.protocol import pad_clouds
 from train.labelers.set_inference import CloudScorer
 from train.labelers.set_labeler import TrainedSetLabeler
 from train.labelers.set_network import SetLabeler
-from train.labelers.storage import load_labeler, load_network
+from train.labelers.storage import load_network
 from train.simulation.held_out import held_out_markers
 
 

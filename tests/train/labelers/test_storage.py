@@ -9,11 +9,11 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from handsim.errors import WeightsError
+from train.glove_labeler import load_labeler
 from train.labelers.storage import (
     _SHIPPED,
     CARD,
     WEIGHTS,
-    load_labeler,
     load_network,
     save_network,
     weights_metadata,

@@ -17,15 +17,14 @@ from handsim.hand.topology import BONES
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
 from train.evaluation.labeler_evaluation import Report
-from train.evaluation.metrics import macro_f1, percent
-from train.evaluation.reliability import error_without, expected_calibration_error
+from train.evaluation.metrics import error_without, expected_calibration_error, macro_f1, percent
+from train.glove_labeler import load_labeler
 from train.history import History
-from train.labelers.storage import load_labeler
 from train.loop import CHECKPOINT, train_labeler
 from train.reports.model_card import MODEL_CARD
 from train.reports.run_page import PAGE, write_run_page
 from train.simulation.dataset_config import DatasetConfig
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.training_state import TrainingState
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning")  # matplotlib's, for a figure that does not fit
@@ -40,7 +39,7 @@ def pictures(page: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "small"
-    generate_dataset(DatasetConfig(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
+    make_dataset(DatasetConfig(num_frames=400, seed=3, frames_per_hand=50), out, workers=1)
     return Dataset(out)
 
 
@@ -48,7 +47,7 @@ def dataset(tmp_path_factory):
 def run(dataset, tmp_path_factory):
     """A whole run and its model card."""
     out = tmp_path_factory.mktemp("whole") / "run"
-    return out, train_labeler(dataset, SMALL, out)
+    return out, train_labeler(dataset, out, SMALL)
 
 
 def test_the_page_says_what_the_card_says(run):
@@ -84,8 +83,8 @@ def test_a_stopped_runs_page_is_the_whole_runs(dataset, run, tmp_path):
     out = tmp_path / "run"
     for _ in range(2):
         with pytest.raises(Stopped):
-            train_labeler(dataset, SMALL, out, progress=stop, save_every=0.0)
-    train_labeler(dataset, SMALL, out, save_every=0.0)
+            train_labeler(dataset, out, SMALL, progress=stop, save_every=0.0)
+    train_labeler(dataset, out, SMALL, save_every=0.0)
     whole, resumed = (torch.load(path / CHECKPOINT, weights_only=True)["history"] for path in (run[0], out))
     assert resumed["losses"] == whole["losses"]
     for history in (resumed, whole):
@@ -106,19 +105,19 @@ def test_the_last_look_agrees_with_the_card(run):
 
 def test_looking_at_held_out_frames_leaves_the_training_alone(dataset, run, tmp_path, monkeypatch):
     monkeypatch.setattr(TrainingState, "evaluate", lambda state, rows, names: None)
-    train_labeler(dataset, SMALL, tmp_path / "blind")
+    train_labeler(dataset, tmp_path / "blind", SMALL)
     one, other = (torch.load(path / CHECKPOINT, weights_only=True) for path in (run[0], tmp_path / "blind"))
     for name, values in one["network"].items():
         assert torch.equal(values, other["network"][name])
 
 
 def test_checkpoints_without_a_history_go_on(dataset, run, tmp_path):
-    train_labeler(dataset, SMALL, tmp_path / "run")
+    train_labeler(dataset, tmp_path / "run", SMALL)
     path = tmp_path / "run" / CHECKPOINT
     content = torch.load(path, weights_only=True)
     del content["history"]
     torch.save(content, path)
-    train_labeler(dataset, SMALL, tmp_path / "run")
+    train_labeler(dataset, tmp_path / "run", SMALL)
     assert len(pictures(tmp_path / "run" / PAGE)) == 4
 
 

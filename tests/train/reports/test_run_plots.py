@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from train.evaluation.reliability import reliability
+from train.evaluation.metrics import reliability
 from train.history import History
 from train.reports.plot_style import picture
 from train.reports.run_plots import (

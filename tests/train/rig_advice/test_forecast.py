@@ -1,4 +1,4 @@
-"""The forecast of a rig against counting by hand, and against a simulated take."""
+"""The forecast of a rig against counting by hand, a simulated take, and points that are really put out."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from gloves.captures.gaps import run_lengths
+from gloves.optics.reconstruction import OpticsConfig, reconstruct
+from handsim.space.camera import look_at
 from handsim.space.cameras import named_rig
-from train.rig_advice.forecast import ROOM, camera_losses, forecast, light
+from tests.rigs import mixed_rig, square_rig
+from train.rig_advice.forecast import ROOM, camera_losses, covariances, ellipsoid, forecast, light
 from train.simulation.room import record_take
 
 
@@ -47,3 +50,41 @@ def test_a_second_camera_at_the_same_place_can_go_and_others_cannot(work):
         assert loss.without.seen_by_two <= whole.seen_by_two
     six = camera_losses(light(work[:2], named_rig("six"), rng=np.random.default_rng(2)), named_rig("six"))
     assert min(one.needed for one in six) > max(one.needed for one in losses)
+
+
+@pytest.mark.parametrize(
+    "rig", [named_rig("six"), named_rig("figure5"), mixed_rig()], ids=lambda rig: rig.name
+)
+def test_the_covariance_is_that_of_reconstructed_points(rig):
+    """Also of cameras with lenses, whose noise is one of real pixels."""
+    frames = 20_000
+    point = np.array([0.15, -0.1, 1.2])
+    optics = OpticsConfig(noise=0.5, blob_loss=0.0, dropout=0.0)
+    seen = np.ones((frames, 1, len(rig.positions)), dtype=bool)
+    sources = np.tile(point, (frames, 1, 1))
+    found = reconstruct(sources, seen, rig, optics, continuous=False, rng=np.random.default_rng(0))
+    measured = np.cov((found.positions[:, 0] - point).T)
+    expected = covariances(point[None], seen[:1, 0], rig, np.array([0.5]))[0]
+    assert np.linalg.norm(measured - expected) < 0.05 * np.linalg.norm(expected)
+
+
+def test_two_cameras_side_by_side_know_depth_least():
+    middle = np.array([0.0, 0.0, 1.1])
+    poses = np.stack([look_at(np.array([x, -2.0, 1.1]), middle) for x in (-0.25, 0.25)])
+    rig = square_rig("pair", poses)
+    spread = covariances(middle[None], np.ones((1, 2), dtype=bool), rig, np.array([0.12]))
+    found = ellipsoid(spread)
+    assert abs(found.directions[0, 1]) > 0.999
+    # By hand: an error of s across either ray moves the point by s / (sqrt(2) sin a) in depth, where a is
+    # half the angle between the rays, and by s / sqrt(2) upwards.
+    distance = np.hypot(0.25, 2.0)
+    across = 0.12 * distance / rig.cameras[0].focal_length
+    assert found.axes[0] == pytest.approx(across / np.sqrt(2) / (0.25 / distance), rel=1e-6)
+    assert found.axes[1:] == pytest.approx(
+        [across / np.sqrt(2) / (2.0 / distance), across / np.sqrt(2)], rel=1e-6
+    )
+    assert found.mean == pytest.approx(np.linalg.norm(found.axes))
+
+
+def test_no_points_have_no_error():
+    assert np.isnan(ellipsoid(np.empty((0, 3, 3))).mean)

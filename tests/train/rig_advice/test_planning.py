@@ -9,20 +9,18 @@ import pytest
 
 from gloves.layout import load_layout
 from handsim.errors import ArgumentError
+from handsim.space.camera import pinhole
 from handsim.space.cameras import ROOM_CENTER, CameraRig, named_rig
-from train.rig_advice.candidate_views import view_candidates
 from train.rig_advice.forecast import light
-from train.rig_advice.plan import LensKind, plan
-from train.rig_advice.planning import Planning
-
-LENS = LensKind(float(np.deg2rad(60.0)), 1280)
+from train.rig_advice.plan import plan
+from train.rig_advice.planning import Planning, view_candidates
 
 
 @pytest.fixture(scope="module")
 def candidates(work):
     """Ten of the sixteen cameras of `figure5`, as candidates."""
-    poses = named_rig("figure5").T_world_camera[[0, 2, 4, 6, 8, 10, 11, 13, 14, 15]]
-    return poses, view_candidates([one.faster(4) for one in work], poses, *LENS, rng=np.random.default_rng(0))
+    ten = [named_rig("figure5").cameras[number] for number in (0, 2, 4, 6, 8, 10, 11, 13, 14, 15)]
+    return ten, view_candidates([one.faster(4) for one in work], ten, rng=np.random.default_rng(0))
 
 
 def seen_of(views):
@@ -32,23 +30,23 @@ def seen_of(views):
 
 
 def test_candidates_see_what_a_rig_of_them_sees(candidates, work):
-    poses, views = candidates
-    rig = CameraRig("ten", poses, *LENS)
+    ten, views = candidates
+    rig = CameraRig("ten", ten)
     lit = light([one.faster(4) for one in work], rig, rng=np.random.default_rng(0))
     expected = np.concatenate([one.seen.reshape(-1, 10) for one in lit])
     seen = seen_of(views)
     assert seen.shape == expected.shape
     assert (seen == expected).mean() > 0.98  # the visible spots are drawn anew
-    tilted = poses.copy()
-    tilted[:, :3, :3] = poses[:, :3, :3] @ np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    away = view_candidates(work[:1], tilted, *LENS, rng=np.random.default_rng(0))
+    turn = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    tilted = [one.at(one.T_world_camera @ turn) for one in ten]
+    away = view_candidates(work[:1], tilted, rng=np.random.default_rng(0))
     assert not away.bits.any() and not away.told.any()
 
 
 def test_the_search_finds_the_best_of_all_choices(candidates):
-    poses, views = candidates
-    search = Planning(views, poses[:, :3, 3])
-    values = {chosen: search._value_of(chosen) for chosen in itertools.combinations(range(len(poses)), 4)}
+    ten, views = candidates
+    search = Planning(views, CameraRig("ten", ten).positions)
+    values = {chosen: search._value_of(chosen) for chosen in itertools.combinations(range(len(ten)), 4)}
     steps = []
     search.grow(4)
     search.exchange(steps.append)
@@ -59,8 +57,8 @@ def test_the_search_finds_the_best_of_all_choices(candidates):
 
 
 def test_the_value_is_that_of_shares_and_errors(candidates):
-    poses, views = candidates
-    search = Planning(views, poses[:, :3, 3])
+    ten, views = candidates
+    search = Planning(views, CameraRig("ten", ten).positions)
     count = seen_of(views)[:, [1, 5, 7]].sum(axis=1)
     shares = [(count >= level).mean() for level in (1, 2, 3, 4)]
     told = views.told[:, [1, 5, 7]].sum(axis=1).astype(float)
@@ -75,8 +73,8 @@ def test_the_value_is_that_of_shares_and_errors(candidates):
 
 
 def test_kept_cameras_stay_and_too_many_have_no_room(candidates):
-    poses, views = candidates
-    search = Planning(views, poses[:, :3, 3], kept=[3, 8])
+    ten, views = candidates
+    search = Planning(views, CameraRig("ten", ten).positions, kept=[3, 8])
     search.grow(5)
     search.exchange()
     assert search.chosen[:2] == [3, 8] and len(set(search.chosen)) == 5
@@ -85,12 +83,16 @@ def test_kept_cameras_stay_and_too_many_have_no_room(candidates):
 
 
 def test_a_plan_beats_cameras_in_a_row():
-    row = np.stack([named_rig("figure5").T_world_camera[n] for n in (0, 1)])
-    old = CameraRig("row", row, *LENS)
+    old = CameraRig("row", named_rig("figure5").cameras[:2])
+    wide = pinhole("wide", (1664, 1088), 1188.0)
     found = plan(
         4, np.array([2.4, 1.8, 2.2]), ("truss",), load_layout("tips8"), np.array(ROOM_CENTER),
-        np.full(3, 0.6), LENS, old, name="new",
+        np.full(3, 0.6), wide, old, name="new",
     )  # fmt: skip
-    assert found.rig.T_world_camera[:2] == pytest.approx(row)
+    assert found.rig.cameras[:2] == old.cameras
+    assert [(one.name, one.size) for one in found.rig.cameras[2:]] == [
+        ("camera3", wide.size),
+        ("camera4", wide.size),
+    ]
     assert len(found.rig.positions) == len(found.targets) == 4
     assert found.after.seen_by_two > found.before.seen_by_two + 0.1

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from handsim.space.cameras import CameraRig, list_rigs, look_at, named_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import list_rigs, named_rig
+from tests.rigs import square_rig
 from train.rig_advice.rig_faults import faults, working_point
 
 
@@ -21,7 +21,7 @@ def with_cameras(change, name="six"):
     rig = named_rig(name)
     poses = rig.T_world_camera.copy()
     change(poses)
-    return dataclasses.replace(rig, T_world_camera=poses)
+    return square_rig(rig.name, poses)
 
 
 def test_opengl_axes_are_told():
@@ -55,7 +55,7 @@ def test_close_low_and_near_cameras_are_told():
 def test_a_narrow_far_and_shifted_rig_is_told():
     middle = np.array([4.0, 0.0, 1.1])
     poses = np.stack([look_at(middle + [9.0, side, 0.0], middle) for side in (-0.5, 0.5)])
-    told = faults(CameraRig("narrow", poses, np.deg2rad(60.0), 320))
+    told = faults(square_rig("narrow", poses, resolution=320))
     assert any("no two cameras see the middle at more than 6 deg" in one for one in told)
     assert any("the cameras look at (4.00, 0.00, 1.10) m" in one for one in told)
     assert any(one.startswith("camera 1 sees a marker of 6.4 mm as 0.2 px") for one in told)

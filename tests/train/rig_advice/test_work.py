@@ -8,7 +8,7 @@ import pytest
 from gloves.layout import load_layout
 from handsim.errors import CaptureError
 from train.rig_advice.work import moved, sample_work, work_of_take
-from train.simulation.takes import TakeConfig, simulate_take
+from train.simulation.takes import simulate_take
 
 
 def test_people_walk_through_a_long_volume():
@@ -33,7 +33,7 @@ def test_an_object_stays_in_the_hand(work):
 
 
 def test_a_take_keeps_its_place_and_its_stretches():
-    take = simulate_take(TakeConfig("hand-pen", num_frames=60, glove="tips8"))
+    take = simulate_take("hand-pen", num_frames=60, glove="tips8")
     (scene,) = work_of_take(take, None, 40)["the take"]
     assert scene.num_frames == 40 and scene.moving_object is not None
     assert scene.hands[0].qpos == pytest.approx(take.qpos[:40, 0])

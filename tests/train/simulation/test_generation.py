@@ -21,12 +21,16 @@ from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
+from handsim.space.cameras import as_rig, save_rig
 from poses.shapes.couplings import HIGH, LOW
+from tests.rigs import mixed_rig
+from track.viewer.recordings.datasets import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
+from train.reports.dataset_page import write_report
 from train.simulation import frame_scenes, generation, people
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import NO_GRASP, NO_TOUCH, SceneMix
-from train.simulation.generation import generate_dataset
+from train.simulation.generation import make_dataset
 from train.simulation.people import NO_REST
 
 CONFIG = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
@@ -38,7 +42,7 @@ from train.simulation.dataset_config import DatasetConfig
 generation.ROWS_PER_SHARD = 200
 if __name__ == "__main__":
     config = DatasetConfig(num_frames=700, seed=3, frames_per_hand=50)
-    generation.generate_dataset(config, Path(sys.argv[1]), workers=1)
+    generation.make_dataset(config, Path(sys.argv[1]), workers=1)
 """
 
 # A pause after each shard, so that the kill comes before the end however busy the machine is.
@@ -63,7 +67,7 @@ def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "undisturbed"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(generation, "ROWS_PER_SHARD", 200)
-        generate_dataset(CONFIG, out, workers=1)
+        make_dataset(CONFIG, out, workers=1)
     return out
 
 
@@ -125,12 +129,12 @@ def test_a_killed_run_goes_on_to_the_same_bytes(finished, tmp_path):
     )  # what a kill in the middle of a write leaves
     with pytest.raises(DatasetError, match="is unfinished; run handsim generate again"):
         Dataset(out)
-    generate_dataset(CONFIG, out, workers=1)
+    make_dataset(CONFIG, out, workers=1)
     assert contents(out) == contents(finished)
 
 
 def test_another_seed_makes_other_rows(finished, tmp_path):
-    generate_dataset(dataclasses.replace(CONFIG, seed=4), tmp_path / "other", workers=1)
+    make_dataset(dataclasses.replace(CONFIG, seed=4), tmp_path / "other", workers=1)
     assert contents(tmp_path / "other")[rows_name(0)] != contents(finished)[rows_name(0)]
 
 
@@ -140,7 +144,7 @@ def test_the_gloves_radius_reaches_the_optics(tmp_path):
         glove = tmp_path / f"{radius}.toml"
         save_layout(glove, dataclasses.replace(load_layout("dense19"), radius=radius))
         config = dataclasses.replace(CONFIG, num_frames=200, glove=str(glove))
-        manifest = generate_dataset(config, tmp_path / f"set{radius}", workers=1)
+        manifest = make_dataset(config, tmp_path / f"set{radius}", workers=1)
         assert manifest.config["optics"]["marker_radius"] == radius
         lost[radius] = np.isnan(Dataset(tmp_path / f"set{radius}").rows()["observed"][..., 0]).mean()
     assert lost[0.008] > 1.5 * lost[0.0032]
@@ -158,13 +162,13 @@ def test_redraws_are_counted_in_the_manifest(tmp_path, monkeypatch):
         population=Population(girth_spread=0.2),
         scenes=SceneMix(alone=0.0, together=1.0, holding=1.0),
     )
-    manifest = generate_dataset(config, tmp_path / "set", workers=1)
+    manifest = make_dataset(config, tmp_path / "set", workers=1)
     assert manifest.redrawn is not None and set(manifest.redrawn) == {NO_REST, NO_TOUCH, NO_GRASP}
     assert manifest.redrawn[NO_TOUCH] + manifest.redrawn[NO_GRASP] == 30
     assert Dataset(tmp_path / "set").manifest == manifest
     for shard in (0, 2):
         (tmp_path / "set" / rows_name(shard)).unlink()
-    assert generate_dataset(config, tmp_path / "set", workers=1) == manifest, "a resumed run counts the same"
+    assert make_dataset(config, tmp_path / "set", workers=1) == manifest, "a resumed run counts the same"
 
 
 def test_errors_other_than_poses_out_of_reach_stop_the_generation(tmp_path, monkeypatch):
@@ -174,7 +178,7 @@ def test_errors_other_than_poses_out_of_reach_stop_the_generation(tmp_path, monk
     monkeypatch.setattr(frame_scenes, "sample_two_hand_poses", broken)
     config = DatasetConfig(num_frames=20, scenes=SceneMix(alone=0.0, together=1.0, holding=0.0))
     with pytest.raises(ArgumentError, match="qpos has shape"):
-        generate_dataset(config, tmp_path / "set", workers=1)
+        make_dataset(config, tmp_path / "set", workers=1)
 
 
 def test_people_are_not_drawn_for_ever(rng, monkeypatch):
@@ -194,14 +198,12 @@ def test_a_set_without_counts_of_redraws_is_read(finished, tmp_path):
     (copy / MANIFEST).write_text(json.dumps(content))
     assert Dataset(copy).manifest.redrawn is None
     (copy / redrawn_name(1)).unlink()
-    assert generate_dataset(CONFIG, copy, workers=1).redrawn is None, (
-        "an older version made one of the shards"
-    )
+    assert make_dataset(CONFIG, copy, workers=1).redrawn is None, "an older version made one of the shards"
 
 
 def test_other_settings_in_the_same_folder_are_told(finished):
     with pytest.raises(DatasetError, match=r"\(num_frames: 700 there, 9 here; seed: 3 there, 9 here\)"):
-        generate_dataset(dataclasses.replace(CONFIG, seed=9, num_frames=9), finished)
+        make_dataset(dataclasses.replace(CONFIG, seed=9, num_frames=9), finished)
 
 
 def test_a_damaged_shard_is_named(finished, tmp_path):
@@ -228,14 +230,29 @@ def test_a_damaged_shard_is_named(finished, tmp_path):
 def test_bad_settings_leave_nothing_behind(tmp_path, change, error, sentence):
     out = tmp_path / "set"
     with pytest.raises(error, match=sentence):
-        generate_dataset(DatasetConfig(num_frames=10, **change), out)
+        make_dataset(DatasetConfig(num_frames=10, **change), out)
     assert not out.exists()
+
+
+def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
+    rig = mixed_rig()
+    config = DatasetConfig(num_frames=40, frames_per_hand=20, rig=rig, seed=3)
+    make_dataset(config, tmp_path / "set", workers=1)
+    dataset = Dataset(tmp_path / "set")
+    assert as_rig(dataset.manifest.config["rig"]) == rig
+    assert DatasetRecording(dataset).rig == rig
+    write_report(dataset)
+    save_rig(tmp_path / "mixed.toml", rig)  # the same cameras, whatever names them
+    same = dataclasses.replace(config, rig=str(tmp_path / "mixed.toml"))
+    make_dataset(same, tmp_path / "set", workers=1)
+    with pytest.raises(DatasetError, match=r"begun with other settings \(rig"):
+        make_dataset(dataclasses.replace(config, rig="six"), tmp_path / "set", workers=1)
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(DatasetError, match="is not empty and holds no training set"):
-        generate_dataset(CONFIG, tmp_path)
+        make_dataset(CONFIG, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -255,18 +272,18 @@ def test_a_full_disk_is_told_and_leaves_nothing_half_written(tmp_path, monkeypat
 def test_a_set_grows_to_the_bytes_of_one_made_at_once(finished, tmp_path):
     """700 frames are three shards of 200 and one of 100, which is made again."""
     out = tmp_path / "grown"
-    generate_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
+    make_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
     kept = (out / rows_name(0)).stat().st_mtime_ns
-    assert generate_dataset(CONFIG, out, workers=1) == Dataset(finished).manifest
+    assert make_dataset(CONFIG, out, workers=1) == Dataset(finished).manifest
     assert contents(out) == contents(finished)
     assert (out / rows_name(0)).stat().st_mtime_ns == kept
     with pytest.raises(DatasetError, match=r"num_frames: 700 there, 300 here\).*num_frames may only grow"):
-        generate_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
+        make_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
 
 
 def test_a_growth_that_was_killed_is_unfinished_and_goes_on(finished, tmp_path, monkeypatch):
     out = tmp_path / "grown"
-    generate_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
+    make_dataset(dataclasses.replace(CONFIG, num_frames=300), out, workers=1)
 
     def killed(*args):
         raise KeyboardInterrupt
@@ -274,18 +291,18 @@ def test_a_growth_that_was_killed_is_unfinished_and_goes_on(finished, tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(generation, "make_shard", killed)
         with pytest.raises(Stopped) as caught:
-            generate_dataset(CONFIG, out, workers=1)
+            make_dataset(CONFIG, out, workers=1)
     assert caught.value.kept == f"200 of 700 frames are in {out}, and the same command goes on after them"
     with pytest.raises(DatasetError, match="is unfinished; run handsim generate again"):
         Dataset(out)
-    generate_dataset(CONFIG, out, workers=1)
+    make_dataset(CONFIG, out, workers=1)
     assert contents(out) == contents(finished)
 
 
 def test_a_set_that_the_disk_has_no_space_for_is_refused(tmp_path):
     config = dataclasses.replace(CONFIG, num_frames=10**18)
     with pytest.raises(DatasetError, match=r"10{18} frames need 7\d\d EB, but the disk of .* has .* free"):
-        generate_dataset(config, tmp_path / "set")
+        make_dataset(config, tmp_path / "set")
     assert not (tmp_path / "set").exists()
 
 

@@ -13,14 +13,14 @@ from gloves.takes.take import Take
 from handsim.space.transforms import quaternion_matrix
 from train.simulation.motion import SceneMotion
 from train.simulation.real_like import FLESH, NOISE, move_skin, sample_real_like_scene
-from train.simulation.takes import TakeConfig, sample_scene, simulate_take
+from train.simulation.takes import sample_scene, simulate_take
 
 FRAMES = 240
 
 
 @functools.cache
 def real_like() -> Take:
-    return simulate_take(TakeConfig(kind="real-like", num_frames=FRAMES))
+    return simulate_take(kind="real-like", num_frames=FRAMES)
 
 
 def test_markers_are_off_by_noise_and_flesh():
@@ -45,7 +45,7 @@ def test_a_part_of_the_displacement_repeats_with_the_pose_in_the_frame_of_the_wr
 
 
 def test_the_same_seed_gives_the_same_take_of_two_hands():
-    take, again = real_like(), simulate_take(TakeConfig(kind="real-like", num_frames=FRAMES))
+    take, again = real_like(), simulate_take(kind="real-like", num_frames=FRAMES)
     np.testing.assert_array_equal(take.points, again.points)
     assert [hand.side for hand in take.hands] == ["right", "left"]
     assert take.num_frames == FRAMES and take.settings["kind"] == "real-like"

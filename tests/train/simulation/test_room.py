@@ -19,9 +19,11 @@ from gloves.takes.take import Take
 from handsim.errors import ArgumentError
 from handsim.hand.model import HandModel
 from handsim.hand.motion import BodyMotion
-from handsim.space.cameras import CameraRig, look_at, named_rig
+from handsim.space.camera import look_at
+from handsim.space.cameras import named_rig
 from handsim.space.objects import RigidObject, named_object
 from poses.motion.motions import sample_motion
+from tests.rigs import square_rig
 from train.simulation.light_sources import sample_light_sources
 from train.simulation.motion import MovingObject, SceneMotion
 from train.simulation.room import pack_take, record_take
@@ -217,6 +219,6 @@ def test_a_camera_in_the_hands_is_refused(rng):
     scene = two_hands()
     middle = SceneSight(scene, RIG).markers[0][0, 0]
     poses = np.stack([look_at(middle + [0.0, 0.0, 0.01], middle), look_at(middle + [0.0, 1.5, 0.5], middle)])
-    near = CameraRig("near", poses, field_of_view=1.0)
+    near = square_rig("near", poses, 1.0)
     with pytest.raises(ArgumentError, match=r"camera 1 of rig 'near' is 0\.00\d+ m from the hand"):
         record_take(scene, near, CLEAN, {}, rng=rng)

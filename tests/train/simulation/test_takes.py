@@ -12,19 +12,20 @@ import pytest
 from gloves.captures.gaps import count_gaps
 from gloves.layout import load_layout, save_layout
 from gloves.optics.reconstruction import OpticsConfig
-from gloves.takes.take import Take
+from gloves.takes.take import Take, load_take
 from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
-from handsim.space.cameras import ROOM_CENTER
+from handsim.space.cameras import ROOM_CENTER, as_rig, named_rig, save_rig
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.contact.two_hands import two_hands_penetration
 from poses.grasps.object_motion import object_penetration
 from poses.shapes.couplings import HIGH, LOW
+from tests.rigs import mixed_rig
 from train.simulation import takes
 from train.simulation.motion import RATE
 from train.simulation.room_settings import KINDS, TWINS, OpticsOptions
-from train.simulation.takes import WRIST_VOLUME, TakeConfig, simulate_take
+from train.simulation.takes import WRIST_VOLUME, TakeConfig, record_config, simulate_take
 
 FRAMES = 200
 SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
@@ -32,12 +33,12 @@ SELF_DEEPEST, DEEPEST = 0.001, 0.0015  # [m]
 
 @functools.cache
 def short(kind: str) -> Take:
-    return simulate_take(TakeConfig(kind=kind, num_frames=FRAMES))
+    return simulate_take(kind=kind, num_frames=FRAMES)
 
 
 @functools.cache
 def whole() -> Take:
-    return simulate_take(TakeConfig(kind="hand-controller"))
+    return simulate_take(kind="hand-controller")
 
 
 def models(take: Take) -> tuple[HandModel, HandModel]:
@@ -103,10 +104,28 @@ def test_the_pen_points_at_markers_of_the_other_hand():
 
 def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
     config = TakeConfig(kind="hand-hand", num_frames=40, glove="sparse13", rig="eight", seed=7)
-    first, again = simulate_take(config), simulate_take(config)
+    first, again = record_config(config), record_config(config)
     for name in ("points", "ids", "labels"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
     assert first.hand_labels == (range(13), range(13, 26))
+
+
+def test_a_rig_of_ones_own_is_kept_in_the_take_with_its_cameras(tmp_path):
+    rig = mixed_rig()
+    save_rig(tmp_path / "mixed.toml", rig)
+    takes = []
+    for given in (rig, str(tmp_path / "mixed.toml")):
+        take = simulate_take(num_frames=40, rig=given)
+        take.save(tmp_path / "take.truth.npz")
+        takes.append(load_take(tmp_path / "take.truth.npz"))
+        assert as_rig(takes[-1].settings["rig"]) == rig
+    np.testing.assert_array_equal(takes[0].points, takes[1].points)
+    assert takes[0].markers_present().mean() > 0.4
+    six = simulate_take(num_frames=40, rig=named_rig("six"))
+    assert six.settings["rig"] == "six"
+    np.testing.assert_array_equal(six.points, simulate_take(num_frames=40, rig="six").points)
+    with pytest.raises(ArgumentError, match="a rig is int, expected a CameraRig"):
+        simulate_take(num_frames=40, rig=3)
 
 
 def thick_glove(folder: Path, radius_mm: float) -> str:
@@ -120,20 +139,20 @@ def test_the_gloves_radius_reaches_the_optics(tmp_path):
     missing = {}
     for radius in (3.2, 8.0):
         config = TakeConfig(kind="hand-hand", num_frames=120, glove=thick_glove(tmp_path, radius))
-        take = simulate_take(config)
+        take = record_config(config)
         assert take.settings["room"]["optics"]["marker_radius"] == radius * 1e-3
         missing[radius] = 1.0 - take.markers_present().mean()
     assert missing[8.0] > 2.0 * missing[3.2]
     own = dataclasses.replace(config, optics=OpticsOptions(marker_radius=0.0032))
-    assert 1.0 - simulate_take(own).markers_present().mean() < missing[8.0]
+    assert 1.0 - record_config(own).markers_present().mean() < missing[8.0]
 
 
 def test_the_optics_have_options():
     assert [field.name for field in dataclasses.fields(OpticsOptions)] == [
         field.name for field in dataclasses.fields(OpticsConfig)
     ]
-    blind = simulate_take(TakeConfig(num_frames=60, optics=OpticsOptions(blob_loss=0.9)))
-    clear = simulate_take(TakeConfig(num_frames=60))
+    blind = simulate_take(num_frames=60, optics=OpticsOptions(blob_loss=0.9))
+    clear = simulate_take(num_frames=60)
     assert blind.markers_present().mean() < 0.8 < clear.markers_present().mean()
     assert blind.settings["room"]["optics"]["blob_loss"] == 0.9 and "optics" not in clear.settings
     with pytest.raises(ArgumentError, match="blob_loss is 2, expected a chance"):
@@ -142,7 +161,7 @@ def test_the_optics_have_options():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_single_frame_is_a_capture(kind):
-    take = simulate_take(TakeConfig(kind=kind, num_frames=1))
+    take = simulate_take(kind=kind, num_frames=1)
     assert take.num_frames == 1 and (take.labels >= 0).sum() > 30
 
 
@@ -155,7 +174,7 @@ def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
 
     monkeypatch.setattr(takes, "sample_scene_motion", out_of_reach)
     with pytest.raises(PoseError, match="none of 10 people can do 'hand-pen'; the last: this hand does not"):
-        simulate_take(TakeConfig(kind="hand-pen", num_frames=5))
+        simulate_take(kind="hand-pen", num_frames=5)
     assert len(tried) == 10
 
     def broken(kind, fits, num_frames, *, rng):
@@ -163,7 +182,7 @@ def test_people_who_cannot_do_it_are_replaced_and_counted(monkeypatch):
 
     monkeypatch.setattr(takes, "sample_scene_motion", broken)
     with pytest.raises(ArgumentError, match="qpos has shape"):
-        simulate_take(TakeConfig(kind="hand-pen", num_frames=5))
+        simulate_take(kind="hand-pen", num_frames=5)
 
 
 @pytest.mark.parametrize(
@@ -186,7 +205,7 @@ def test_a_mistake_is_one_sentence(arguments, words):
 )
 def test_unknown_gloves_and_rigs_are_told(arguments, words):
     with pytest.raises(HandSimError, match=words):
-        simulate_take(TakeConfig(num_frames=5, **arguments))
+        simulate_take(num_frames=5, **arguments)
 
 
 def test_the_whole_hand_controller_twin_is_near_table_3():
@@ -202,7 +221,7 @@ def test_the_whole_hand_controller_twin_is_near_table_3():
 @pytest.mark.parametrize("kind", ["single-hand", "calibration", "free"])
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_one_hand_alone(kind, side):
-    take = simulate_take(TakeConfig(kind=kind, num_frames=FRAMES, hands=(side,)))
+    take = simulate_take(kind=kind, num_frames=FRAMES, hands=(side,))
     assert [hand.shape.side for hand in take.hands] == [side] and take.settings["hands"] == (side,)
     assert take.num_frames == len(take.qpos) == FRAMES
     assert set(np.unique(take.labels)) <= {-1, *range(19)}
@@ -213,10 +232,10 @@ def test_one_hand_alone(kind, side):
 
 
 def test_calibration_has_touches_and_free_motion_of_both_hands():
-    take = simulate_take(TakeConfig(kind="calibration"))
+    take = simulate_take(kind="calibration")
     assert [hand.shape.side for hand in take.hands] == ["right", "left"] and "hands" not in take.settings
     assert take.num_frames > 45 * RATE, "40 s of free motion after the touches"
-    free = simulate_take(TakeConfig(kind="free", num_frames=FRAMES))
+    free = simulate_take(kind="free", num_frames=FRAMES)
     assert len(free.hands) == 2 and free.num_frames == FRAMES
     apart = np.linalg.norm(free.qpos[:, 0, :3] - free.qpos[:, 1, :3], axis=1)
     assert apart.min() > 0.2

@@ -10,7 +10,7 @@ from jaxtyping import UInt32
 from handsim.hand.model import HandModel
 from handsim.space.cameras import CameraRig
 from track.viewer.recordings.recording import Recording, ShownFrame
-from track.viewer.recordings.takes import shipped_rig
+from track.viewer.recordings.takes import rig_of_settings
 from train.data.shards import Dataset
 
 _ROWS_PER_SECOND: Final = 4.0
@@ -22,7 +22,7 @@ class DatasetRecording(Recording):
 
     Args:
         dataset: The training set; its rows stay on disk.
-        rig: The cameras; those that the set names, if they come with handsim, when None.
+        rig: The cameras; those of the set, if it names shipped ones or holds its own, when None.
     """
 
     def __init__(self, dataset: Dataset, rig: CameraRig | None = None) -> None:
@@ -34,7 +34,7 @@ class DatasetRecording(Recording):
             np.arange(self._starts[-1]) / _ROWS_PER_SECOND,
             dataset.marker_names,
             most_points=markers + ghosts,
-            rig=shipped_rig(dataset.manifest.config.get("rig")) if rig is None else rig,
+            rig=rig_of_settings(dataset.manifest.config.get("rig")) if rig is None else rig,
         )
 
     def frame(self, index: int) -> ShownFrame:

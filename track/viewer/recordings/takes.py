@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from gloves.takes.take import COASTING, LOST, STATUSES, RigidBody, Take
-from handsim.space.cameras import CameraRig, list_rigs, named_rig
+from handsim.space.cameras import CameraRig, as_rig, list_rigs
 from track.viewer.recordings.recording import Curve, Doubt, Recording, ShownBody, ShownFrame, runs_of
 
 _CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
@@ -33,7 +33,7 @@ class TakeRecording(Recording):
             most_points=int(points.max()) + take.hand_labels[-1].stop,
             radius=take.hands[0].layout.radius,
             bodies=tuple(shown_body(body) for body in take.bodies),
-            rig=shipped_rig(take.settings.get("rig")) if rig is None else rig,
+            rig=rig_of_settings(take.settings.get("rig")) if rig is None else rig,
         )
         self.replace(take)
 
@@ -130,6 +130,6 @@ def shown_body(body: RigidBody) -> ShownBody:
     return ShownBody(body.name) if thing is None else ShownBody(body.name, thing.vertices, thing.faces)
 
 
-def shipped_rig(name: object) -> CameraRig | None:
-    """A rig that comes with handsim; None for any other: a file's settings are no path to follow."""
-    return named_rig(name) if isinstance(name, str) and name in list_rigs() else None
+def rig_of_settings(rig: object) -> CameraRig | None:
+    """The rig that settings name or hold; None for a path, which is none to follow."""
+    return as_rig(rig) if isinstance(rig, dict) or rig in list_rigs() else None

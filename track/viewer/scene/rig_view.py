@@ -29,15 +29,16 @@ def show_rig(server: ViserServer, rig: CameraRig, *, scale: float = 0.12) -> Non
         scale: Size of a frustum [m].
     """
     quaternions = rotation_quaternions(rig.T_world_camera[:, :3, :3])
-    for number, (position, quaternion) in enumerate(zip(rig.positions, quaternions, strict=True), 1):
+    for number, (camera, quaternion) in enumerate(zip(rig.cameras, quaternions, strict=True), 1):
+        width, height = camera.angles
         server.scene.add_camera_frustum(
             f"/cameras/{number}",
-            fov=rig.field_of_view,
-            aspect=1.0,
+            fov=height,
+            aspect=float(np.tan(width / 2) / np.tan(height / 2)),
             scale=scale,
             thickness=0.004,
             color=(60, 66, 76),
-            position=position,
+            position=camera.T_world_camera[:3, 3],
             wxyz=quaternion,
         )
         server.scene.add_label(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from handsim.errors import DatasetError, HandSimError
-from handsim.space.cameras import look_at
+from handsim.space.camera import look_at
 from render.formats.annotations.interhand import skeleton_lines
 from render.formats.annotations.joint_orders import from_order
 from render.formats.writer import open_writer

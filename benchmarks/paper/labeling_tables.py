@@ -1,0 +1,377 @@
+"""The paper's tables of labeling, with its figures beside ours."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.paper.printed import AUGMENTATIONS, TABLE2, TABLE4, TABLE6, TEST_SETS
+from benchmarks.record import Figures, save_figures
+from gloves.captures.collection import find_captures, read_markers
+from gloves.captures.gaps import count_gaps, run_lengths
+from gloves.takes.take import Take
+from handsim.app.progress import progress_bar
+from handsim.errors import HandSimError
+from train.config import Kind, default_config
+from train.data.augmentation import Corruption
+from train.data.batches import paper_corruption
+from train.data.shards import Dataset
+from train.evaluate import evaluate_labeler
+from train.evaluation.labeler_evaluation import Report
+from train.glove_labeler import load_labeler
+from train.labelers.protocol import Labeler
+from train.labelers.storage import shipped_labelers
+from train.loop import train_labeler
+from train.simulation.held_out import held_out_markers
+from train.simulation.room_settings import KINDS, TWINS
+from train.simulation.takes import simulate_take
+
+PUBLISHED_GAPS: Final = "3-4", "24-43"  # median and p90 of real finger markers' gaps [frames]; docs/room.md
+FIGURES: Final = {
+    "slot_accuracy": "Accuracy (slots)",
+    "point_accuracy": "Accuracy (points)",
+    "frame_accuracy": "Frames all right",
+    "macro_f1": "Macro F1",
+    "occlusion_ratio": "O ratio",
+    "occlusion_precision": "O precision",
+    "occlusion_recall": "O recall",
+    "ghost_ratio": "G ratio",
+    "ghost_precision": "G precision",
+    "ghost_recall": "G recall",
+}
+"""Rows of Tables 4 and 6, the paper's and ours."""
+_KEYS: Final = dict(
+    zip(
+        FIGURES,
+        "slots points frames f1 o_ratio o_precision o_recall g_ratio g_precision g_recall".split(),
+        strict=True,
+    )
+)
+
+
+def table2(
+    data: Annotated[Path, tyro.conf.Positional],
+    out: Path,
+    *,
+    kinds: tuple[Kind, ...] = ("set",),
+    samples: int = 300_000,
+    num_frames: int = 5000,
+    captures: tuple[Path, ...] = (),
+    seed: int = 0,
+    save: str | None = None,
+) -> None:
+    """Train with and without random drops and ghosts, and test each network with and without them.
+
+    Args:
+        data: Training set that handsim generate wrote.
+        out: Folder for the runs; the same command continues where it was stopped.
+        kinds: Networks to train: set, cnn or both.
+        samples: Clouds that each network is trained on (the paper: 12.8 million).
+        num_frames: Test frames of people and poses that are not in the training set.
+        captures: Labeled captures or folders of them, for a second table.
+        seed: Seed of the training, the test frames and their corruption.
+        save: Name under which the last table's figures are kept in benchmarks/figures, such as table2.
+    """
+    dataset = Dataset(data)
+    names, glove = dataset.marker_names, str(dataset.manifest.config["glove"])
+    tests = {"held-out simulated frames": held_out_markers(glove, num_frames, seed=seed)}
+    if captures:
+        files = find_captures(captures)
+        tests[f"{len(files)} captures"] = read_markers(files, names)
+    for kind in kinds:
+        runs = {name: out / f"{kind}-{name}" for name in AUGMENTATIONS}
+        for name, run in runs.items():
+            _train_augmentation(dataset, kind, name, run, samples, seed)
+        for title, markers in tests.items():
+            nets = {
+                name: measure_augmentations(load_labeler(glove, run), markers, seed=seed)
+                for name, run in runs.items()
+            }
+            Console().print(print_table2(nets, title=f"Table 2, {kind}: {title}, ours (the paper's) [%]"))
+            save_figures(save, _table2_figures(nets, f"Table 2, {kind}, {title}"))
+
+
+def _train_augmentation(dataset: Dataset, kind: Kind, name: str, run: Path, samples: int, seed: int) -> None:
+    drawn = augmentations(len(dataset.marker_names))[name]
+    usual = dataclasses.replace(default_config(kind), samples=samples, seed=seed, rig_share=0.0)
+    config = dataclasses.replace(usual, occlude=drawn.occlude, ghosts=drawn.ghosts)
+    with progress_bar("samples") as (bar, task):
+        train_labeler(
+            dataset,
+            run,
+            config,
+            progress=lambda done, total, loss: bar.update(
+                task, completed=done, total=total, description=f"{kind} {name}, loss {loss:.3f}"
+            ),
+        )
+
+
+def table3(glove: str = "dense19", seed: int = 0, save: str | None = None) -> None:
+    """Frames, gaps and ghosts of the simulated twins of the paper's captures.
+
+    Args:
+        glove: Marker layout: a shipped name or the path of a .toml file.
+        seed: Seed of the captures; 0 gives the twins, others give other captures of the same kinds.
+        save: Name under which the figures are kept in benchmarks/figures, such as table3.
+    """
+    takes = _simulate(glove, seed)
+    Console().print(_table3(takes))
+    Console().print(_by_marker(takes))
+    save_figures(save, _table3_figures(takes))
+
+
+def table4(
+    labelers: tuple[str, ...] = ("dense19",),
+    num_frames: int = 5000,
+    captures: tuple[Path, ...] = (),
+    seed: int = 0,
+    save: str | None = None,
+) -> None:
+    """Labelers of the dense layout on simulated test frames and on the twins of the paper's captures.
+
+    Args:
+        labelers: Shipped names, folders of trained labelers, or exported .onnx files.
+        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
+        captures: Labeled captures or folders of them, for another column with the paper's recipe.
+        seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
+        save: Name under which the last labeler's figures are kept in benchmarks/figures, such as table4.
+    """
+    _print_tests("Table 4", "dense19", TABLE4, labelers, num_frames, captures, seed, save)
+
+
+def table6(
+    labelers: tuple[str, ...] = ("sparse13",),
+    num_frames: int = 5000,
+    captures: tuple[Path, ...] = (),
+    seed: int = 0,
+    save: str | None = None,
+) -> None:
+    """Labelers of the sparse layout on simulated test frames and on the twins of the paper's captures.
+
+    Args:
+        labelers: Shipped names, folders of trained labelers, or exported .onnx files.
+        num_frames: Test frames of people and poses that are in no training set, with the paper's recipe.
+        captures: Labeled captures or folders of them, for another column with the paper's recipe.
+        seed: Seed of the test frames, the takes and the recipe; 0 gives the twins.
+        save: Name under which the last labeler's figures are kept in benchmarks/figures, such as table4.
+    """
+    _print_tests("Table 6", "sparse13", TABLE6, labelers, num_frames, captures, seed, save)
+
+
+LABELING_TABLES: Final[dict[str, Callable[..., None]]] = {
+    "table2": table2,
+    "table3": table3,
+    "table4": table4,
+    "table6": table6,
+}
+
+
+def _print_tests(
+    table: str,
+    glove: str,
+    paper: Mapping[str, tuple[float, ...]],
+    labelers: tuple[str, ...],
+    num_frames: int,
+    captures: tuple[Path, ...],
+    seed: int,
+    save: str | None,
+) -> None:
+    if num_frames < 1:
+        raise HandSimError(f"num_frames is {num_frames}, expected at least 1")
+    found = {
+        name: load_labeler(glove, name if name in shipped_labelers() else Path(name)) for name in labelers
+    }
+    stills = {"synthetic": held_out_markers(glove, num_frames, seed=seed)}
+    takes = _simulate(glove, seed)
+    if captures:
+        names = next(iter(found.values())).marker_names
+        stills["captures"] = read_markers(find_captures(captures), names)
+    for name, labeler in found.items():
+        reports = measure_tests(labeler, stills, takes, seed=seed)
+        Console().print(print_tests(reports, paper, title=f"{table}, {name}: ours (the paper's)"))
+        save_figures(save, _tests_figures(reports, paper, f"{table}, {name}"))
+
+
+def _simulate(glove: str, seed: int) -> dict[str, Take]:
+    with progress_bar("captures") as (bar, task):
+        bar.update(task, total=len(KINDS))
+        return simulate_takes(glove, seed, lambda: bar.advance(task))
+
+
+def _table3(takes: dict[str, Take]) -> Table:
+    table = Table(title="Table 3: ours, and the paper's in brackets")
+    for column in ("Test set", "#Frame", "#Gap", "AGL", "AMF", "ghosts / labels"):
+        table.add_column(
+            column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"
+        )
+    for kind, take in takes.items():
+        present = take.markers_present()
+        ours, paper = count_gaps(present), TWINS[kind].paper
+        ghosts = int(((take.labels < 0) & np.isfinite(take.points[..., 0])).sum())
+        table.add_row(
+            kind,
+            f"{ours.frames} ({paper.frames})",
+            f"{ours.gaps} ({paper.gaps})",
+            f"{ours.average_length:.2f} ({paper.average_length:.2f})",
+            f"{ours.average_missing:.2f} ({paper.average_missing:.2f})",
+            f"{100 * ghosts / present.size:.2f} % ({100 * TWINS[kind].ghost_ratio:.2f} %)",
+        )
+    return table
+
+
+def _table3_figures(takes: Mapping[str, Take]) -> Figures:
+    """The figures of Table 3."""
+    kept: Figures = {}
+    columns = "frames, gaps, AGL, AMF, ghosts / labels [%], each with the paper's"
+    missing_columns = "missing, mean, least and most marker [%]; gaps, median, p90, p99 [frames]"
+    for kind, take in takes.items():
+        present, paper, key = take.markers_present(), TWINS[kind].paper, kind.split("-")[-1]
+        key, ours = "single" if kind == "single-hand" else key, count_gaps(present)
+        ghosts = int(((take.labels < 0) & np.isfinite(take.points[..., 0])).sum())
+        pairs = [
+            [ours.frames, paper.frames],
+            [ours.gaps, paper.gaps],
+            [ours.average_length, paper.average_length],
+            [ours.average_missing, paper.average_missing],
+            [100 * ghosts / present.size, 100 * TWINS[kind].ghost_ratio],
+        ]
+        share, lengths = 100 * (~present).mean(axis=0), run_lengths(~present)
+        quantiles = np.quantile(lengths, [0.5, 0.9, 0.99]) if len(lengths) else np.full(3, np.nan)
+        kept[key] = f"Table 3, {kind}: {columns}", pairs
+        row = [share.mean(), share.min(), share.max(), *quantiles]
+        kept[f"gaps_{key}"] = f"{kind}: {missing_columns}", row
+    return kept
+
+
+def _table2_figures(nets: Mapping[str, Mapping[str, Report]], title: str) -> Figures:
+    """The figures of Table 2: a row a test set, ours and the paper's of each network."""
+    kept: Figures = {}
+    for key, test in zip(("base", "o", "g", "og"), AUGMENTATIONS, strict=True):
+        ours = [100 * reports[test].figures["slot_accuracy"] for reports in nets.values()]
+        row = [[one, 100 * paper] for one, paper in zip(ours, TABLE2[test], strict=True)]
+        kept[key] = f"{title}: {test}, ours and the paper's [%], networks trained on {', '.join(nets)}", row
+    return kept
+
+
+def _tests_figures(
+    reports: Mapping[str, Report], paper: Mapping[str, tuple[float, ...]], title: str
+) -> Figures:
+    """The figures of Tables 4 and 6: a row a figure, the paper's beside where it has one."""
+    kept: Figures = {}
+    for figure, words in FIGURES.items():
+        printed = dict(zip(TEST_SETS, paper[figure], strict=True)) if figure in paper else {}
+        ours = {test: 100 * report.figures[figure] for test, report in reports.items()}
+        row = [[one, 100 * printed[test]] if test in printed else one for test, one in ours.items()]
+        kept[_KEYS[figure]] = f"{title}, ours and the paper's [%], {', '.join(reports)}: {words}", row
+    return kept
+
+
+def _by_marker(takes: dict[str, Take]) -> Table:
+    table = Table(title="Missing share and gap lengths per marker")
+    for column in ("Test set", "mean", "least", "most", "median gap", "p90", "p99 [frames]"):
+        table.add_column(
+            column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"
+        )
+    for kind, take in takes.items():
+        missing = ~take.markers_present()
+        share, lengths = missing.mean(axis=0), run_lengths(missing)
+        quantiles = np.quantile(lengths, [0.5, 0.9, 0.99]) if len(lengths) else np.full(3, np.nan)
+        table.add_row(
+            kind,
+            *(f"{100 * value:.2f} %" for value in (share.mean(), share.min(), share.max())),
+            *(f"{value:.0f}" for value in quantiles),
+        )
+    table.add_row("real finger markers", "2.6-4.9 %", "0.2 %", "12.4 %", *PUBLISHED_GAPS, "320-340")
+    return table
+
+
+def augmentations(num_markers: int) -> dict[str, Corruption]:
+    """The four test sets of Table 2 for a layout, see `train.data.batches.paper_corruption`."""
+    most = paper_corruption(num_markers)
+    drawn = ((0, 0), (most.occlude, 0), (0, most.ghosts), (most.occlude, most.ghosts))
+    return {name: Corruption(*pair) for name, pair in zip(AUGMENTATIONS, drawn, strict=True)}
+
+
+def measure_augmentations(
+    labeler: Labeler, markers: Float[np.ndarray, "T M 3"], *, seed: int
+) -> dict[str, Report]:
+    """Table 2's column of one network: the markers [m] as they are, with drops, with ghosts, with both."""
+    return {
+        name: evaluate_labeler(labeler, markers, corruption, rng=np.random.default_rng(seed))
+        for name, corruption in augmentations(markers.shape[1]).items()
+    }
+
+
+def simulate_takes(glove: str, seed: int, done: Callable[[], None]) -> dict[str, Take]:
+    """The twins of the paper's four captures."""
+    takes: dict[str, Take] = {}
+    for kind in KINDS:
+        takes[kind] = simulate_take(kind=kind, glove=glove, seed=seed)
+        done()
+    return takes
+
+
+def measure_tests(
+    labeler: Labeler,
+    stills: Mapping[str, Float[np.ndarray, "T M 3"]],
+    takes: Mapping[str, Take],
+    *,
+    seed: int,
+) -> dict[str, Report]:
+    """Tables 4 and 6 for one labeler.
+
+    Args:
+        labeler: The labeler to evaluate.
+        stills: Sets of true markers [m] that get the paper's corruption, by name.
+        takes: Simulated captures, by name.
+        seed: Seed of the corruption.
+    """
+    recipe = paper_corruption(len(labeler.marker_names))
+    reports = {
+        name: evaluate_labeler(labeler, markers, recipe, rng=np.random.default_rng(seed))
+        for name, markers in stills.items()
+    }
+    return reports | {name: evaluate_labeler(labeler, [take]) for name, take in takes.items()}
+
+
+def print_table2(nets: Mapping[str, Mapping[str, Report]], *, title: str) -> Table:
+    """Slot accuracy of networks (columns) on test sets (rows), the paper's in brackets."""
+    table = Table(title=title)
+    table.add_column("test \\ net", no_wrap=True)
+    for name in nets:
+        table.add_column(name, justify="right")
+    for test in AUGMENTATIONS:
+        paper = dict(zip(AUGMENTATIONS, TABLE2[test], strict=True))
+        table.add_row(
+            test,
+            *(_cell(reports[test].figures["slot_accuracy"], paper[net]) for net, reports in nets.items()),
+        )
+    return table
+
+
+def print_tests(
+    reports: Mapping[str, Report], paper: Mapping[str, tuple[float, ...]], *, title: str
+) -> Table:
+    """Figures (rows) by test set (columns), the paper's in brackets where it has one."""
+    table = Table(title=title)
+    table.add_column("[%]", no_wrap=True)
+    for test in reports:
+        table.add_column(test, justify="right")
+    for figure, words in FIGURES.items():
+        printed = dict(zip(TEST_SETS, paper[figure], strict=True)) if figure in paper else {}
+        cells = (_cell(report.figures[figure], printed.get(test)) for test, report in reports.items())
+        table.add_row(words, *cells)
+    return table
+
+
+def _cell(ours: float, paper: float | None) -> str:
+    percent = "-" if np.isnan(ours) else f"{100 * ours:.2f}"
+    return percent if paper is None else f"{percent} ({100 * paper:.2f})"

@@ -1,0 +1,194 @@
+"""Makes a benchmark: captures that a tracker may read, and their truth apart from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from benchmarks.public.answers import Answers, BenchmarkError, poses_of, save_answers
+from benchmarks.public.card import data_card, describe_captures
+from benchmarks.public.difficulties import BENCHMARK, DIFFICULTIES, GLOVE, Plan, PlannedCapture
+from benchmarks.public.manifest import (
+    LICENSE,
+    MANIFEST,
+    Benchmark,
+    capture_path,
+    truth_path,
+    user_path,
+    write_manifest,
+)
+from gloves.captures.capture import Capture
+from gloves.captures.formats import write_capture
+from gloves.captures.markers import UNLABELED
+from gloves.fit import GloveFit
+from gloves.layout import load_layout, save_layout
+from gloves.takes.take import Take
+from handsim.files.atomic import atomic_write, remove_leftovers
+from handsim.files.capacity import check_free
+from handsim.files.json_files import claim
+from handsim.hand.model import HandModel
+from handsim.space.cameras import load_rig, save_rig
+from track.user import User, load_user
+from train.simulation.real_like import sample_real_like_scene
+from train.simulation.room import record_take
+from train.simulation.room_settings import Kind
+from train.simulation.takes import sample_scene
+
+Progress = Callable[[int, int], None]
+"""Called with frames done and frames expected."""
+PLAN: Final = "plan.json"
+CAPTURES: Final = "captures/captures.csv"
+_LICENSE_FILE: Final = "LICENSE.txt"
+_GLOVE_FILE: Final = "captures/glove.toml"
+_BYTES_PER_FRAME: Final = 2500
+_POINT_DECIMALS: Final = 5  # of a point or joint [m]: 0.01 mm, below the noise of the cameras
+_ANGLE_DECIMALS: Final = 4  # of a true joint angle [rad]
+_HAND_DECIMALS: Final = 9  # of hands and gloves [m]
+
+
+def make_benchmark(
+    plan: Plan, out: Path, *, workers: int | None = None, progress: Progress | None = None
+) -> Benchmark:
+    """Make a benchmark, or finish a stopped one; the bytes depend on the plan alone.
+
+    Args:
+        plan: Which captures.
+        out: Folder to make it in.
+        workers: Processes; all cores when not given.
+        progress: Called after every capture.
+
+    Raises:
+        BenchmarkError: `out` holds something else, or its disk is too small.
+    """
+    captures = plan.captures
+    total = sum(one.num_frames for one in captures)
+    check_free(out, _BYTES_PER_FRAME * total, f"{total} frames", "ask for --size small", error=BenchmarkError)
+    claim(out / PLAN, _settings(plan), noun="benchmark", error=BenchmarkError, result=out / MANIFEST)
+    todo = [number for number, one in enumerate(captures) if not _finished(out, one)]
+    done = total - sum(captures[number].num_frames for number in todo)
+    make, workers = functools.partial(make_capture, plan, out), workers or os.cpu_count()
+    with ProcessPoolExecutor(workers, get_context("spawn")) if workers != 1 else nullcontext() as pool:
+        for number in (pool.map if pool else map)(make, todo):
+            done += captures[number].num_frames
+            if progress is not None:
+                progress(done, total)
+    remove_leftovers(out)  # of processes that were killed
+    return _complete(plan, out)
+
+
+def make_capture(plan: Plan, out: Path, number: int) -> int:
+    """Write one capture, its user and its truth; they depend on its number in the plan alone."""
+    planned = plan.captures[number]
+    take = simulate_capture(planned)
+    capture, labels = _published_points(take)
+    hands = tuple(_rounded(hand) for hand in take.hands)
+    joints, angles = poses_of(hands, take.qpos)
+    rounded = _round(joints, _POINT_DECIMALS), _round(angles, _ANGLE_DECIMALS)
+    write_capture(out / capture_path(planned.name), capture)
+    notes = "The true hands and gloves of this capture, as a perfect calibration finds them."
+    User(hands, notes).save(out / user_path(planned.name))
+    save_answers(out / truth_path(planned.name), Answers(labels, *rounded))  # last: it is finished now
+    return number
+
+
+def simulate_capture(planned: PlannedCapture) -> Take:
+    """The take of a planned capture, without the points of a rigid body, which systems track themselves."""
+    rng, difficulty, layout = planned.rng("motion"), DIFFICULTIES[planned.difficulty], load_layout(GLOVE)
+    if planned.kind == "real-like":
+        scene = sample_real_like_scene(layout, planned.num_frames, rng=rng)
+    else:
+        kind, frames = cast("Kind", planned.kind), difficulty.speed * planned.num_frames
+        scene = sample_scene(kind, layout, frames, rng=rng).faster(difficulty.speed)
+    optics = difficulty.room.optics.worn(layout.radius)
+    room = dataclasses.replace(difficulty.room, optics=optics)
+    take = record_take(scene, load_rig(difficulty.rig), room, {"glove": GLOVE}, rng=planned.rng("optics"))
+    return take.without_body()
+
+
+def _published_points(take: Take) -> tuple[Capture, Int[np.ndarray, "T N"]]:
+    """The points (T, N, 3) as they are written, and their labels (T, N), without columns that are empty."""
+    used = np.isfinite(take.points[..., 0]).any(axis=0)
+    names = tuple(f"{UNLABELED}{number + 1}" for number in range(int(used.sum())))
+    points = _round(take.points[:, used], _POINT_DECIMALS)
+    return Capture(names, points, take.rate), take.labels[:, used]
+
+
+def _rounded(fit: GloveFit) -> GloveFit:
+    """A hand in its glove with lengths to a nanometer, which do not depend on the last bits of a machine.
+
+    Its layout is the glove as designed, as after a calibration: where markers slipped is in their positions.
+    """
+
+    def rounded(owner: Any, *without: str) -> Any:
+        fields = {field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)}
+        numbers = {
+            name: _round(value, _HAND_DECIMALS)
+            if isinstance(value, np.ndarray)
+            else round(value, _HAND_DECIMALS)
+            for name, value in fields.items()
+            if name not in without
+        }
+        return dataclasses.replace(owner, **numbers)
+
+    model = HandModel(rounded(fit.shape, "side"))
+    worn = dataclasses.replace(fit.attachment, layout=load_layout(GLOVE))
+    return GloveFit(model, rounded(worn, "layout", "bone_indices"))
+
+
+def _round(array: Float[np.ndarray, "*shape"], decimals: int) -> Float[np.ndarray, "*shape"]:
+    """Rounded numbers, never -0.0."""
+    rounded: np.ndarray = np.round(array, decimals) + 0.0
+    return rounded
+
+
+def _finished(out: Path, planned: PlannedCapture) -> bool:
+    paths = (capture_path(planned.name), user_path(planned.name), truth_path(planned.name))
+    return all((out / path).is_file() for path in paths)
+
+
+def _settings(plan: Plan) -> dict[str, Any]:
+    difficulties = {name: dataclasses.asdict(DIFFICULTIES[name]) for name in plan.difficulties}
+    return {"benchmark": BENCHMARK, **dataclasses.asdict(plan), "settings": difficulties}
+
+
+def _complete(plan: Plan, out: Path) -> Benchmark:
+    """Write what captures share, the data card and the manifest."""
+    save_layout(out / _GLOVE_FILE, load_layout(GLOVE))
+    files = [PLAN, _GLOVE_FILE, CAPTURES, _LICENSE_FILE, "README.md"]
+    for name in sorted({DIFFICULTIES[name].rig for name in plan.difficulties}):
+        files.append(f"captures/rig-{name}.toml")
+        save_rig(out / files[-1], load_rig(name))
+    _write(out / CAPTURES, _table_of_captures(plan, out))
+    with atomic_write(out / _LICENSE_FILE) as temporary:
+        shutil.copyfile(Path(__file__).with_name(f"{LICENSE}.txt"), temporary)
+    _write(out / "README.md", data_card(plan, describe_captures(plan, out)))
+    for one in plan.captures:
+        files += [capture_path(one.name), user_path(one.name), truth_path(one.name)]
+    return write_manifest(out, plan, files)
+
+
+def _table_of_captures(plan: Plan, out: Path) -> str:
+    """What a tracker may know of every capture beside its points."""
+    lines = ["capture,kind,difficulty,rig,frames,hand_length_mm,hand_breadth_mm"]
+    for one in plan.captures:
+        shape = load_user(out / user_path(one.name))[0].shape
+        size = f"{1e3 * shape.length:.1f},{1e3 * shape.breadth:.1f}"
+        rig = DIFFICULTIES[one.difficulty].rig
+        lines.append(f"{one.name},{one.kind},{one.difficulty},{rig},{one.num_frames},{size}")
+    return "\n".join(lines)
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_write(path) as temporary:
+        temporary.write_text(text.rstrip("\n") + "\n", encoding="utf-8")

@@ -1,0 +1,186 @@
+"""Scores of results: labels are counted as in the tables of labeling and tracking, joints against the truth.
+
+A slot is right when it holds the right point, or rightly none; a frame when all its slots and points are
+(`train.evaluation.metrics`). Joint errors are over joints that were given; what was not given shows in
+`posed` and `within_5mm`, where it counts as wrong. A capture without results counts as zero.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from benchmarks.public.answers import Answers
+from benchmarks.public.manifest import Benchmark, BenchmarkCapture, label_names
+from benchmarks.public.results import find_results, read_result
+from handsim.errors import HandSimWarning
+from handsim.hand.keypoints import NUM_KEYPOINTS
+from train.evaluation.metrics import LabelCounts
+
+NEAR: Final = 0.005
+"""Distance from the truth within which a joint counts as found [m]."""
+POSE_SHARES: Final = ("posed", "within_5mm")
+_MOST_TOLD: Final = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaptureScore:
+    """The score of one capture."""
+
+    capture: BenchmarkCapture
+    figures: dict[str, float]
+    """Shares in [0, 1] of `train.evaluation.metrics.LabelCounts`; `posed`, the share of joints that were
+    given; `within_5mm`, of those that are right to 5 mm; `mpjpe`, mean distance of joints from the truth [m];
+    `angle_error`, mean absolute error of joint angles [rad]. NaN where nothing was counted."""
+    joint_errors: Float[np.ndarray, "21"]
+    """Mean distance of each joint of both hands from the truth [m]; NaN where it was never given."""
+    missing: bool = False
+    """There is no result of this capture."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Score:
+    """The score of results."""
+
+    benchmark: Benchmark
+    captures: tuple[CaptureScore, ...]
+
+    def mean(self, *, difficulty: str | None = None, kind: str | None = None) -> dict[str, float]:
+        """Means over captures of one difficulty or kind, or over all; NaN are left out."""
+        chosen = self._of(difficulty, kind)
+        return {name: _mean([one.figures[name] for one in chosen]) for name in self.captures[0].figures}
+
+    def joint_errors(self, *, difficulty: str | None = None) -> Float[np.ndarray, "21"]:
+        """Mean over captures of each joint's error [m]."""
+        errors = np.array([one.joint_errors for one in self._of(difficulty, None)])
+        return np.array([_mean(column) for column in errors.T])
+
+    def _of(self, difficulty: str | None, kind: str | None) -> list[CaptureScore]:
+        return [
+            one
+            for one in self.captures
+            if difficulty in (None, one.capture.difficulty) and kind in (None, one.capture.kind)
+        ]
+
+
+def score_results(benchmark: Benchmark, results: Path, *, done: Callable[[], None] | None = None) -> Score:
+    """Compare results with the truth.
+
+    Args:
+        benchmark: The benchmark.
+        results: Folder of results, see `benchmarks.public.results`.
+        done: Called after each capture.
+
+    Raises:
+        BenchmarkError: A file is damaged or does not fit its capture.
+
+    Warns:
+        HandSimWarning: A capture has no results and counts as zero; a file is of no capture.
+    """
+    names = label_names()
+    found, unknown = find_results(results, [one.name for one in benchmark.captures])
+    _tell(results, [one.name for one in benchmark.captures if one.name not in found], unknown)
+    scores: list[CaptureScore | None] = []
+    for one in benchmark.captures:
+        if one.name in found:
+            capture, truth = benchmark.capture(one.name), benchmark.truth(one.name)
+            result = read_result(found[one.name], capture, names)
+            present = np.isfinite(capture.positions[..., 0])
+            scores.append(score_capture(one, result, truth, present, len(names)))
+        else:
+            scores.append(None)
+        if done is not None:
+            done()
+    posed = any(score is not None and not np.isnan(score.figures["posed"]) for score in scores)
+    return Score(
+        benchmark,
+        tuple(_completed(one, score, posed) for one, score in zip(benchmark.captures, scores, strict=True)),
+    )
+
+
+def score_capture(
+    capture: BenchmarkCapture,
+    result: Answers,
+    truth: Answers,
+    present: Bool[np.ndarray, "T N"],
+    num_labels: int,
+) -> CaptureScore:
+    """Compare a result with the truth of its capture.
+
+    Args:
+        capture: The capture.
+        result: Labels, joints and angles that were given, of as many frames and columns.
+        truth: The true ones.
+        present: Where the capture has points.
+        num_labels: Number of labels.
+    """
+    counts = LabelCounts()
+    for given, true, here in zip(result.labels, truth.labels, present, strict=True):
+        counts.add(given[here].astype(np.int64), true[here].astype(np.int64), num_labels)
+    errors = np.full(NUM_KEYPOINTS, np.nan)
+    posed, near, mpjpe, angle = (np.nan,) * 4
+    if result.joints is not None and truth.joints is not None:
+        apart = np.linalg.norm(result.joints.astype(np.float64) - truth.joints, axis=-1)
+        there = np.isfinite(apart)
+        posed, near = float(there.mean()), float((apart <= NEAR).mean())
+        mpjpe = _mean(apart)
+        errors = np.array([_mean(apart[..., joint]) for joint in range(NUM_KEYPOINTS)])
+    if result.angles is not None and truth.angles is not None:
+        angle = _mean(np.abs(result.angles.astype(np.float64) - truth.angles))
+    figures = {
+        **counts.figures(),
+        "posed": posed,
+        "within_5mm": near,
+        "mpjpe": mpjpe,
+        "angle_error": angle,
+    }
+    return CaptureScore(capture, figures, errors)
+
+
+def _completed(capture: BenchmarkCapture, score: CaptureScore | None, posed: bool) -> CaptureScore:
+    """A score with zeros for what these results lack.
+
+    Args:
+        capture: The capture.
+        score: Its score; None if it has no results.
+        posed: Whether the results of any capture have joints.
+    """
+    zeros = dict.fromkeys(POSE_SHARES, 0.0) if posed else {}
+    if score is None:
+        shares = dict.fromkeys(LabelCounts().figures(), 0.0)
+        # Those of the capture itself are no merit of a result.
+        shares |= dict.fromkeys(("occlusion_ratio", "ghost_ratio"), np.nan)
+        figures = shares | dict.fromkeys((*POSE_SHARES, "mpjpe", "angle_error"), np.nan) | zeros
+        return CaptureScore(capture, figures, np.full(NUM_KEYPOINTS, np.nan), missing=True)
+    if np.isnan(score.figures["posed"]):
+        return dataclasses.replace(score, figures=score.figures | zeros)
+    return score
+
+
+def _tell(results: Path, missing: Sequence[str], unknown: Sequence[str]) -> None:
+    """Tell of captures without results, and of files of no capture."""
+    if missing:
+        count = f"{len(missing)} capture{'s' * (len(missing) != 1)}"
+        told = f"{results}: no results of {count}, which count as zero: {_few(missing)}"
+        warnings.warn(told, HandSimWarning, stacklevel=3)
+    if unknown:
+        told = f"{results}: not counted, because they are of no capture of this benchmark: {_few(unknown)}"
+        warnings.warn(told, HandSimWarning, stacklevel=3)
+
+
+def _few(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_TOLD} more" if len(names) > _MOST_TOLD else ""
+    return ", ".join(names[:_MOST_TOLD]) + more
+
+
+def _mean(values: Sequence[float] | Float[np.ndarray, "*shape"]) -> float:
+    """Mean of what is not NaN; NaN if there is nothing."""
+    array = np.asarray(values, dtype=np.float64)
+    return float(np.nanmean(array)) if np.isfinite(array).any() else np.nan

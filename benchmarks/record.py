@@ -1,0 +1,102 @@
+"""What benchmarks keep: their figures as JSON, with the commit, the machine and the date."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Mapping
+from datetime import date
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+
+from handsim import __version__
+
+FOLDER: Final = Path(__file__).with_name("figures")
+Figures = dict[str, tuple[str, Any]]
+"""What each figure is, with its unit, and its value, by its name: a number, or lists of numbers."""
+
+
+def describe(*packages: str) -> str:
+    """One line: versions, processor, cores."""
+    versions = [f"handsim {__version__}"]
+    versions += [f"{name} {metadata.version(name)}" for name in ("numpy", *packages)]
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    models = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    processor = models[0] if models else platform.processor() or platform.machine()
+    return f"Python {platform.python_version()}, {', '.join(versions)}; {processor}, {os.cpu_count()} cores"
+
+
+def add_save(parser: argparse.ArgumentParser) -> None:
+    """Add the option `--save NAME`, whose value is the first argument of `save_figures`."""
+    what = "keep the figures as benchmarks/figures/NAME.json, of which make results makes docs/results.md"
+    parser.add_argument("--save", metavar="NAME", help=what)
+
+
+def save_figures(name: str | None, figures: Figures, folder: Path = FOLDER) -> Path | None:
+    """Write the figures of one benchmark, in place of those that its file had.
+
+    Args:
+        name: Name of the file, without its ending; None writes nothing.
+        figures: The figures.
+        folder: Folder of the files.
+
+    Returns:
+        The file.
+    """
+    if name is None:
+        return None
+    path = folder / f"{name}.json"
+    # Where somebody keeps data is nobody's business, and tells nothing.
+    words = [Path(word).name if os.path.isabs(word) else word for word in sys.argv[1:]]
+    main = getattr(sys.modules["__main__"], "__spec__", None)
+    module = main.name.removesuffix(".__main__") if main is not None else sys.argv[0]
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short=7", "HEAD"], cwd=FOLDER, capture_output=True, text=True, check=True
+    )
+    head = {
+        "command": f"python -m {module} {shlex.join(words)}".strip(),
+        "commit": commit.stdout.strip(),
+        "machine": describe(),
+        "date": date.today().isoformat(),
+    }
+    rows = {key: {"what": what, "value": _rounded(value)} for key, (what, value) in figures.items()}
+    path.write_text(file_text(head, rows), "utf-8")
+    return path
+
+
+def file_text(head: Mapping[str, str], figures: Mapping[str, Any]) -> str:
+    """A file's JSON, a line for each figure."""
+    lines = [f" {json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}," for key, value in head.items()]
+    rows = [f"  {json.dumps(key)}: {json.dumps(one, ensure_ascii=False)}" for key, one in figures.items()]
+    return "\n".join(["{", *lines, ' "figures": {', ",\n".join(rows), " }", "}", ""])
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers to six digits, also in lists; None where there is no number."""
+    if isinstance(value, str | None):
+        return value
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_rounded(one) for one in value]
+    number = float(f"{float(value):.6g}")
+    if not np.isfinite(number):
+        return None
+    return int(number) if number.is_integer() else number
+
+
+def load_figures(folder: Path = FOLDER) -> dict[str, SimpleNamespace]:
+    """The values of all figures: `load_figures()["table5"].right_size[1]`."""
+    found = {}
+    for path in sorted(folder.glob("*.json")):
+        figures = json.loads(path.read_text("utf-8"))["figures"]
+        found[path.stem] = SimpleNamespace(**{name: one["value"] for name, one in figures.items()})
+    return found

@@ -1,0 +1,314 @@
+"""Where jobs leave their files: a folder, or a folder of an object store, of which the rest is made here."""
+
+from __future__ import annotations
+
+import platform
+import re
+import shutil
+import tempfile
+import zlib
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from upath import UPath
+
+from handsim.app.workers import Job
+from handsim.errors import ArgumentError, HandSimError
+from handsim.files.atomic import remove_abandoned, remove_leftovers, temporary_beside
+from handsim.files.inputs import checksum
+from handsim.files.json_files import claim
+
+Make = Callable[[Path, int], int]
+"""Takes a folder and a number, leaves the number's files in the folder, and returns the number."""
+Place = Path | UPath
+"""A folder of this machine, or of an object store."""
+_EXTRA: Final = "object-stores"
+_PASSWORD: Final = re.compile(r"[^/@]*:[^/]*@")
+_HERE: Final = ("", "file", "local")
+_AGAIN: Final = "what is there stays, and the same command goes on after it"
+
+
+def place_of(out: str | Place) -> Place:
+    """What a name stands for: a folder, or a folder of an object store, as s3://bucket/prefix.
+
+    Raises:
+        ArgumentError: It is neither.
+    """
+    if isinstance(out, Path) or (isinstance(out, str) and "://" not in out):
+        return Path(out)
+    wrong = f"the address is '{str(out)[:200]}', expected"
+    if not isinstance(out, str | UPath):
+        raise ArgumentError(f"{wrong} a folder, or one like s3://bucket/prefix")
+    protocol, _, path = str(out).partition("://")
+    if _PASSWORD.match(path):  # it would be in messages, and be sent to workers
+        raise ArgumentError(
+            f"the {protocol}:// address holds a password; credentials come from the environment"
+        )
+    try:
+        place = UPath(out)
+    except ValueError as error:
+        raise ArgumentError(f"{wrong} one like s3://bucket/prefix: {error}") from error
+    if place.protocol in _HERE and not isinstance(place, Path):
+        return Path(place.path)
+    if isinstance(place, Path) or not path.strip("/"):
+        raise ArgumentError(f"{wrong} one like s3://bucket/prefix")
+    if "::" in str(out) or ".." in path.split("/"):
+        raise ArgumentError(f"{wrong} one without :: and ..")
+    return place
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """A folder that all jobs write to.
+
+    Where that is in an object store, each job writes to a folder of its own, wherever it is done, and puts
+    the files into the store, those last that say that it is finished. What is made of all jobs is made in a
+    folder here, out of what `fetch` brings, and then put too.
+    """
+
+    place: Place
+    """Where the files shall be."""
+    folder: Path
+    """The same, or the folder here that stands for it."""
+    _claimed: list[str] = field(default_factory=list)
+    _fetched: set[str] = field(default_factory=set)
+
+    def __str__(self) -> str:
+        return str(self.place)
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it is a folder of this machine."""
+        return self.place is self.folder
+
+    def claim(
+        self,
+        name: str,
+        settings: dict[str, Any],
+        *,
+        noun: str,
+        error: type[HandSimError],
+        grows: str = "",
+        result: str | None = None,
+    ) -> None:
+        """Claim the folder by a settings file, see `handsim.files.json_files.claim`.
+
+        Args:
+            name: The settings file.
+            settings: What decides the content.
+            noun: What the folder holds, for messages.
+            error: Class of the error.
+            grows: A setting that may be larger than before.
+            result: A file that is true for the old settings only.
+
+        Raises:
+            HandSimError: Of class `error`: the `noun` there has other settings, or something else is there.
+        """
+        path = self.folder / name
+        if self.is_here:
+            old = None if result is None else self.folder / result
+            claim(path, settings, noun=noun, error=error, grows=grows, result=old)
+        else:
+            found = self.sizes()
+            if found and name not in found:
+                raise error(f"{self} is not empty and holds no {noun}; name another folder")
+            self.fetch(name)
+            before = path.read_bytes() if path.is_file() else b""
+            claim(path, settings, noun=noun, error=error, grows=grows, shown=str(self))
+            if path.read_bytes() != before:
+                if result in found:
+                    with _one_sentence(self.place, "removing"):
+                        (self.place / str(result)).unlink()
+                _put(self.place, self.folder, [name])
+        self._claimed.append(name)
+        self._fetched.add(name)
+
+    def job(self, make: Make, *, last: Sequence[str] = ()) -> Job:
+        """A job that writes to the claimed folder.
+
+        Args:
+            make: What to do.
+            last: Patterns of the files that say that a job is finished, whose content is then complete.
+        """
+        name = self._claimed[0]
+        if isinstance(self.place, Path):
+            return _FolderJob(make, self.folder, name, checksum(self.folder / name))
+        return _StoredJob(make, self.place, tuple(last), self.folder.parent)
+
+    def sizes(self) -> dict[str, int]:
+        """Names of all files there and their lengths [bytes].
+
+        Raises:
+            HandSimError: The store does not answer or refuses.
+        """
+        if self.is_here:
+            return {name: (self.folder / name).stat().st_size for name in _files_in(self.folder)}
+        with _one_sentence(self.place, "listing"):
+            system, start = self.place.fs, self.place.path.rstrip("/") + "/"  # type: ignore[union-attr]
+            system.invalidate_cache()  # other machines write there too
+            try:
+                found = system.find(start, detail=True)
+            except FileNotFoundError:
+                return {}
+        names = {path.removeprefix(start): about["size"] for path, about in found.items()}
+        return {name: int(size) for name, size in names.items() if _is_inside(name)}
+
+    def fetch(self, *patterns: str, names_of: Sequence[str] = ()) -> None:
+        """Have files in the folder here that match patterns, and empty ones where the name is enough.
+
+        Raises:
+            HandSimError: The store does not give them.
+        """
+        if self.is_here:
+            return
+        lacking = [name for name in self.sizes() if not (self.folder / name).exists()]
+        wanted = [name for name in lacking if _matches(name, patterns)]
+        for name in lacking:
+            (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            if _matches(name, names_of):
+                (self.folder / name).touch()
+                self._fetched.add(name)
+        self._fetched.update(wanted)
+        _transfer("get", self.place, {str(self.place / name): str(self.folder / name) for name in wanted})
+
+    def checksum(self, name: str) -> str:
+        """SHA-256 of a file there.
+
+        Raises:
+            HandSimError: It is gone, or the store does not give it.
+        """
+        if self.is_here:
+            return checksum(self.folder / name)
+        with _one_sentence(self.place, f"reading {name}"):
+            return checksum(self.place / name)
+
+    def publish(self, last: str) -> None:
+        """Put all files that were made in the folder here, one of them after all others."""
+        if not self.is_here:
+            made = [name for name in _files_in(self.folder) if name not in self._fetched]
+            _put(self.place, self.folder, [name for name in made if name != last])
+            _put(self.place, self.folder, [name for name in made if name == last])
+
+
+@contextmanager
+def open_output(out: str | Place) -> Iterator[Output]:
+    """Where the files of jobs go; what workers left that died or were ended is removed after the block.
+
+    Raises:
+        ArgumentError: There is no such place, or what an object store needs is not installed.
+    """
+    place = place_of(out)
+    if isinstance(place, Path):
+        output = Output(place, place)
+        try:
+            yield output
+        finally:
+            if output._claimed:
+                remove_leftovers(place)
+        return
+    _check_store(place)
+    name = Path(tempfile.gettempdir(), f"handsim-{zlib.crc32(str(place).encode()):08x}")
+    remove_abandoned(name)  # of a run that was killed
+    here = temporary_beside(name)
+    try:
+        (here / "output").mkdir(mode=0o700, parents=True)
+        yield Output(place, here / "output")
+    finally:
+        shutil.rmtree(here, ignore_errors=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _FolderJob:
+    """A job that writes to a folder, which whoever does it must see as the one who asks for it does."""
+
+    make: Make
+    folder: Path
+    claimed: str
+    """The settings file there."""
+    content: str
+    """Its checksum."""
+
+    def __call__(self, number: int) -> int:
+        path = self.folder / self.claimed
+        if not path.is_file() or checksum(path) != self.content:
+            raise HandSimError(
+                f"the worker on {platform.node()} does not see the files in {self.folder}; write to a folder "
+                "that all workers share, under the same path"
+            )
+        return self.make(self.folder, number)
+
+
+@dataclass(frozen=True, slots=True)
+class _StoredJob:
+    """A job whose files go into a store."""
+
+    make: Make
+    store: UPath
+    last: tuple[str, ...]
+    near: Path
+    """Where to have its folder, if this machine has that: it is removed at the end of the run."""
+
+    def __call__(self, number: int) -> int:
+        _check_store(self.store)  # before the work
+        near = self.near if self.near.is_dir() else None
+        with tempfile.TemporaryDirectory(prefix="handsim-", dir=near) as name:
+            folder = Path(name)
+            self.make(folder, number)
+            files = _files_in(folder)
+            _put(self.store, folder, [file for file in files if not _matches(file, self.last)])
+            _put(self.store, folder, [file for file in files if _matches(file, self.last)])
+        return number
+
+
+def _check_store(store: UPath) -> None:
+    """Load what an address needs."""
+    try:
+        with _one_sentence(store, "opening"):
+            store.fs  # noqa: B018
+    except ImportError as error:
+        raise ArgumentError(
+            f"{store} needs a package that cannot be imported ({' '.join(str(error).split())}); "
+            f"for s3:// run `pip install 'handsim[{_EXTRA}]'`"
+        ) from error
+
+
+def _put(store: Place, folder: Path, names: Collection[str]) -> None:
+    """Put files of a folder; each object is there with all its bytes, or as it was before."""
+    _transfer("put", store, {str(folder / name): str(store / name) for name in names})
+
+
+def _transfer(method: str, store: Place, pairs: dict[str, str]) -> None:
+    """Have the file system of a store get or put files, several at a time."""
+    if pairs:
+        with _one_sentence(store, "writing" if method == "put" else "reading"):
+            getattr(store.fs, method)(list(pairs), list(pairs.values()))  # type: ignore[union-attr]
+
+
+@contextmanager
+def _one_sentence(store: Place, doing: str) -> Iterator[None]:
+    """Tell trouble with a store in one sentence: each protocol has errors of its own."""
+    try:
+        yield
+    except ImportError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise HandSimError(f"{store}: {doing} failed: {reason}; {_AGAIN}") from error
+
+
+def _files_in(folder: Path) -> list[str]:
+    """Names of all files below a folder, in order."""
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def _matches(name: str, patterns: Sequence[str]) -> bool:
+    return any(PurePosixPath(name).match(pattern) for pattern in patterns)
+
+
+def _is_inside(name: str) -> bool:
+    """Whether an object's name is that of a file in a folder."""
+    parts = PurePosixPath(name).parts
+    return bool(parts) and "/".join(parts) == name and not {"..", "/"} & set(parts)

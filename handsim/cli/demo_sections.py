@@ -1,0 +1,290 @@
+"""What `handsim demo` runs and shows: each function makes a section of the page, out of what others made."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from handsim import __version__
+from handsim.app.page import Section
+from handsim.hand.model import HandModel, join_qpos
+from handsim.space.cameras import load_rig
+from poses.shapes.library import gesture
+from render.config import RenderConfig
+from render.drawing import draw
+from render.illustrations.captions import write_png
+from render.illustrations.contact_sheet import contact_sheet
+from render.illustrations.hands import draw_camera, draw_gestures, draw_glove, draw_labels, draw_sizes
+from render.illustrations.scene import PosedHand
+from track.capture_tracking import track_capture
+from train.data.augmentation import Corruption, corrupt
+from train.data.shards import Dataset
+from train.evaluate import CLEAN, evaluate_labeler
+from train.glove_labeler import load_labeler
+from train.labelers.protocol import Labeler
+from train.simulation.generation import generate_dataset
+from train.simulation.takes import simulate_take
+
+GLOVE: Final = "dense19"
+GESTURES: Final = ("fist", "spread", "pinch_index", "relaxed", "pinch_little")
+"""Drawn in a row; the last one is the thumb's opposition to the little finger."""
+_RAISED: Final = np.deg2rad(35.0)
+_CAMERA: Final = 4
+_PICTURES: Final = 6
+_TRACKED: Final = 120  # frames of the capture
+_PAPER: Final = Corruption(occlude=5, ghosts=2)  # Han et al. 2018, section 5
+_TIMED: Final = 1024  # frames that are labeled at once to time the labeler
+_CANDIDATES: Final = 400  # frames among which the shown one is chosen
+
+# The figures on the page, and the ratio that is zero where there was nothing to find.
+_SHOWN: Final = {
+    "slot_accuracy": "",
+    "point_accuracy": "",
+    "occlusion_precision": "occlusion_ratio",
+    "occlusion_recall": "occlusion_ratio",
+    "ghost_precision": "ghost_ratio",
+    "ghost_recall": "ghost_ratio",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class LabeledFrame:
+    """One frame of the set with the labels that the labeler gave it."""
+
+    points: Float[np.ndarray, "N 3"]
+    """[m]"""
+    labels: Int[np.ndarray, "N"]
+    truth: Int[np.ndarray, "N"]
+    seen: Bool[np.ndarray, "M"]
+    """Which markers the rig sees."""
+    hand: PosedHand
+
+
+@dataclass(frozen=True, slots=True)
+class DemoFigures:
+    """The labeler's figures on the set, and speeds [frames/s]."""
+
+    columns: dict[str, dict[str, float]]
+    generated_per_second: float
+    labeled_per_second: float
+    frame: LabeledFrame
+
+
+def demo_sections(
+    out: Path, work: Path, *, seed: int, num_frames: int, report: Callable[[str], None]
+) -> Iterator[Section]:
+    """Run the whole chain; the sections of the page in order, their pictures written to `out`.
+
+    Args:
+        out: Folder of the page.
+        work: Folder for the training set, which may go afterwards.
+        seed: Of the generated frames and of everything drawn at random.
+        num_frames: Frames to generate and label.
+        report: Shows what is being done.
+    """
+    labeler = load_labeler(GLOVE)  # first, so that a missing labeler is reported before any work
+    report("drawing hands")
+    yield _draw_hands(out)
+    report("drawing the glove")
+    yield _draw_worn_glove(out)
+    report("drawing what a camera sees")
+    yield _draw_camera_view(out)
+    figures = _generate_and_label(work, labeler, seed, num_frames, report)
+    report("drawing a labeled frame")
+    yield _draw_labeled_frame(out, figures.frame)
+    report("tracking a simulated capture")
+    yield _track_and_draw(out, labeler, seed)
+    yield _figures_section(figures, seed, num_frames)
+
+
+def _draw_hands(out: Path) -> Section:
+    """The five sizes, and some gestures."""
+    write_png(out / "sizes.png", draw_sizes())
+    write_png(out / "gestures.png", draw_gestures(HandModel.named("M"), GESTURES))
+    return Section(
+        "The hand",
+        "A MuJoCo hand of 26 degrees of freedom. Its skeleton, flesh and skin follow from its measures.",
+        pictures=[
+            ("sizes.png", "Five sizes, length by breadth, at one scale."),
+            ("gestures.png", "Some of the named gestures; the last one opposes thumb and little finger."),
+        ],
+    )
+
+
+def _draw_worn_glove(out: Path) -> Section:
+    """The glove from two sides, with the names of its markers."""
+    fit = nominal_fit(load_layout(GLOVE), "M", "right")
+    write_png(out / "glove.png", draw_glove(fit, sides=("back", "thumb side")))
+    return Section(
+        "The glove",
+        f"{GLOVE}: {fit.layout.num_markers} markers of {2e3 * fit.layout.radius:.1f} mm that move with the "
+        "skin. The same file fits every hand. A layout of your own is one TOML file: "
+        "<code>handsim glove new</code>.",
+        pictures=[("glove.png", "Names of the markers that each side shows, colored by digit.")],
+    )
+
+
+def _draw_camera_view(out: Path) -> Section:
+    """What one camera of the rig sees of a raised hand."""
+    fit, rig = nominal_fit(load_layout(GLOVE), "M", "right"), load_rig("figure5")
+    raised = np.array(
+        [np.cos(_RAISED / 2), 0.0, -np.sin(_RAISED / 2), 0.0]
+    )  # about y: fingers up, back of the hand behind
+    qpos = join_qpos(gesture("ok")[None], position=np.array([0.0, 0.0, 1.1]), quaternion=raised)[0]
+    picture, seen = draw_camera(fit, qpos, rig, _CAMERA)
+    write_png(out / "camera.png", picture)
+    return Section(
+        "What a camera sees",
+        "A ray from every marker to every camera, tested against the hand's own flesh, decides which camera "
+        "sees which marker. A marker gives a point when at least two cameras see it.",
+        pictures=[
+            (
+                "camera.png",
+                f"Camera {_CAMERA + 1} of {len(rig.positions)} of the rig, zoomed in: {int(seen.sum())} "
+                f"markers seen (green), {int((~seen).sum())} turned away or hidden (red).",
+            )
+        ],
+    )
+
+
+def _generate_and_label(
+    work: Path, labeler: Labeler, seed: int, num_frames: int, report: Callable[[str], None]
+) -> DemoFigures:
+    """Generate a small training set, label it clean and corrupted, and keep one labeled frame."""
+
+    def tell(done: int, total: int) -> None:
+        report(f"generating frames: {done} of {total}")
+
+    start = time.perf_counter()
+    dataset = generate_dataset(work / "dataset", glove=GLOVE, num_frames=num_frames, seed=seed, progress=tell)
+    seconds = time.perf_counter() - start
+    columns = {}
+    for title, corruption in (("clean", CLEAN), ("occluded", _PAPER)):
+        report(f"labeling {num_frames} frames, {title}")
+        rng = np.random.default_rng(seed)
+        columns[title] = evaluate_labeler(labeler, dataset, corruption, rng=rng).figures
+    report("timing the labeler")
+    clouds = list(dataset.rows()["markers"][:_TIMED].astype(np.float64))
+    start = time.perf_counter()
+    labeler.label_frames(clouds)
+    labeled = len(clouds) / (time.perf_counter() - start)
+    return DemoFigures(columns, num_frames / seconds, labeled, _labeled_frame(dataset, labeler, seed))
+
+
+def _labeled_frame(dataset: Dataset, labeler: Labeler, seed: int) -> LabeledFrame:
+    """One frame with ghosts and its labels."""
+    rows = dataset.rows()
+    row = rows[_clear_frame(rows)]
+    cloud = corrupt(
+        row["observed"][None].astype(np.float64),
+        Corruption(0, _PAPER.ghosts),
+        ghosts=row["ghosts"][None].astype(np.float64),
+        rng=np.random.default_rng(seed),
+    )
+    present = cloud.present[0]
+    points = cloud.points[0][present]
+    model = HandModel(dataset.hands(0)[int(row["hand"])])
+    return LabeledFrame(
+        points=points,
+        labels=labeler.label_frames([points])[0].labels,
+        truth=cloud.truth[0][present],
+        seen=np.isfinite(row["observed"][:, 0]),
+        hand=PosedHand(model, row["qpos"].astype(np.float64), covering="glove"),
+    )
+
+
+def _clear_frame(rows: np.ndarray) -> int:
+    """An early frame with hidden markers, whose seen markers lie well apart when viewed from the back."""
+    best, widest = 0, -1.0
+    model = HandModel.named("M")
+    for number in range(min(_CANDIDATES, len(rows))):
+        row = rows[number]
+        seen = np.isfinite(row["observed"][:, 0])
+        if not 0.7 * len(seen) <= seen.sum() < len(seen):
+            continue
+        wrist = model.forward_kinematics(row["qpos"][None].astype(np.float64))[0, 0, :3, :3]
+        flat = row["markers"][seen] @ wrist[:, :2]
+        distances = np.linalg.norm(flat[:, None] - flat, axis=-1) + np.eye(len(flat))
+        if distances.min() > widest:
+            best, widest = number, float(distances.min())
+    return best
+
+
+def _draw_labeled_frame(out: Path, frame: LabeledFrame) -> Section:
+    """One frame as it comes, and with the labels that the labeler gave it."""
+    write_png(out / "labels.png", draw_labels(frame.hand, frame.points, frame.labels, load_layout(GLOVE)))
+    right = int((frame.labels == frame.truth).sum())
+    return Section(
+        "A frame and its labels",
+        "A frame is a set of points in random order: some markers are hidden, some points are ghosts, which "
+        "no marker made. The labeler labels each point from this one frame alone.",
+        pictures=[
+            (
+                "labels.png",
+                f"Left: the labeler's input, {len(frame.points)} points; ghosts: "
+                f"{int((frame.truth < 0).sum())}, hidden markers: {int((~frame.seen).sum())}. Right: its "
+                f"labels, {right} of {len(frame.points)} right; the hand behind them is the simulation's.",
+            )
+        ],
+    )
+
+
+def _track_and_draw(out: Path, labeler: Labeler, seed: int) -> Section:
+    """Track a simulated capture of two hands, say how far its joints are off, and draw it."""
+    take = simulate_take("hand-hand", num_frames=_TRACKED, seed=seed)
+    tracked = track_capture(take.capture(), hands=take.hands, labeler=labeler)
+    errors = []
+    for number, hand in enumerate(take.hands):
+        model, found = hand.model, tracked.motion(hand.side).qpos
+        joints = [model.forward_kinematics(qpos)[..., :3, 3] for qpos in (found, take.qpos[:, number])]
+        errors.append(1e3 * np.linalg.norm(joints[0] - joints[1], axis=-1).mean())
+    frames = np.linspace(0, tracked.num_frames - 1, _PICTURES).astype(int).tolist()
+    drawn = draw(tracked, config=RenderConfig(seed=seed, vary="frame"), frames=frames)
+    write_png(out / "pictures.png", contact_sheet(list(drawn)))
+    return Section(
+        "Tracked hands, drawn",
+        f"A simulated capture of two hands, {_TRACKED} frames, is labeled and tracked. The mean error of the "
+        f"joints is {np.mean(errors):.2f} mm. The tracked hands are drawn, with the truth of every pixel.",
+        pictures=[("pictures.png", "Colors with keypoints, and depth of a time-of-flight sensor.")],
+    )
+
+
+def _figures_section(figures: DemoFigures, seed: int, num_frames: int) -> Section:
+    """The figures of this run as a table, with speeds and versions."""
+    versions = ", ".join(
+        f"{package} {metadata.version(package)}"
+        for package in ("mujoco", "numpy", "torch", "pyrender-maintained")
+    )
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return Section(
+        "Figures of this run",
+        f"{num_frames} freshly generated frames (seed {seed}) of random people, none of whom is in the "
+        f"training set. Occluded: 0 to {_PAPER.occlude} markers dropped and 0 to {_PAPER.ghosts} ghosts per "
+        "frame.",
+        table=_table(figures.columns),
+        notes=[
+            f"generated {figures.generated_per_second:,.0f} frames/s (start included), "
+            f"labeled {figures.labeled_per_second:,.0f} frames/s, on {cores} CPU cores",
+            f"handsim {__version__}, Python {platform.python_version()}, {versions}.",
+        ],
+    )
+
+
+def _table(columns: dict[str, dict[str, Any]]) -> list[list[str]]:
+    """Header and rows in percent; a dash where there was nothing to find."""
+    table = [["", *(f"{title} [%]" for title in columns)]]
+    for name, ratio in _SHOWN.items():
+        cells = ("-" if ratio and not one[ratio] else f"{100 * one[name]:.2f}" for one in columns.values())
+        table.append([name.replace("_", " ").capitalize(), *cells])
+    return table

@@ -1,0 +1,71 @@
+"""Space on the disk and memory of the machine, asked for before the work."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Final
+
+from handsim.errors import ArgumentError, HandSimError
+
+_UNITS: Final = ("bytes", "kB", "MB", "GB", "TB", "PB", "EB")
+
+
+def check_free(folder: Path, needed: int, what: str, remedy: str, *, error: type[HandSimError]) -> None:
+    """Refuse work that the disk has no space for.
+
+    Args:
+        folder: Where files will be; it need not exist yet.
+        needed: Bytes still to be written.
+        what: What needs them, for the message, in the plural.
+        remedy: What to do beside freeing space, as in `ask for fewer frames`.
+        error: Class of the error.
+    """
+    there = folder.absolute()
+    while not there.exists():
+        there = there.parent
+    free = shutil.disk_usage(there).free
+    if needed > free:
+        raise error(
+            f"{what} need {shown_bytes(needed)}, but the disk of {folder} has {shown_bytes(free)} free; "
+            f"{remedy} or name a folder on another disk"
+        )
+
+
+def check_memory(needed: int, what: str, remedy: str) -> None:
+    """Refuse work that the machine has no memory for.
+
+    Args:
+        needed: Bytes that will be held at a time.
+        what: What needs them, for the message, in the plural.
+        remedy: What to do, as in `ask for fewer frames`.
+
+    Raises:
+        ArgumentError: The machine has less than that free.
+    """
+    free = available_bytes()
+    if needed > free:
+        raise ArgumentError(
+            f"{what} need {shown_bytes(needed)} of memory, but {shown_bytes(free)} are free; {remedy}"
+        )
+
+
+def available_bytes() -> int:
+    """Memory to be had without swapping [bytes]; all that is built in where the system tells no more."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    for line in lines:
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def shown_bytes(count: float) -> str:
+    """A number of bytes with a unit that suits it."""
+    unit = 0
+    while count >= 1000.0 and unit < len(_UNITS) - 1:
+        count, unit = count / 1000.0, unit + 1
+    return f"{count:.3g} {_UNITS[unit]}"

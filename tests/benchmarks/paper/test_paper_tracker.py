@@ -1,0 +1,208 @@
+"""The paper's loop on simulated captures: how it begins, what it carries on, what it names anew."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from benchmarks.paper.paper_tracker import GATE, PaperTracker
+from benchmarks.paper.take_evaluation import evaluate_tracker, seen_frame, true_users
+from benchmarks.paper.trials import hide_points
+from gloves.fit import GloveFit
+from gloves.takes.take import Take
+from handsim.hand.topology import JOINT_NAMES
+from track.tracked_frame import Status, TrackedFrame
+from train.glove_labeler import load_labeler
+from train.labelers.protocol import Labeling
+from train.simulation.takes import simulate_take
+
+
+class Asked:
+    """A labeler that counts the clouds it is asked about."""
+
+    def __init__(self) -> None:
+        self.labeler, self.clouds = load_labeler("dense19"), 0
+        self.marker_names = self.labeler.marker_names
+
+    def label_frames(self, frames: Sequence[np.ndarray]) -> list[Labeling]:
+        self.clouds += len(frames)
+        return self.labeler.label_frames(frames)
+
+
+@pytest.fixture(scope="module")
+def labeler():
+    return Asked()
+
+
+@pytest.fixture(scope="module")
+def take() -> Take:
+    return simulate_take(kind="hand-controller", num_frames=240).without_body()
+
+
+@pytest.fixture(scope="module")
+def users(take) -> list[GloveFit]:
+    return true_users(take)
+
+
+@pytest.fixture(scope="module")
+def still(take) -> Take:
+    """A frame of which every marker is seen, standing still."""
+    frame = int(np.flatnonzero(take.markers_present().all(axis=1))[0])
+    part = take.cut(frame, frame + 1)
+    arrays = (part.qpos, part.points, part.ids, part.labels)
+    qpos, points, ids, labels = (np.repeat(array, 40, axis=0) for array in arrays)
+    return Take.of_truth(part.hands, qpos, points, ids, labels, rate=part.rate)
+
+
+def run(tracker: PaperTracker, take: Take) -> list[TrackedFrame]:
+    frames = []
+    for number in range(take.num_frames):
+        seen = seen_frame(take, number)
+        frames.append(tracker.step(seen.points, seen.ids, number / take.rate))
+    return frames
+
+
+def settled(users, labeler, still) -> PaperTracker:
+    """A tracker that has both hands."""
+    tracker = PaperTracker(users, labeler, rng=np.random.default_rng(1))
+    assert np.array_equal(run(tracker, still)[-1].labels, seen_frame(still, 0).labels)
+    return tracker
+
+
+def without(still: Take, marker: int, *, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A frame with a marker back under another ID, off by so much; or without it."""
+    seen = seen_frame(still, 0)
+    points, ids = seen.points.copy(), seen.ids.copy()
+    points[seen.labels == marker, 0] += shift
+    ids[seen.labels == marker] = 10_000
+    return points, ids, seen.labels
+
+
+def test_hands_are_found_and_followed(take, users, labeler):
+    tracker = PaperTracker(users, labeler, rng=np.random.default_rng(3))
+    report = evaluate_tracker(take, users, tracker)
+    assert report.valid[20:].all(), "both hands are found within a few frames"
+    assert report.right[20:].mean() >= 0.95
+    assert np.nanmean(report.joint_error) < 0.0005
+
+
+def test_sides_are_drawn_and_a_wrong_one_is_thrown_away(users, labeler, still):
+    first = []
+    for seed in range(12):
+        tracker = PaperTracker(users, labeler, rng=np.random.default_rng(seed))
+        frames = run(tracker, still)
+        first.append([hand.status for hand in frames[0].hands])
+        assert all(hand.status is Status.TRACKED for hand in frames[-1].hands)
+        assert np.array_equal(frames[-1].labels, seen_frame(still, 0).labels)
+    found = [statuses == [Status.INITIALIZED] * 2 for statuses in first]
+    assert all(statuses in ([Status.INITIALIZED] * 2, [Status.LOST] * 2) for statuses in first)
+    assert 2 <= sum(found) <= 10, "the coin has two sides"
+
+
+def test_the_same_seed_gives_the_same_frames(users, labeler, still):
+    runs = [run(PaperTracker(users, labeler, rng=np.random.default_rng(4)), still) for _ in range(2)]
+    for one, other in zip(*runs, strict=True):
+        np.testing.assert_array_equal(one.labels, other.labels)
+        np.testing.assert_array_equal(one.hands[0].qpos, other.hands[0].qpos)
+
+
+def test_the_labeler_is_asked_only_when_points_are_new(users, labeler, still):
+    tracker = settled(users, labeler, still)
+    before = labeler.clouds
+    run(tracker, still)
+    assert labeler.clouds == before
+    points, ids, labels = without(still, 7)
+    kept = labels != 7
+    assert np.array_equal(tracker.step(points[kept], ids[kept], 1.0).labels, labels[kept])
+    assert labeler.clouds == before, "a marker that goes away is nothing new"
+    assert np.array_equal(tracker.step(points, ids, 1.01).labels, labels)
+    assert labeler.clouds == before + 1, "but one that comes back is, for its hand alone"
+
+
+class Fading(Asked):
+    """A labeler that knows nothing from some time on."""
+
+    silent = False
+
+    def label_frames(self, frames: Sequence[np.ndarray]) -> list[Labeling]:
+        if self.silent:
+            return [Labeling(np.full(len(cloud), -1), np.ones(len(cloud))) for cloud in frames]
+        return super().label_frames(frames)
+
+
+@pytest.mark.parametrize(("shift", "name"), [(0.8 * GATE, 7), (1.2 * GATE, -1)])
+def test_a_marker_that_comes_back_near_its_place_has_its_name_again(shift, name, users, still):
+    labeler = Fading()
+    tracker = settled(users, labeler, still)
+    labeler.silent = True
+    points, ids, labels = without(still, 7, shift=shift)
+    named = tracker.step(points, ids, 1.0).labels
+    assert named[labels == 7] == name
+    assert np.array_equal(named[labels != 7], labels[labels != 7])
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_markers_that_come_back_elsewhere_are_for_the_labeler(silent, users, still):
+    labeler = Fading()
+    tracker = settled(users, labeler, still)
+    labeler.silent = silent
+    seen = seen_frame(still, 0)
+    bent = still.qpos[:1, 0].copy()
+    bent[0, 7 + JOINT_NAMES.index("index_MCP_flexion")] += 0.6
+    model, glove = users[0].model, users[0].attachment
+    places = glove.centers(model, model.forward_kinematics(bent))[0]
+    names = [glove.layout.names.index(name) for name in ("IndexPIP", "IndexTip")]
+    finger = np.isin(seen.labels, names)
+    points, ids = seen.points.copy(), seen.ids.copy()
+    points[finger] = places[seen.labels[finger]]
+    assert np.linalg.norm(points - seen.points, axis=1)[finger].min() > GATE
+    tracker.step(points[~finger], ids[~finger], 1.0)
+    ids[finger] += 10_000
+    named = tracker.step(points, ids, 1.01).labels
+    assert np.array_equal(named, np.where(finger, -1, seen.labels) if silent else seen.labels)
+
+
+def test_poses_of_more_than_8_mm_rms_are_thrown_away(users, labeler, still, rng):
+    tracker = settled(users, labeler, still)
+    seen = seen_frame(still, 0)
+    points = seen.points.copy()
+    mine = seen.labels < 19
+    points[mine] += rng.normal(0.0, 0.03, size=(int(mine.sum()), 3))
+    frame = tracker.step(points, seen.ids, 1.0)
+    assert [hand.status for hand in frame.hands] == [Status.LOST, Status.TRACKED]
+    assert (frame.labels[mine] == -1).all()
+    assert np.isnan(frame.hands[0].qpos).all() and np.isnan(frame.hands[0].markers).all()
+
+
+def test_missing_markers_are_filled_in(users, labeler, still):
+    tracker = settled(users, labeler, still)
+    points, ids, labels = without(still, 7)
+    kept = labels != 7
+    hand = tracker.step(points[kept], ids[kept], 1.0).hands[0]
+    assert hand.filled.tolist() == [7]
+    assert np.linalg.norm(hand.markers[7] - points[labels == 7][0]) < 0.005
+    np.testing.assert_array_equal(hand.markers[3], points[labels == 3][0])
+
+
+def test_hands_are_found_again_after_a_second_without_points(take, users, labeler):
+    frames = run(PaperTracker(users, labeler, rng=np.random.default_rng(0)), hide_points(take, 60, 120))
+    assert all(hand.status is Status.LOST for hand in frames[100].hands)
+    assert all(hand.status is Status.TRACKED for hand in frames[-1].hands)
+    assert np.array_equal(frames[-1].labels, seen_frame(take, 239).labels)
+
+
+def test_points_without_ids_are_found_anew_in_every_frame(users, labeler, still):
+    nameless = dataclasses.replace(still, ids=np.full_like(still.ids, -1))
+    frames = run(PaperTracker(users, labeler, rng=np.random.default_rng(0)), nameless)
+    assert not any(hand.status is Status.TRACKED for frame in frames for hand in frame.hands)
+    assert any(hand.status is Status.INITIALIZED for frame in frames for hand in frame.hands)
+
+
+def test_frames_without_points_are_frames(users, labeler):
+    tracker = PaperTracker(users, labeler, rng=np.random.default_rng(0))
+    frame = tracker.step(np.zeros((0, 3)), np.zeros(0, dtype=int), 0.0)
+    assert len(frame.labels) == len(frame.confidence) == 0
+    assert [hand.status for hand in frame.hands] == [Status.LOST] * 2

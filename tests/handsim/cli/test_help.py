@@ -1,0 +1,42 @@
+"""The help of every command: defaults where there are some, and no type of Python shines through."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from handsim.cli.command_table import COMMANDS, load
+from handsim.cli.main import main
+
+
+def helps() -> list[object]:
+    found = []
+    for name, (target, _) in COMMANDS.items():
+        command = load(target)
+        words = [[name, inner] for inner in command] if isinstance(command, dict) else []
+        found += [pytest.param(one, id=" ".join(one)) for one in [[name], *words]]
+    return found
+
+
+@pytest.mark.parametrize("words", helps())
+def test_help_shows_no_types_and_no_empty_defaults(words, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as stop:
+        main([*words, "--help"])
+    assert not stop.value.code
+    said = re.sub(r"[\s│]+", " ", capsys.readouterr().out)
+    assert f"usage: handsim {words[0]}" in said
+    for odd in ("{None}", "None|", "(default: )", "(default: None)", "(fixed", "~T", "<class"):
+        assert odd not in said, odd
+
+
+@pytest.mark.parametrize("words", [[], ["demo"], ["evaluate"]])
+def test_help_loads_nothing_heavy(words):
+    code = "import sys; from handsim.cli.main import main\ntry: main(sys.argv[1:])\nexcept SystemExit: pass\n"
+    code += "print(sorted(set(sys.modules) & {'torch', 'numba', 'mujoco', 'scipy', 'matplotlib'}))"
+    line = [sys.executable, "-c", code, *words, "--help"]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"

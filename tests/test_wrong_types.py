@@ -1,0 +1,95 @@
+"""A wrong type for any argument of any public function ends in one sentence that names the argument."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+
+import numpy as np
+import pytest
+
+from gloves import Capture
+from handsim import HandModel, HandSimError
+from train import Corruption
+
+PACKAGES = ("handsim", "poses", "gloves", "train")
+WRONG = (5, None, [1, 2], {"a": 1}, object(), 2.5, "no such thing", b"bytes", HandSimError)
+RNG = np.random.default_rng(0)
+QPOS = np.zeros((1, 27)) + np.eye(27)[3]
+CAPTURE = Capture(("a",), np.zeros((1, 1, 3)) + 0.1, 100.0)
+
+
+def flat(model: HandModel, num_poses: int, *, rng: np.random.Generator) -> np.ndarray:
+    return np.zeros((num_poses, 20))
+
+
+VALID: dict[str, dict[str, object]] = {
+    "handsim.join_qpos": {"angles": np.zeros((1, 20))},
+    "handsim.load_rig": {"rig": "six"},
+    "handsim.sample_shape": {"side": "right", "rng": RNG},
+    "poses.load_gestures": {},
+    "poses.sample_motion": {"model": "M", "duration": 0.1, "rng": RNG},
+    "poses.sample_poses": {"model": "M", "num_poses": 1, "sampler": flat, "rng": RNG},
+    "poses.validate": {"model": "M", "qpos": QPOS},
+    "gloves.attach": {"layout": "tips8", "model": "M"},
+    "gloves.load_layout": {"glove": "tips8"},
+    "gloves.load_take": {"path": "gone.npz"},
+    "gloves.read_capture": {"capture": CAPTURE},
+    "gloves.write_capture": {"path": "out.trc", "capture": CAPTURE},
+    "train.corrupt": {"markers": np.zeros((1, 5, 3)), "corruption": Corruption(), "rng": RNG},
+    "train.evaluate_labeler": {"labeler": "dense19", "truth": np.zeros((1, 19, 3)), "every": 1},
+    "train.generate_dataset": {"out": "set", "glove": "tips8", "rig": "six", "num_frames": 10, "seed": 0},
+    "train.load_labeler": {"glove": "dense19"},
+    "train.simulate_take": {"kind": "free", "glove": "tips8", "rig": "six", "num_frames": 2, "seed": 0},
+    "train.train_labeler": {"dataset": "set", "out": "run"},
+}  # fmt: skip
+"""Public functions with arguments that would do; each is then exchanged for wrong ones."""
+
+
+def functions() -> dict[str, object]:
+    found = {}
+    for package in PACKAGES:
+        module = importlib.import_module(package)
+        for name in module.__all__:
+            if inspect.isfunction(getattr(module, name)):
+                found[f"{package}.{name}"] = getattr(module, name)
+    return found
+
+
+def test_every_public_function_stands_in_the_table():
+    assert sorted(functions()) == sorted(VALID)
+
+
+CASES = [
+    pytest.param(name, argument, wrong, id=f"{name}-{argument}-{type(wrong).__name__}")
+    for name, valid in VALID.items()
+    for argument in valid
+    for wrong in WRONG
+]
+
+
+@pytest.mark.parametrize(("name", "argument", "wrong"), CASES)
+def test_a_wrong_type_is_told_in_one_sentence(name, argument, wrong, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    function = functions()[name]
+    default = inspect.signature(function).parameters[argument].default
+    if wrong is default or (wrong is None and default is None):
+        pytest.skip("the default")
+    if is_right(name, argument, wrong):
+        pytest.skip("a value that fits")
+    with pytest.raises(HandSimError) as error:
+        function(**{**VALID[name], argument: wrong})
+    said = str(error.value)
+    assert said and "\n" not in said, said
+    assert not list(tmp_path.iterdir()), "nothing is written"
+
+
+def is_right(name, argument, wrong) -> bool:
+    """Whether a value is a right one after all: numbers where numbers are wanted, any text for a folder."""
+    number = isinstance(wrong, int | float)
+    return (
+        (number and argument in ("duration",))
+        or (isinstance(wrong, int) and argument in ("num_poses", "num_frames", "seed", "every"))
+        or (isinstance(wrong, str) and argument == "out")
+        or (argument == "path" and name == "gloves.load_take" and isinstance(wrong, str))
+    )

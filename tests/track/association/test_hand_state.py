@@ -1,0 +1,133 @@
+"""The filter of one hand: its motion goes on, its markers' biases are learned, forgotten and recalled."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from handsim.hand.model import join_qpos
+from poses.shapes.validity import resting_angles
+from track.association.hand_state import MOST_AGE_LOG_ODDS, SEEN_ELSEWHERE, STRAY_LIFETIME, HandState
+
+RATE, KNUCKLE, TIP = 120.0, 4, 6
+
+
+@pytest.fixture
+def moving() -> HandState:
+    """A hand that has moved at 0.6 m/s for a quarter of a second, every marker being seen."""
+    user = nominal_fit(load_layout("dense19"), "M", "right")
+    state = HandState(user)
+    for frame in range(30):
+        place = np.array([[0.6 * frame / RATE, 0.0, 1.0]])
+        qpos = join_qpos(resting_angles(user.model)[None], position=place)[0]
+        target = state.solver.marker_positions(qpos)
+        if frame == 0:
+            state.initialize(qpos, target, 0.0)
+            continue
+        prediction = state.predict(frame / RATE)
+        state.update(state.fit(target, prediction.qpos, prediction), np.ones(19, dtype=bool), frame / RATE)
+    return state
+
+
+def test_a_motion_goes_on_for_a_while_and_then_the_hand_is_predicted_to_stand(moving):
+    x = moving.qpos[0]
+    ahead = [moving.predict(29 / RATE + span).qpos[0] - x for span in (1 / RATE, 0.05, 0.5)]
+    np.testing.assert_allclose(ahead, [0.6 / RATE, 0.03, 0.03], atol=1e-3)
+
+
+def test_predictions_grow_less_certain(moving):
+    near, far = moving.predict(30 / RATE), moving.predict(0.5)
+    assert (far.joint_prior.spread > near.joint_prior.spread).all()
+    assert far.wrist_spread[0] > near.wrist_spread[0] and far.wrist_spread[1] > near.wrist_spread[1]
+
+
+def test_three_markers_are_no_pose(moving):
+    prediction, target = moving.predict(30 / RATE), np.full((19, 3), np.nan)
+    target[:3] = prediction.positions[:3] + 0.05
+    estimate = moving.fit(target, prediction.qpos, prediction)
+    np.testing.assert_array_equal(estimate.qpos[:7], prediction.qpos[:7])
+    assert np.isnan(estimate.rms) and np.isnan(estimate.residuals).all()
+
+
+def test_a_marker_that_is_missing_is_less_certain_than_its_neighbors(moving):
+    prediction = moving.predict(30 / RATE)
+    target = prediction.positions.copy()
+    target[TIP] = np.nan
+    spread = np.trace(moving.fit(target, prediction.qpos, prediction).covariances, axis1=1, axis2=2)
+    assert spread.argmax() == TIP
+
+
+def test_the_bias_of_a_marker_is_learned_and_its_designed_position_is_known(followed):
+    off = np.zeros((19, 3))
+    off[KNUCKLE] = 0.0, 0.004, 0.004
+    state = followed(off=off)
+    designed = HandState(state.hand).solver.marker_positions(state.qpos)
+    shifted = state.solver.marker_positions(state.qpos) - designed
+    np.testing.assert_allclose(shifted[KNUCKLE], off[KNUCKLE], atol=0.0025)
+    assert np.linalg.norm(np.delete(shifted, KNUCKLE, axis=0), axis=1).max() < 0.002
+    prediction = state.predict(61 / RATE)
+    estimate = state.fit(prediction.positions, prediction.qpos, prediction)
+    designed = HandState(state.hand).solver.marker_positions(estimate.qpos)
+    np.testing.assert_allclose(state.unbiased_positions(estimate), designed, atol=1e-6)
+    assert state.rms_without_bias(estimate) > 3.0 * estimate.rms
+
+
+def test_only_settled_labels_teach_a_bias(moving):
+    before = moving.adapted.positions.copy()
+    prediction = moving.predict(30 / RATE)
+    target = prediction.positions.copy()
+    target[KNUCKLE] += 0.003
+    estimate = moving.fit(target, prediction.qpos, prediction)
+    moving.update(estimate, np.arange(19) != KNUCKLE, 30 / RATE)
+    np.testing.assert_array_equal(moving.adapted.positions[KNUCKLE], before[KNUCKLE])
+    assert (moving.adapted.positions != before).any()
+
+
+def test_biases_are_forgotten_and_recalled(followed):
+    off = np.zeros((19, 3))
+    off[KNUCKLE] = 0.0, 0.01, 0.01
+    state = followed(off=off)
+    designed = HandState(state.hand).adapted.positions
+    biased, variance, biases = state.adapted.positions.copy(), state.variance.copy(), state.biases
+    state.forget(np.array([KNUCKLE]))
+    np.testing.assert_array_equal(state.adapted.positions[KNUCKLE], designed[KNUCKLE])
+    others = np.delete(np.arange(19), KNUCKLE)
+    np.testing.assert_array_equal(state.adapted.positions[others], biased[others])
+    assert state.variance[KNUCKLE] > variance[KNUCKLE]
+    state.recall(biases)
+    np.testing.assert_array_equal(state.adapted.positions, biased)
+    np.testing.assert_array_equal(state.variance, variance)
+    assert np.linalg.norm(biased[KNUCKLE, 0] - designed[KNUCKLE, 0]) > 0.003
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_hand_that_comes_back_keeps_its_biases_if_they_still_fit(followed, same):
+    off = np.random.default_rng(1).uniform(-0.004, 0.004, (19, 3))
+    state = followed(off=off)
+    qpos, biased = state.qpos, state.adapted.positions.copy()
+    target = (
+        state.solver.marker_positions(qpos)
+        if same
+        else HandState(state.hand).solver.marker_positions(qpos) - 2 * off
+    )
+    state.initialize(qpos, target, 2.0)
+    assert np.array_equal(state.adapted.positions, biased) == same
+    assert (state.spread is None) != same and not state.confirmed.any()
+
+
+def test_a_marker_comes_back_soon_or_hardly_and_never_while_it_is_seen_elsewhere(moving):
+    prediction = moving.predict(30 / RATE)
+    target = prediction.positions.copy()
+    target[TIP] = np.nan
+    moving.update(moving.fit(target, prediction.qpos, prediction), np.ones(19, dtype=bool), 30 / RATE)
+    moving.predict(0.5)
+    log_odds = moving.presence_log_odds(np.array([0.1, 30 / RATE + 1e-3, 0.5]))
+    assert log_odds[0, TIP] == pytest.approx(
+        SEEN_ELSEWHERE + MOST_AGE_LOG_ODDS
+    )  # it was seen after the point
+    assert (log_odds[1, KNUCKLE] > log_odds[2, KNUCKLE] - MOST_AGE_LOG_ODDS).all()
+    age = (0.5 - 30 / RATE - 1e-3) / STRAY_LIFETIME
+    soon = log_odds[1] - age
+    assert soon[KNUCKLE] == pytest.approx(np.log(0.65)) and log_odds[2, TIP] < soon[TIP]

@@ -1,0 +1,110 @@
+"""Hands without history, found among points with the shipped labeler."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gloves.fit import nominal_fit
+from gloves.layout import load_layout
+from handsim.hand.model import join_qpos
+from handsim.hand.topology import Side
+from handsim.space.transforms import random_quaternions
+from poses.shapes.validity import sample_valid_angles
+from track.association.hand_state import HandState
+from track.association.initialization import MOST_POINTS, HandInitializer
+from train.labelers.storage import load_labeler
+
+SIDES: tuple[Side, Side] = ("right", "left")
+
+
+@pytest.fixture(scope="module")
+def states() -> list[HandState]:
+    return [HandState(nominal_fit(load_layout("dense19"), "M", side)) for side in SIDES]
+
+
+@pytest.fixture
+def initializer(states) -> HandInitializer:
+    return HandInitializer(states, load_labeler("dense19"))
+
+
+def markers(states: list[HandState], seed: int, apart: float = 0.6) -> np.ndarray:
+    """Markers (2, 19, 3) [m] of both hands in poses of their own, anyhow in space."""
+    rng = np.random.default_rng(seed)
+    clouds = []
+    for number, state in enumerate(states):
+        angles = sample_valid_angles(state.hand.model, 1, rng=rng)
+        place = np.array([[apart * number, 0.0, 1.0]])
+        qpos = join_qpos(angles, position=place, quaternion=random_quaternions(1, rng=rng))[0]
+        clouds.append(state.solver.marker_positions(qpos))
+    return np.array(clouds) + 0.0005 * rng.standard_normal((2, 19, 3))
+
+
+def shuffled(clouds: np.ndarray, strays: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points and their true labels, 19 and more for the second hand, -1 for strays around the hands."""
+    points = clouds.reshape(-1, 3)
+    around = points[rng.integers(len(points), size=strays)] + rng.uniform(-0.05, 0.05, (strays, 3))
+    labels = np.append(np.arange(len(points)), np.full(strays, -1))
+    order = rng.permutation(len(labels))
+    return np.concatenate([points, around])[order], labels[order]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_both_hands_are_found_each_with_its_own_points(initializer, states, seed):
+    points, labels = shuffled(markers(states, seed), 4, np.random.default_rng(seed))
+    found = {hand.index: hand for hand in initializer.initialize(points, (0, 1))}
+    assert sorted(found) == [0, 1]
+    for hand, one in found.items():
+        own = np.where(labels // 19 == hand, labels % 19, -1)
+        own[labels < 0] = -1
+        np.testing.assert_array_equal(one.labels[own >= 0], own[own >= 0])
+        assert one.fit.rms[0] < 0.002
+
+
+def test_a_mirrored_hand_is_not_found(initializer, states):
+    right = markers(states, 1)[0]
+    assert initializer.initialize(right, (1,)) == []
+    assert [hand.index for hand in initializer.initialize(right, (0, 1))] == [0]
+
+
+def test_touching_hands_are_cut_apart(initializer, states):
+    clouds = markers(states, 2, apart=0.0)
+    gap = clouds[0, :, 0].max() - clouds[1, :, 0].min()
+    clouds[1] += [gap + 0.01, 0.0, 0.0]
+    points, labels = shuffled(clouds, 0, np.random.default_rng(0))
+    found = initializer.initialize(points, (0, 1))
+    assert {hand.index for hand in found} == {0, 1}
+    right = sum(
+        (hand.labels[labels // 19 == hand.index] == labels[labels // 19 == hand.index] % 19).sum()
+        for hand in found
+    )
+    assert right >= 36
+
+
+def test_labels_count_among_the_points_that_were_given_and_no_point_twice(initializer, states):
+    points, _ = shuffled(markers(states, 0), 10, np.random.default_rng(5))
+    found = initializer.initialize(points, (0, 1))
+    taken = np.array([hand.labels >= 0 for hand in found])
+    assert taken.sum(axis=0).max() == 1
+    for hand in found:
+        own = hand.labels[hand.labels >= 0]
+        assert len(hand.labels) == len(points) and len(set(own.tolist())) == len(own)
+
+
+def test_a_hand_needs_nearly_half_of_its_markers(initializer, states):
+    cloud = markers(states, 1)[0]
+    assert len(initializer.initialize(cloud[::2], (0,))) <= 1
+    assert initializer.initialize(cloud[:8], (0,)) == []
+    assert initializer.initialize(np.zeros((0, 3)), (0, 1)) == []
+
+
+def test_points_at_random_are_no_hand(initializer):
+    rng = np.random.default_rng(0)
+    assert initializer.initialize(rng.uniform(0.0, 0.2, (24, 3)), (0, 1)) == []
+    assert initializer.initialize(rng.uniform(0.0, 0.2, (MOST_POINTS + 1, 3)), (0, 1)) == []
+
+
+def test_scores_grow_with_points_and_fall_with_their_distance(initializer):
+    assert initializer.score(19, 0.001) > initializer.score(14, 0.001)
+    assert initializer.score(19, 0.001) > initializer.score(19, 0.004)
+    assert initializer.score(19, 0.004, spread=0.001) < initializer.score(19, 0.004)

@@ -1,0 +1,141 @@
+"""Frame sources of the user's own: what they deliver arrives, and what is wrong with them is told."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from handsim.errors import ArgumentError, CaptureError, HandSimWarning
+from track.streams.frame_source import LiveStream, SourceStream, StreamedFrame, capture_frames
+
+
+def frame(number: int, points: object = None, **changes: object) -> StreamedFrame:
+    points = np.full((2, 3), 0.1) if points is None else points
+    values = {"number": number, "time": number / 100, "points": points, "ids": np.array([4, -1]), **changes}
+    return StreamedFrame(**values)  # type: ignore[arg-type]
+
+
+class Listed:
+    """A source of given frames; an exception among them is raised."""
+
+    def __init__(self, *frames: object, waits: bool = False) -> None:
+        self.frames, self.waits, self.closed = frames, waits, threading.Event()
+
+    def __iter__(self):
+        for one in self.frames:
+            if isinstance(one, Exception):
+                raise one
+            yield one
+        if self.waits:
+            self.closed.wait()
+
+    def close(self) -> None:
+        self.closed.set()
+
+
+def test_all_frames_arrive_and_the_end_ends_the_stream():
+    sent = [frame(number) for number in range(1000)]  # more than wait at once
+    stream = SourceStream(Listed(*sent), "mine")
+    time.sleep(0.05)
+    assert [one.number for one in stream] == list(range(1000))
+    assert stream.counts == {"missing_frames": 0}
+
+
+def test_numbers_that_are_left_out_are_counted():
+    stream = SourceStream(Listed(frame(1), frame(5), frame(2), frame(3), frame(9, restarted=True)), "mine")
+    assert len(list(stream)) == 5 and stream.counts == {"missing_frames": 3}
+
+
+def test_points_that_are_missing_are_left_out():
+    (one,) = SourceStream(Listed(frame(0, [[np.nan] * 3, [1, 2, 3]], ids=[3, 7])), "mine")
+    assert one.points.tolist() == [[1.0, 2.0, 3.0]] and one.ids.tolist() == [7]
+
+
+def test_a_silence_is_told_with_the_last_number():
+    stream = SourceStream(Listed(frame(3), waits=True), "mine", silence=0.05)
+    first, second, third = itertools.islice(stream, 3)
+    assert not first.silent and second.silent and third.silent
+    assert (second.number, second.time, second.points.shape) == (3, 0.03, (0, 3))
+    stream.close()
+    assert list(stream) == []
+
+
+def test_it_ends_when_it_is_to_end_after_what_has_come():
+    over = threading.Event()
+    stream = SourceStream(Listed(*map(frame, range(5)), waits=True), "mine", ended=over.is_set)
+    time.sleep(0.1)
+    over.set()
+    assert [one.number for one in stream] == [0, 1, 2, 3, 4]
+    stream.close()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("frame", "ArgumentError: a str came, expected a track.StreamedFrame"),
+        (
+            frame(1, np.zeros((3, 3))),
+            r"points have shape \(3, 3\) and IDs \(2,\), expected \(N, 3\) and \(N,\)",
+        ),
+        (frame(1, time=np.nan), "the time of frame 1 is nan, expected seconds"),
+        (frame(1, ids=np.array([-2, 0])), "IDs are from -2 to 0, expected -1 to 2147483647"),
+        (RuntimeError("the cable is out"), "RuntimeError: the cable is out"),
+    ],
+)
+def test_what_is_wrong_ends_the_stream_and_is_told(wrong, words):
+    stream = SourceStream(Listed(frame(0), wrong, frame(2)), "mine")
+    assert next(stream).number == 0
+    with pytest.raises(CaptureError, match=rf"^mine: the stream failed \(.*{words}"):
+        next(stream)
+    assert list(stream) == []
+
+
+def test_a_class_without_the_methods_is_no_source():
+    with pytest.raises(ArgumentError, match="mine has no method __iter__, expected __iter__ and close"):
+        SourceStream(object(), "mine")  # type: ignore[arg-type]
+
+
+def test_a_close_that_fails_is_told_and_loses_nothing():
+    class Stuck(Listed):
+        def close(self) -> None:
+            super().close()
+            raise OSError("stuck")
+
+    stream = SourceStream(Stuck(frame(0)), "mine")
+    assert next(stream).number == 0
+    with pytest.warns(HandSimWarning, match=r"mine: close failed \(OSError: stuck\)"):
+        stream.close()
+
+
+def test_a_column_is_an_id_until_its_point_is_lost():
+    positions = np.full((5, 2, 3), np.nan)
+    positions[[0, 1, 3, 4], 0], positions[1:, 1] = 0.0, 1.0
+    frames = list(capture_frames(Capture(("a", "b"), positions, 100.0)))
+    assert [frame.ids.tolist() for frame in frames] == [[0], [0, 1], [1], [2, 1], [2, 1]]
+    assert [len(frame.points) for frame in frames] == [1, 2, 1, 2, 2]
+    np.testing.assert_allclose([frame.time for frame in frames], 0.01 * np.arange(5))
+
+
+class Arriving:
+    """Frames as they arrive, of which nothing is counted."""
+
+    def __init__(self, times: list[float]) -> None:
+        self.counts: dict[str, int] = {}
+        self.frames = iter([frame(number, time=time) for number, time in enumerate(times)])
+
+    def __next__(self) -> StreamedFrame:
+        return next(self.frames)
+
+    def close(self) -> None:
+        self.frames = iter(())
+
+
+def test_time_goes_on_when_a_recording_begins_anew():
+    with LiveStream(Arriving([5.0, 5.1, 5.2, 0.1, 0.2, 0.1])) as stream:
+        times = [one.time for one in stream]
+    np.testing.assert_allclose(times, [5.0, 5.1, 5.2, 5.21, 5.31, 5.32], atol=0.005)

@@ -1,0 +1,65 @@
+"""What a tracked take tells of a wrong glove, a hand too many or too few, and hands that do not fit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import write_capture
+from gloves.takes.take import LOST, Take
+from handsim.cli.main import main
+from track.capture_tracking import track_capture
+from track.take_summary import suspicions
+from train.simulation.takes import simulate_take
+
+FRAMES = 40
+
+
+@pytest.fixture(scope="module")
+def truth() -> Take:
+    return simulate_take(kind="single-hand", num_frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def tracked(truth) -> Take:
+    return track_capture(truth, hands=truth.hands, labeler="dense19")
+
+
+def test_a_good_take_tells_nothing(tracked):
+    assert suspicions(tracked) == []
+
+
+def test_a_hand_that_is_not_there(tracked):
+    status, qpos, rms = tracked.status.copy(), tracked.qpos.copy(), tracked.rms.copy()
+    status[:, 0], qpos[:, 0], rms[:, 0] = LOST, np.nan, np.nan
+    take = dataclasses.replace(tracked, status=status, qpos=qpos, rms=rms)
+    side, other = tracked.sides
+    assert suspicions(take) == [
+        f"the {side} hand was seen in 0.0 % of the frames; name the glove worn (--glove), or track the other "
+        f"hand alone (--hands {other})"
+    ]
+
+
+def test_markers_that_were_not_seen_and_markers_off_the_pose(tracked):
+    rms, first = tracked.rms.copy(), (tracked.labels >= 0) & (tracked.labels < 10)
+    rms[:, 1] = 0.0061
+    labels, points = tracked.labels.copy(), tracked.points.copy()
+    labels[first], points[first] = -1, np.nan
+    told = suspicions(dataclasses.replace(tracked, labels=labels, points=points, rms=rms))
+    assert [sentence.split(";")[0] for sentence in told] == [
+        f"52.6 % of the {tracked.sides[0]} hand's markers were not seen and are filled in from its pose",
+        f"the {tracked.sides[1]} hand's markers are 6.1 mm off its pose",
+    ]
+
+
+def test_the_command_tells_of_a_wrong_glove(truth, tmp_path, capsys):
+    names = tuple(f"*{column}" for column in range(truth.points.shape[1]))
+    write_capture(tmp_path / "take.c3d", Capture(names, truth.points, truth.rate))
+    out = str(tmp_path / "take.npz")
+    assert main(["track", str(tmp_path / "take.c3d"), "--glove", "sparse13", "--out", out]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert told and all(line.startswith("handsim track: warning: ") for line in told)
+    assert any(" of the points are not markers of what was tracked; name the glove" in line for line in told)

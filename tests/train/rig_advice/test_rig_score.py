@@ -1,0 +1,86 @@
+"""Advice on a rig: each sentence for the rig that deserves it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from handsim.space.cameras import ROOM_CENTER, named_rig
+from train.rig_advice.forecast import CameraLoss
+from train.rig_advice.rig_page import camera_table, work_table, write_rig_page
+from train.rig_advice.rig_score import score_rig, sentences
+
+
+@pytest.fixture(scope="module")
+def score(work):
+    return score_rig(named_rig("six"), {"all kinds": work}, np.array(ROOM_CENTER), np.full(3, 0.6))
+
+
+def with_missing(one, missing, **more):
+    return dataclasses.replace(one, missing=missing, ghosts=0.0, **more)
+
+
+@pytest.fixture
+def good(score):
+    """A rig without faults, each of whose cameras is needed."""
+    whole = with_missing(score.whole, 0.01)
+    losses = [CameraLoss(0.5, 0.1, with_missing(score.whole, 0.1 + 0.01 * n)) for n in range(6)]
+    volume = score.volume._replace(seen_by_two=np.full(125, 0.98))
+    return dataclasses.replace(score, whole=whole, kinds={"a": whole}, losses=losses, volume=volume)
+
+
+def test_of_a_good_rig_only_the_camera_that_matters_most_is_told(good):
+    assert sentences(good) == [
+        "Camera 6 matters most: without it 15.0 % of the marker-frames are missing, not 1.0 %."
+    ]
+
+
+def test_idle_cameras_can_go(good):
+    losses = list(good.losses)
+    losses[2] = CameraLoss(0.4, 0.001, with_missing(good.whole, 0.0104))
+    losses[4] = CameraLoss(0.4, 0.001, with_missing(good.whole, 0.0102))
+    losses[0] = CameraLoss(0.4, 0.001, with_missing(good.whole, 0.02))
+    sentence = sentences(dataclasses.replace(good, losses=losses))[1]
+    assert sentence.startswith("Camera 5 can go: it sees 0.1 % of the marker-frames that no two others see")
+    assert "So can any one of 3;" in sentence
+
+
+def test_missing_markers_bad_corners_and_ghosts_are_told(good):
+    whole = dataclasses.replace(good.whole, missing=0.2, ghosts=1.5)
+    shares = np.full(125, 0.98)
+    shares[7] = 0.3
+    volume = good.volume._replace(seen_by_two=shares)
+    kinds = {"a": good.whole, "b": whole}
+    told = sentences(dataclasses.replace(good, whole=whole, volume=volume, kinds=kinds))
+    assert told[0].startswith("20.0 % of the marker-frames will be missing, most with b (20 %)")
+    assert "two cameras see 30 % of a hand's markers, 98 % at the best place" in told[1]
+    assert told[-1].startswith("1.50 points a frame will be no marker")
+
+
+def test_a_long_error_names_its_axis(good):
+    error = good.whole.error._replace(
+        axes=np.array([0.002, 0.0005, 0.0004]), directions=np.array([[0.1, 0.99, 0.0], [1, 0, 0], [0, 0, 1]])
+    )
+    told = sentences(dataclasses.replace(good, whole=dataclasses.replace(good.whole, error=error)))
+    assert told[-1].startswith("Points are least certain along y, 2.00 mm against 0.40 mm")
+
+
+def test_two_cameras_are_both_needed(good):
+    losses = [CameraLoss(0.9, 0.9, None)] * 2
+    told = sentences(dataclasses.replace(good, losses=losses))
+    assert told == ["Without either camera there are no points at all: a third would forgive a loss."]
+    assert camera_table(dataclasses.replace(good, losses=losses))[1][3] == "-"
+
+
+def test_the_page_has_tables_and_pictures_and_the_record_every_figure(score, tmp_path):
+    path = tmp_path / "page.html"
+    write_rig_page(path, score, work="a <test>")
+    page = path.read_text("utf-8")
+    assert page.count("data:image/svg+xml") == 2 and "a &lt;test&gt;" in page
+    assert len(work_table(score)) == 2 and len(camera_table(score)) == 7
+    record = score.record()
+    assert record["all"]["missing"] == score.whole.missing
+    assert len(record["all"]["error_directions"]) == 3 and len(record["volume"]["error"]) == 125
+    assert len(record["without_camera"]) == 6 and record["without_camera"][3]["seen"] > 0.1

@@ -1,0 +1,225 @@
+"""Recording of tracked frames: in memory, or on disk, as they come, so that memory does not grow.
+
+A recording on disk grows in `take.npz.part` (`gloves.takes.growing`), which is readable at any time and holds
+all but the last half second, whatever ends the process. `finish` turns it into `take.npz`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gloves.captures.capture import Capture
+from gloves.takes.columns import FRAMES, KEYPOINTS, NUMBERS
+from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
+from gloves.takes.take import (
+    RATED_FRAMES,
+    STATUSES,
+    Take,
+    keypoints_of,
+    take_header,
+    unpack_take,
+    usual_rate,
+    worn_arrays,
+)
+from handsim.errors import ArgumentError, CaptureError
+from track.streams.frame_source import StreamedFrame
+from track.tracked_frame import Status, TrackedFrame
+from track.tracker import Tracker
+
+_NUMBERS: Final = {status: STATUSES.index(status.value) for status in Status}
+_SUMMARIZED: Final = 20_000  # frames at most that are read for a summary
+
+
+class TakeRecorder:
+    """Records tracked frames; `take` gives the take so far at any time.
+
+    Args:
+        tracker: The tracker, for its hands and bodies.
+    """
+
+    def __init__(self, tracker: Tracker) -> None:
+        self._hands = tracker.hands
+        self._config = tracker.config
+        self._bodies = tracker.bodies
+        self._rows: list[dict[str, NDArray[Any]]] = []
+
+    @property
+    def num_frames(self) -> int:
+        """Number of recorded frames."""
+        return len(self._rows)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return float(self._rows[-1]["times"] - self._rows[0]["times"]) if self._rows else 0.0
+
+    def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        """Record a frame, unless it stands for a silence of the stream."""
+        if not frame.silent:
+            self._rows.append(frame_values(frame, tracked))
+
+    def take(self, capture: Capture | None = None) -> Take:
+        """The take so far.
+
+        Args:
+            capture: The capture of these frames, whose columns and rate are kept; None for a stream, whose
+                rate is the median one.
+
+        Raises:
+            CaptureError: There are too few frames to determine the rate of a stream.
+        """
+        rows = self._rows
+        if not rows or (capture is None and len(rows) < 2):
+            raise CaptureError(f"{len(rows)} frames came, expected two or more")
+        settings = {"tracker": dataclasses.asdict(self._config)}
+        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=settings)
+
+
+def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
+    """A frame's entries of the arrays of a take, by their names; those of points for its N points."""
+    hands, bodies = tracked.hands, tracked.bodies
+    poses = [np.concatenate([body.translation, body.rotation]) for body in bodies]
+    return {
+        "times": np.array(frame.time),
+        "numbers": np.array(frame.number),
+        "qpos": np.array([hand.qpos for hand in hands]),
+        "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
+        "rms": np.array([hand.rms for hand in hands]),
+        "body_poses": np.array(poses).reshape(len(bodies), 7),
+        "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
+        "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
+        "points": frame.points,
+        "ids": frame.ids.astype(np.int32),
+        "labels": tracked.labels.astype(np.int16),
+        "confidence": tracked.confidence,
+    }
+
+
+class Recorder:
+    """Records tracked frames on disk in a `with` block, frame by frame with `add`.
+
+    The end of the block writes the take, also when Ctrl-C ends it. After any other exception the recording
+    stays as it is, in `part`.
+
+    Args:
+        path: The take's file, .npz; until its end the recording is beside it.
+        tracker: The tracker, for its hands, bodies and settings.
+        settings: What else made the take, as JSON.
+
+    Raises:
+        ArgumentError: The path does not end in .npz.
+        CaptureError: A recording that was cut off is in the way.
+        OSError: The file cannot be written.
+    """
+
+    def __init__(
+        self, path: str | Path, tracker: Tracker, settings: Mapping[str, Any] = MappingProxyType({})
+    ) -> None:
+        out = Path(path)
+        if out.suffix.lower() != ".npz":
+            raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")
+        self.part = growing_path(out)
+        """The file of the recording."""
+        self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
+        self._settings = {"tracker": dataclasses.asdict(tracker.config), **settings}
+        sizes = {"H": len(self._hands), "B": len(self._bodies)}
+        self._archive = GrowingArchive(
+            self.part,
+            self._header(None),
+            worn_arrays(self._hands, self._bodies),
+            [column.sized(sizes) for column in (*FRAMES, NUMBERS, KEYPOINTS)],
+        )
+        self._times: tuple[float, float] | None = None
+        self._closed = False
+
+    @property
+    def num_frames(self) -> int:
+        """Number of recorded frames."""
+        return self._archive.num_frames
+
+    @property
+    def duration(self) -> float:
+        """Time from the first frame to the last [s]."""
+        return self._times[1] - self._times[0] if self._times else 0.0
+
+    def add(self, frame: StreamedFrame, tracked: TrackedFrame) -> None:
+        """Record a frame, unless it stands for a silence of the stream.
+
+        Raises:
+            CaptureError: The file cannot be written; what was recorded until then is kept.
+        """
+        try:
+            if frame.silent:
+                self._archive.flush_due()
+                return
+            values = frame_values(frame, tracked)
+            keypoints = keypoints_of(self._hands, values["qpos"][None])[0]
+            self._archive.add({**values, KEYPOINTS.name: keypoints}, len(frame.points))
+        except OSError as error:
+            raise CaptureError(
+                f"the recording ended after {self.num_frames} frames ({error.strerror or error}); they are "
+                f"kept in {self.part}"
+            ) from error
+        self._times = (self._times[0] if self._times else frame.time, frame.time)
+
+    def close(self) -> None:
+        """Write what still waits, and close the recording without writing the take."""
+        self._closed = True
+        self._archive.close()
+
+    def finish(
+        self, stream: Mapping[str, int] | None = None, *, told: Callable[[], None] = lambda: None
+    ) -> tuple[Take, int]:
+        """Write the take and remove the recording; without at least two frames, remove it only.
+
+        Args:
+            stream: What became of the stream's frames (`counts` of `open_source`), for the take's settings.
+            told: Called after every part.
+
+        Returns:
+            The take for a summary, and a step: of a long take it holds the frames of every step-th block.
+
+        Raises:
+            CaptureError: Fewer than two frames came, or the take cannot be written; then the recording is
+                kept.
+        """
+        self.close()
+        if self.num_frames < 2:
+            self.part.unlink()
+            raise CaptureError(f"{self.num_frames} frames came, expected two or more")
+        if stream is not None:
+            self._settings["stream"] = dict(stream)
+        grown = GrownArchive(self.part, check=False)
+        header = self._header(usual_rate(grown.first("times", RATED_FRAMES)))
+        try:
+            finish_archive(grown, self._out, header, told=told)
+        except OSError as error:
+            raise CaptureError(
+                f"{self._out}: cannot be written ({error.strerror or error}); the recording is kept in "
+                f"{self.part}"
+            ) from error
+        step = grown.step_for(_SUMMARIZED)
+        take = unpack_take(header, grown.read(step))
+        self.part.unlink()
+        return take, step
+
+    def _header(self, rate: float | None) -> dict[str, Any]:
+        return take_header(self._hands, self._bodies, rate, self._settings)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._closed or not (error is None or isinstance(error, KeyboardInterrupt)):
+            self.close()
+        else:
+            self.finish()

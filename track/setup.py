@@ -1,0 +1,221 @@
+"""What a tracker is made of: hands that are known or still to be measured, their labeler, and bodies."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, Self, get_args
+
+import numpy as np
+
+from gloves.fit import GloveFit
+from gloves.layout import MarkerLayout
+from handsim.errors import ArgumentError, HandSimWarning, choices
+from handsim.hand.topology import NUM_QPOS, SIDES, Side
+from track.bodies.body_file import AnyBody, load_bodies
+from track.bodies.rigid_body import RigidTemplate
+from track.calibration.hand_size import fit_size, sample_frames
+from track.config import TrackerConfig
+from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, glove_of, labeler_of
+from track.streams.frame_source import StreamedFrame, checked_frames
+from track.tracker import Tracker
+from track.user import User, check_sides, load_user, nominal_user
+from train.labelers.protocol import Labeler
+
+Size = Literal["auto", "XS", "S", "M", "L", "XL"]
+AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
+"""A user, hands in their gloves, or the path of a user's file; or sides, whose hands are to be measured."""
+BOTH: Final[tuple[Side, ...]] = ("right", "left")
+USUAL_GLOVE: Final = "dense19"
+USUAL_SIZE: Final = "M"
+"""The size of hands that could not be measured."""
+_SHOWN: Final = 0.8  # share of one hand's markers in a frame in which its size can be measured
+_HAND_SPACING: Final = 0.5  # [m] between the hands of the warm-up
+_UNSURE_EXTENT: Final = 0.12  # of clouds that no labeler is sure of [m]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackerSetup:
+    """Everything that a tracker needs but frames to measure its hands in."""
+
+    user: User
+    """The hands; of the usual size where they are to be measured."""
+    is_measured: bool
+    """Whether their size is to be measured."""
+    labeler: Labeler
+    """Labeler of their glove."""
+    bodies: tuple[RigidTemplate, ...]
+    config: TrackerConfig
+    settings: dict[str, Any]
+    """What makes a take, as JSON."""
+
+    @classmethod
+    def of(
+        cls,
+        glove: AnyGlove | None,
+        hands: AnyHands,
+        size: Size,
+        labeler: AnyLabeler,
+        bodies: Sequence[AnyBody],
+        config: TrackerConfig,
+    ) -> Self:
+        """The setup that arguments of `track_capture` name.
+
+        Raises:
+            ArgumentError: Hands and size do not go together, a hand wears another glove, a size or a body is
+                unknown, or a name is given twice.
+            UserError: A user's file cannot be read.
+            LayoutError: The glove is unknown, or does not fit a hand.
+            WeightsError: The labeler is unknown, or knows other markers.
+        """
+        user, is_measured = choose_user(glove, hands, size)
+        templates = load_bodies(bodies)
+        network = labeler_of(user.layout, labeler)
+        name = user.layout.name if glove is None or not isinstance(glove, str | Path) else str(glove)
+        settings = {"glove": name, "user": user.notes or str(user), "labeler": _name_of(labeler, name)}
+        return cls(user, is_measured, network, templates, config, settings)
+
+    @property
+    def fewest_points(self) -> float:
+        """Points of a frame in which hands can be measured."""
+        return _SHOWN * self.user.layout.num_markers
+
+    def measured(self, frames: Sequence[StreamedFrame]) -> TrackerSetup:
+        """The setup with the hands as measured in some frames, if they are to be measured."""
+        if not self.is_measured:
+            return self
+        user = measured_user(frames, self.user.layout, self.user.sides, self.labeler)
+        settings = {**self.settings, "user": user.notes}
+        return dataclasses.replace(self, user=user, is_measured=False, settings=settings)
+
+    def tracker(self) -> Tracker:
+        """A tracker of the hands and bodies."""
+        return Tracker(self.user, self.labeler, self.bodies, self.config)
+
+
+def measure_hands(
+    capture: AnyCapture,
+    glove: AnyGlove = "dense19",
+    *,
+    labeler: AnyLabeler = None,
+    hands: Sequence[Side] = BOTH,
+) -> User:
+    """The hands of a capture with their size and proportions measured; a `Tracker` takes them.
+
+    Args:
+        capture: Points [m], or the path of a marker file or a take; names of markers are not used.
+        glove: Marker layout, or its shipped name or the path of its .toml file.
+        labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
+        hands: Which hands.
+
+    Returns:
+        The hands, all of one shape; printed, it is their length and breadth. Where no hand is found that
+        shows most of its markers, hands of size M, with a warning.
+
+    Raises:
+        ArgumentError: The capture is not in meters, or a hand is named twice.
+        CaptureError: The capture cannot be read, or most of its points are far from any room.
+        LayoutError: The glove is unknown, or does not fit a hand.
+        WeightsError: The labeler is unknown, or knows other markers.
+    """
+    check_sides(hands)
+    layout = glove_of(glove)
+    frames = checked_frames(capture_of(capture))
+    return measured_user(sample_frames(frames), layout, hands, labeler_of(layout, labeler))
+
+
+def measured_user(
+    frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
+) -> User:
+    """The user whose hands are in some frames; of size M, with a warning, if no hand is found."""
+    size = fit_size(frames, layout, sides, labeler)
+    if size is not None:
+        return User(size.hands(sides), f"auto, {size}")
+    warnings.warn(
+        f"no hand was found to measure its size; size {USUAL_SIZE} is used, or name a size",
+        HandSimWarning,
+        stacklevel=3,
+    )
+    usual = nominal_user(layout, USUAL_SIZE, sides)
+    return User(usual.hands, f"auto, {USUAL_SIZE}")
+
+
+def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:
+    """Load the tracker's kernels, which the first run on a machine compiles for half a minute.
+
+    Otherwise the first frames of a stream would have to wait.
+
+    Args:
+        hands: The user's hands.
+        labeler: Labeler of their glove.
+    """
+    tracker = Tracker(hands, labeler)
+    qpos = np.zeros((len(hands), NUM_QPOS))
+    qpos[:, 0], qpos[:, 3] = _HAND_SPACING * np.arange(len(hands)), 1.0
+    points = np.concatenate(
+        [
+            hand.attachment.centers(hand.model, hand.model.forward_kinematics(row[None]))[0]
+            for hand, row in zip(hands, qpos, strict=True)
+        ]
+    )
+    for number in range(3):  # initialized, tracked, and labeled again
+        ids = np.arange(len(points)) + (number == 2) * len(points) * (np.arange(len(points)) % 4 == 0)
+        tracker.step(points, ids, 0.01 * number)
+    unsure = np.random.default_rng(0).uniform(0.0, _UNSURE_EXTENT, (4, len(points) // len(hands), 3))
+    for cloud in unsure:  # labels that a pose has to verify
+        labeler.label_frames([cloud])
+
+
+def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[User, bool]:
+    """The hands that arguments name, and whether they are still to be measured.
+
+    Args:
+        glove: The glove; when None that of the hands, or dense19 for hands that are measured.
+        hands: Hands, or sides.
+        size: Size of hands of which only the sides are given.
+
+    Raises:
+        ArgumentError: See `TrackerSetup.of`.
+    """
+    if size not in get_args(Size):
+        raise ArgumentError(choices(str(size), get_args(Size), noun="size"))
+    if isinstance(hands, str) and hands in SIDES:
+        hands = (hands,)
+    if isinstance(hands, str | Path):
+        known = dataclasses.replace(load_user(hands), notes=Path(hands).name)
+        return _in_glove(known, glove, size), False
+    if isinstance(hands, User):
+        return _in_glove(hands, glove, size), False
+    sides = [hand for hand in hands if not isinstance(hand, GloveFit)]
+    if not sides and hands:
+        fits = tuple(hand for hand in hands if isinstance(hand, GloveFit))
+        return _in_glove(User(fits), glove, size), False
+    check_sides(sides)
+    layout = glove_of(USUAL_GLOVE if glove is None else glove)
+    return nominal_user(layout, USUAL_SIZE if size == "auto" else size, sides), size == "auto"
+
+
+def _in_glove(user: User, glove: AnyGlove | None, size: Size) -> User:
+    """A user whose hands wear a glove, and for whom no size is named."""
+    if size != "auto":
+        raise ArgumentError(f"given size {size} and hands as they are, expected one of them")
+    if glove is None:
+        return user
+    names, expected = user.layout.names, glove_of(glove).names
+    if names != expected:
+        name = glove if isinstance(glove, str | Path) else glove.name
+        raise ArgumentError(
+            f"{user.notes or 'the hands'} is of a glove with the markers {', '.join(names)}, "
+            f"but glove '{name}' has {', '.join(expected)}"
+        )
+    return user
+
+
+def _name_of(labeler: AnyLabeler, glove: str) -> str:
+    """What a take's settings call a labeler."""
+    if labeler is None:
+        return glove
+    return str(labeler) if isinstance(labeler, str | Path) else type(labeler).__name__

@@ -1,0 +1,86 @@
+"""Batches of labeled clouds without end, out of a training set, for networks of your own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import IterableDataset, get_worker_info
+
+from handsim._checks import check_number, check_type
+from handsim.errors import ArgumentError
+from train.data.augmentation import Corruption
+from train.data.batches import BatchRecipe, draw_batch
+from train.data.own_corruption import OwnCorruption, check_corruption
+from train.data.shards import Dataset, load_dataset
+
+
+class CloudStream(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
+    """Clouds of points of one hand, each corrupted anew, in batches without end.
+
+    An item is a batch: points (B, N, 3) [m], float32, around the middle of the hand's markers, 0 in padding;
+    which of them are there (B, N), bool; and the marker of each (B, N), int64, -1 for a ghost. Left hands
+    are mirrored to right ones. N is the fullest cloud's.
+
+    For `torch.utils.data.DataLoader(stream, batch_size=None, num_workers=...)`. Batch number n depends on the
+    set, the settings, the seed and n alone, and workers share the numbers: the sequence is the same with any
+    number of workers. Each pass begins at batch `start` again.
+
+    Args:
+        dataset: The training set, or its folder.
+        corruption: What is done to clean markers: a `Corruption`, or one of your own: a function
+            `(markers, *, rng) -> (points, labels)`, its `module:name` or its entry point.
+        batch: Clouds in a batch, B.
+        seed: Seed of all randomness.
+        rig_share: Share of batches, 0 to 1, that are what the set's simulated cameras see instead; our
+            labelers learn from half of each.
+        anisotropy: Log standard deviation of the stretch of each hand along three random directions.
+        start: Number of the first batch.
+
+    Raises:
+        ArgumentError: An argument is of another type or out of range.
+        DatasetError: There is no such set, or it is damaged.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset | str | Path,
+        corruption: Corruption | OwnCorruption | str = Corruption(),  # noqa: B008 - it is frozen
+        *,
+        batch: int = 64,
+        seed: int = 0,
+        rig_share: float = 0.0,
+        anisotropy: float = 0.0,
+        start: int = 0,
+    ) -> None:
+        self.dataset = load_dataset(dataset)
+        for name, value, least in (("batch", batch, 1), ("seed", seed, 0), ("start", start, 0)):
+            check_type(name, value, int, "a whole number")
+            if value < least:
+                raise ArgumentError(f"{name} is {value}, expected at least {least}")
+        check_number("rig_share", rig_share, 0.0, 1.0)
+        check_number("anisotropy", anisotropy, 0.0, 1.0)
+        if not isinstance(corruption, Corruption):
+            check_corruption(corruption, len(self.dataset.marker_names))
+        self.recipe = BatchRecipe(batch, corruption, rig_share=rig_share, anisotropy=anisotropy)
+        self.seed, self.start = seed, start
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        worker = get_worker_info()
+        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        for number in count(self.start + first, step):
+            yield self.batch(number)
+
+    def batch(self, number: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Points (B, N, 3) [m], presence (B, N) and labels (B, N) of the batch of a number."""
+        rng = np.random.default_rng((self.seed, number))
+        cloud = draw_batch(self.dataset.mapped_rows(), self.recipe, rng=rng).cloud
+        return (
+            torch.from_numpy(cloud.points.astype(np.float32)),
+            torch.from_numpy(cloud.present),
+            torch.from_numpy(np.where(cloud.present, cloud.truth, -1)),
+        )
