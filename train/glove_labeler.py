@@ -71,7 +71,7 @@ def _is_layout(glove: Any) -> bool:
 def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
     """The labeler that was trained on a layout, or the one for any."""
     for name in shipped_labelers():
-        if _is_worn(layout, load_layout(name)):
+        if load_layout(name) == layout:
             return load_stored_labeler(name)
     shown = layout.name if isinstance(glove, MarkerLayout) else glove
     warnings.warn(
@@ -82,13 +82,6 @@ def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labele
         stacklevel=3,
     )
     return _for_any(layout)
-
-
-def _is_worn(layout: MarkerLayout, designed: MarkerLayout) -> bool:
-    """Whether a layout is a designed one as somebody wears it: markers slip, but stay on their bones."""
-    return layout.name == designed.name and [(one.name, one.bone) for one in layout.markers] == [
-        (one.name, one.bone) for one in designed.markers
-    ]
 
 
 def _for_any(layout: MarkerLayout) -> Labeler:
