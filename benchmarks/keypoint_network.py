@@ -31,11 +31,11 @@ from typing import Any, Final
 from unittest.mock import patch
 
 import cv2
-import keypoint_training as training
 import numpy as np
 import torch
 import trimesh
 
+from benchmarks import keypoint_training as training
 from benchmarks.record import Figures, add_save, describe, save_figures
 from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel

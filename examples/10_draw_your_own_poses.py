@@ -14,8 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from handsim import Camera, HandModel
-from handsim.space.cameras import look_at
+from handsim import Camera, HandModel, look_at
 from poses import sample_poses
 from render import RenderConfig, draw, merge_renderings, render_take
 

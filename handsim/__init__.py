@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from handsim.hand.model import HandModel, join_qpos
     from handsim.hand.motion import HandMotion
     from handsim.hand.shape import HandShape, Population, sample_shape
-    from handsim.space.camera import Camera
+    from handsim.space.camera import Camera, look_at
     from handsim.space.cameras import CameraRig, load_rig
 
 __getattr__, __dir__ = lazy_exports(
@@ -30,6 +30,7 @@ __getattr__, __dir__ = lazy_exports(
         "HandMotion": "handsim.hand.motion",
         "HandShape": "handsim.hand.shape",
         "join_qpos": "handsim.hand.model",
+        "look_at": "handsim.space.camera",
         "load_rig": "handsim.space.cameras",
         "sample_shape": "handsim.hand.shape",
     },
@@ -47,6 +48,7 @@ __all__ = [
     "__version__",
     "join_qpos",
     "load_rig",
+    "look_at",
     "sample_shape",
 ]
 

@@ -523,6 +523,9 @@ def load_take(path: str | Path) -> Take:
     Args:
         path: The file.
 
+    Returns:
+        Times (T,) [s], poses (T, H, 27) [m, rad], points (T, N, 3) [m] and their labels (T, N).
+
     Raises:
         ArgumentError: It is no path.
         CaptureError: No such file, of another kind or schema, or damaged.

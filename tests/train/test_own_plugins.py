@@ -108,7 +108,7 @@ def dataset(folder):
 
 def test_a_training_set_has_the_samplers_poses(dataset, folder, capsys):
     angles = dataset.rows()["qpos"][:, 7:]
-    assert np.ptp(angles, axis=0).max() < 0.02, "one pose"
+    assert np.ptp(angles, axis=0).max() < 0.1, "one pose, which a hand of thick fingers opens a little"
     np.testing.assert_allclose(np.median(angles[:, 5::4]), 0.3, atol=0.01)
     settings = json.loads((folder / "set" / "config.json").read_text())
     assert settings["sampler"] == "own_ideas:Curled"

@@ -117,7 +117,7 @@ def test_table_4_has_a_column_a_test_set(capsys, monkeypatch, takes):
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        (["table4", "--labelers", "nowhere"], "unknown labeler 'nowhere'"),
+        (["table4", "--labelers", "nowhere"], "unknown labeler or glove 'nowhere'"),
         (["table4", "--num-frames", "0"], "num_frames is 0, expected at least 1"),
         (["table2", "nowhere", "--out", "OUT"], "expected a training set with a manifest.json, but nowhere"),
     ],

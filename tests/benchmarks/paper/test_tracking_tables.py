@@ -167,10 +167,10 @@ def test_every_tracker_has_a_maker():
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["table5", "--glove", "dense91"], "unknown glove 'dense91'"),
+        (["table5", "--glove", "dense91"], "unknown labeler or glove 'dense91'"),
         (["table5", "--num-frames", "0"], "num_frames is 0, expected at least 1"),
         (["table7", "--seed", "-1"], "seed is -1, expected 0 or more"),
-        (["table7", "--labeler", "nowhere"], "unknown labeler 'nowhere'"),
+        (["table7", "--labeler", "nowhere"], "unknown labeler or glove 'nowhere'"),
         (["cameras", "--rig", "figure6"], "unknown camera rig 'figure6'"),
     ],
 )

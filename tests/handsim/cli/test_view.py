@@ -89,7 +89,7 @@ def test_a_video_is_drawn_without_a_page(capture, tmp_path, capsys):
     out = tmp_path / "take.mp4"
     truth = capture.with_suffix(".truth.npz")
     assert main(["view", str(truth), "--video", str(out)]) == 0
-    assert f"{out}: 30 pictures of {truth} (truth)" in capsys.readouterr().out
+    assert f"{out}: 30 pictures of {truth} (take)" in capsys.readouterr().out
     video = cv2.VideoCapture(str(out))
     assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (30, 30)
     pictures = [video.read()[1].astype(int) for _ in range(30)]

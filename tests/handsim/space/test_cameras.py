@@ -94,7 +94,7 @@ def test_whatever_stands_for_a_rig_gives_it(tmp_path):
     assert load_rig(rig) is rig
     other = CameraRig("six", rig.cameras)  # a shipped name, but other cameras
     assert as_rig(rig_setting(other)) == other
-    with pytest.raises(ArgumentError, match="a rig is int, expected a CameraRig, a name"):
+    with pytest.raises(ArgumentError, match="rig is 3, expected a CameraRig, or the name or path of one"):
         as_rig(3)
     with pytest.raises(RigError, match="a damaged record of a rig"):
         as_rig({"name": "six"})

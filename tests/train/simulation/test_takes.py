@@ -124,7 +124,7 @@ def test_a_rig_of_ones_own_is_kept_in_the_take_with_its_cameras(tmp_path):
     six = simulate_take(num_frames=40, rig=named_rig("six"))
     assert six.settings["rig"] == "six"
     np.testing.assert_array_equal(six.points, simulate_take(num_frames=40, rig="six").points)
-    with pytest.raises(ArgumentError, match="a rig is int, expected a CameraRig"):
+    with pytest.raises(ArgumentError, match="rig is 3, expected a CameraRig, or the name or path of one"):
         simulate_take(num_frames=40, rig=3)
 
 
