@@ -1,7 +1,7 @@
 """Depth, normals and ids of triangles, by a compiled z-buffer.
 
 Every pixel shows the surface behind its center, so that depth, normals and ids belong together and have the
-same bytes on every machine (see docs/decisions.md).
+same bytes on every machine (see docs/decisions/pictures.md).
 """
 
 from __future__ import annotations

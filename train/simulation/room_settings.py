@@ -1,7 +1,7 @@
 """The settings of a simulated capture room, and those fitted to the four test captures of Han et al. 2018.
 
 How often cameras drop out and how many reflections flash is fitted to Table 3 and to the ghost ratios of
-Table 4 (docs/room.md says what was fitted to what).
+Table 4 (docs/room_numbers.md says what was fitted to what).
 """
 
 from __future__ import annotations
