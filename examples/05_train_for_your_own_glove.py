@@ -4,7 +4,8 @@
 
 The labeler is measured on people that it was not trained on. Training set and network are small, so that
 this takes twenty seconds; `handsim generate` and `handsim train` make a better one (docs/labeling.md). To
-begin with, a glove of your own needs no training set: `load_labeler(glove)` is then the labeler for any layout.
+begin with, a glove of your own needs no training set: `load_labeler(glove)` is then the labeler for any
+layout.
 """
 
 from __future__ import annotations
