@@ -47,7 +47,7 @@ def main() -> None:
     layouts += [random_layout(number, rng) for number in range(options.random)]
     unseen = []
     for layout in layouts:
-        labelers: dict[str, Labeler] = {"at once": LayoutLabeler(layout)}
+        labelers: dict[str, Labeler] = {"at once": LayoutLabeler.at_once(layout)}
         began = time.perf_counter()
         labelers["after a minute"] = fine_tuned_labeler(layout)
         seconds = time.perf_counter() - began

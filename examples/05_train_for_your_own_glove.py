@@ -3,9 +3,9 @@
     python examples/05_train_for_your_own_glove.py
 
 The labeler is measured on people that it was not trained on. Training set and network are small, so that
-this takes twenty seconds; `handsim generate` and `handsim train` make a better one (docs/labeling.md). A
-glove of your own needs no training set: `load_labeler(glove)` is then the labeler for any layout, which learns
-it within a minute. One trained on it is better.
+this takes twenty seconds; `handsim generate` and `handsim train` make a better one (docs/labeling.md). To
+begin with, a glove of your own needs no training set: `load_labeler(glove)` is then the labeler for any
+layout.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     python examples/10_draw_your_own_poses.py
 
-On the command line poses and cameras are files (docs/own_poses.md):
+On the command line poses and cameras are files (docs/rendering.md):
 `handsim render --poses poses.npz --cameras cameras.toml --hands right --out pictures --format coco`.
 """
 

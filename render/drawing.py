@@ -16,6 +16,7 @@ from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera
+from handsim.space.cameras import CameraRig
 from render.cameras.viewpoints import ViewConfig, Viewpoints, check_hands_in_view
 from render.config import RenderConfig, SpawnKey
 from render.frames import RenderedFrame
@@ -32,8 +33,9 @@ from render.subject import Model, Subject, load_subject, source_of
 
 _MOST_STUDIOS: Final = 32  # of people with painted skins that are kept, some 5 MB each
 
-Cameras = Camera | Sequence[Camera] | str
-"""A camera or several of the user's own, used as they are; or the name of a preset, which is placed."""
+Cameras = Camera | CameraRig | Sequence[Camera] | str
+"""A camera, a rig or several cameras of the user's own, used as they are; or the name of a preset, which is
+placed."""
 
 
 def draw(
@@ -81,7 +83,8 @@ def configured(config: RenderConfig | None, camera: Cameras | None, seed: int | 
         return config
     if isinstance(camera, str):
         return dataclasses.replace(config, view=dataclasses.replace(config.view, camera=camera))
-    given = (camera,) if isinstance(camera, Camera) else camera
+    several = camera.cameras if isinstance(camera, CameraRig) else camera
+    given = (several,) if isinstance(several, Camera) else several
     cameras = tuple(given) if isinstance(given, Iterable) else ()
     if not cameras or not all(isinstance(one, Camera) for one in cameras):
         raise ArgumentError(f"camera is {camera!r}, expected a Camera, several, or the name of a preset")

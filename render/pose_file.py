@@ -47,7 +47,7 @@ class OwnPoses(NamedTuple):
 
 
 def read_pose_file(path: Path, num_hands: int) -> OwnPoses:
-    """Poses of an `.npz` that `numpy.savez` wrote; docs/own_poses.md has its arrays.
+    """Poses of an `.npz` that `numpy.savez` wrote; docs/rendering.md has its arrays.
 
     Args:
         path: The file; nothing in it is unpickled.

@@ -70,7 +70,8 @@ def render_take(
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         times: Time of each pose (T,) [s]; poses are no motion without them.
         people: Who strikes your poses, instead of the model: a number of drawn people, or their hands.
-        person: Number of the person in each pose (T,); distributed at random when not given.
+        person: Which of the people is in each pose (T,); when not given, a number of people is distributed at
+            random, and of hands there is one, or one for each pose.
         glove: Marker layout on the hands of your poses, where they wear gloves; dense19 when not given.
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
         workers: Number of processes, all cores when not given; or an executor, as Dask's

@@ -20,7 +20,7 @@ from handsim.hand.keypoints import NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.records import pack_hand
 from handsim.hand.shape import HandShape, sample_shape
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, SIDES, Side
+from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from handsim.space.camera import Camera, preset
 from poses import PoseSampler, sample_poses
 from poses.shapes.sampling import load_sampler, mixed_angles
@@ -79,8 +79,8 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
     NaN, and not visible.
 
     Args:
-        sampler: Draws joint angles (T, 20) [rad], which are made valid, or poses (T, 27), or poses of two
-            hands (T, 2, 27); a function like `PoseSampler`, or its `module:name`. By default handsim's own.
+        sampler: Draws joint angles (T, 20) [rad] or whole poses (T, 27) of one hand, which are made valid: a
+            function like `PoseSampler`, its `module:name`, or its entry point. By default handsim's own.
         poses: Poses to draw from at random instead, as `render.draw` takes them.
         takes: Takes to draw frames from at random instead, or their paths.
         model: The hand, or both; another adult with every person when not given. Takes have their own.
@@ -140,7 +140,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         self._crop, self._fill = crop, fill
         self._people, self._sitting, self._batch, self._start = people, sitting, batch, start
         self._model, self._side, self._glove = model, side, glove
-        self._sampler = load_sampler(sampler) if isinstance(sampler, str) else sampler
+        self._sampler = mixed_angles if sampler is None else load_sampler(sampler)
         self._poses = None if poses is None else np.asarray(poses, dtype=np.float64)
         given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
         self._takes = [load_subject(source_of(take, model=model), seed=self.seed) for take in given]
@@ -188,24 +188,10 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         if self._poses is not None:
             qpos = self._poses[rng.integers(len(self._poses), size=self._sitting)]
         else:
-            qpos = self._sampled(models_of(model, 2 if isinstance(model, tuple) else 1)[0], rng)
+            qpos = sample_poses(models_of(model, 1)[0], self._sitting, self._sampler, rng=rng)
         if qpos.ndim == 3 and self._model is None:
             model = (HandModel(shape.with_side("right")), HandModel(shape.with_side("left")))
         return subject_of_poses(qpos, model=model, glove=self._glove)
-
-    def _sampled(self, model: HandModel, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Poses by the sampler."""
-        sampler = mixed_angles if self._sampler is None else self._sampler
-        drawn = np.asarray(sampler(model, self._sitting, rng=rng), dtype=np.float64)
-        if drawn.shape == (self._sitting, NUM_JOINTS):
-            return sample_poses(model, self._sitting, lambda *_, **__: drawn, rng=rng)
-        if drawn.shape not in {(self._sitting, NUM_QPOS), (self._sitting, 2, NUM_QPOS)}:
-            raise ArgumentError(
-                f"the sampler returned an array of shape {drawn.shape} for {self._sitting} poses, expected "
-                f"({self._sitting}, {NUM_JOINTS}), ({self._sitting}, {NUM_QPOS}) or ({self._sitting}, 2, "
-                f"{NUM_QPOS})"
-            )
-        return drawn
 
     def _picture(self, number: int, sitting: _Sitting, rank: int) -> dict[str, torch.Tensor]:
         rng = SpawnKey.STREAM.rng(self.seed, _PICTURE, number)

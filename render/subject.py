@@ -17,7 +17,7 @@ from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
 from handsim.errors import ArgumentError, CaptureError, choices
 from handsim.files.inputs import checksum
-from handsim.hand.model import HandModel
+from handsim.hand.model import HandModel, load_model
 from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.shape import HandShape, sample_shape
 from handsim.hand.topology import SIDES, Side
@@ -198,7 +198,8 @@ def subject_of_poses(
             given.
         times: Time of each frame (T,), increasing [s]; poses are no motion without them.
         people: Who strikes the poses, instead of the model: a number of drawn people, or their hands.
-        person: Number of the person in each frame (T,); distributed at random when not given.
+        person: Which of the people is in each frame (T,); when not given, a number of people is distributed
+            at random, and of hands there is one, or one for each frame.
         glove: Marker layout on the hands, where they wear gloves.
         seed: Seed of the people.
 
@@ -208,8 +209,12 @@ def subject_of_poses(
     """
     array = np.asarray(qpos)
     models = models_of(model, 2 if array.ndim == 3 else 1)
-    shapes = None if people is None or isinstance(people, int) else tuple(_model(one).shape for one in people)
-    _check_people(people if isinstance(people, int) else None)
+    if model is not None and person is not None and people is None:
+        raise ArgumentError("person says who strikes each pose, and the model is one hand; give people")
+    count = people if isinstance(people, int) else None
+    _check_people(count)
+    known = () if people is None or isinstance(people, int) else people
+    shapes = tuple(load_model(one).shape for one in known) or None
     poses = check_poses(
         array,
         len(models),
@@ -218,13 +223,13 @@ def subject_of_poses(
         shapes=shapes,
     )
     cast = None
-    if model is None or people is not None or person is not None:
-        cast = _cast(poses, people if isinstance(people, int) else None, seed)
+    if model is None or people is not None:
+        cast = _cast(poses, count, seed)
     hands = [pack_hand(shape) for shape in (*(one.shape for one in models), *(shapes or ()))]
     told = (array for array in (poses.qpos, poses.times, poses.person) if array is not None)
     name = _digest(*told, np.array(hands, dtype=HAND_DTYPE))
-    layout = load_layout(glove) if isinstance(glove, str) else glove
-    record = {"people": people if isinstance(people, int) else None, "glove": layout.name}
+    layout = load_layout(glove)
+    record = {"people": count, "glove": layout.name}
     return _posed(name, poses, models, layout, cast, record)
 
 
@@ -272,7 +277,7 @@ def models_of(model: Model | tuple[Model, Model] | None, num_hands: int) -> tupl
     """The hands of poses: those given, or a right one, or both."""
     if model is None:
         return tuple(HandModel.named("M", side=side) for side in SIDES[::-1][:num_hands])
-    models = tuple(_model(one) for one in model) if isinstance(model, tuple | list) else (_model(model),)
+    models = tuple(load_model(one) for one in (model if isinstance(model, tuple | list) else (model,)))
     if len(models) == 1 and num_hands == 2:
         other: Side = "left" if models[0].shape.side == "right" else "right"
         models = (models[0], HandModel(models[0].shape.with_side(other)))
@@ -283,18 +288,6 @@ def models_of(model: Model | tuple[Model, Model] | None, num_hands: int) -> tupl
             "for each, and one hand of each side"
         )
     return models
-
-
-def _model(model: Model) -> HandModel:
-    if isinstance(model, HandModel):
-        return model
-    if isinstance(model, HandShape):
-        return HandModel(model)
-    if isinstance(model, str):
-        return HandModel.named(model)
-    raise ArgumentError(
-        f"model is a {type(model).__name__}, expected a HandModel, a HandShape or the name of a size"
-    )
 
 
 def _check_people(people: int | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,11 @@ ROOT = Path(__file__).resolve().parents[1]
 def pytest_configure() -> None:
     """Two test processes with two threads each would wait for one another most of the time."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch reads it when it is imported
+    # What tests learn is theirs alone; workers of pytest-xdist share it.
+    if "HANDSIM_TEST_CACHE" not in os.environ:
+        os.environ["HANDSIM_TEST_CACHE"] = os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(
+            prefix="handsim-cache-"
+        )
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -47,4 +47,5 @@ def designed_glove(worn: MarkerLayout) -> MarkerLayout:
     if worn.name not in list_layouts():
         return worn
     designed = load_layout(worn.name)
-    return designed if designed.names == worn.names else worn
+    places, own = ([(one.name, one.bone) for one in glove.markers] for glove in (designed, worn))
+    return designed if places == own else worn

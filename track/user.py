@@ -13,6 +13,7 @@ import numpy as np
 
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit, nominal_fit
+from gloves.hand_files import write_hand
 from gloves.layout import MarkerLayout, stored_layout
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, FileError, HandSimError, choices
@@ -106,6 +107,28 @@ class User(Sequence[GloveFit]):
             if side not in known:
                 raise ArgumentError(choices(side, known, noun="hand"))
         return dataclasses.replace(self, hands=tuple(known[side] for side in sides))
+
+    def of_side(self, side: Side | None = None) -> GloveFit:
+        """The hand of a side; when not given the right hand, or the only one.
+
+        Raises:
+            ArgumentError: The user has no such hand.
+        """
+        return self.of_sides(["right" if "right" in self.sides else "left"] if side is None else [side])[0]
+
+    def export(self, path: str | Path, side: Side | None = None, *, actuators: bool = False) -> None:
+        """Write a hand for other programs, in the flat pose; meters, radians, kilograms.
+
+        Args:
+            path: The file: .xml (MuJoCo, with the markers as sites), .urdf, or .glb (rigged skin, y up).
+            side: Which hand; when not given the right hand, or the only one.
+            actuators: Position servos in the .xml.
+
+        Raises:
+            ArgumentError: The name ends otherwise, or the user has no such hand.
+            OSError: The file cannot be written.
+        """
+        write_hand(Path(path), self.of_side(side), actuators=actuators)
 
     def save(self, path: str | Path) -> None:
         """Write hands and gloves as JSON; `load_user` gives the same numbers again.

@@ -50,7 +50,9 @@ def load_labeler(
         return _of_layout(load_layout(glove), glove) if _is_layout(glove) else _of(glove)  # type: ignore[arg-type]
     layout = load_layout(glove)  # type: ignore[arg-type]
     if labeler == ANY_LAYOUT:
-        return _for_any(layout)
+        from train.any_layout.learned_gloves import learned_labeler  # torch
+
+        return learned_labeler(layout)
     found = _of(labeler)
     if found.marker_names != layout.names:
         raise WeightsError(
@@ -71,30 +73,20 @@ def _is_layout(glove: Any) -> bool:
 def _of_layout(layout: MarkerLayout, glove: MarkerLayout | str | Path) -> Labeler:
     """The labeler that was trained on a layout, or the one for any."""
     for name in shipped_labelers():
-        if _is_worn(layout, load_layout(name)):
+        if load_layout(name) == layout:
             return load_stored_labeler(name)
+    from train.any_layout.learned_gloves import is_learned, learned_labeler  # torch
+
     shown = layout.name if isinstance(glove, MarkerLayout) else glove
+    how = "has learned it before" if is_learned(layout) else "learns it within a minute, once"
     warnings.warn(
-        f"no labeler was trained on glove '{shown}', so that the one for any layout learns it within a "
-        f"minute; a better one takes handsim generate --glove {shown} --out SET && handsim train SET "
-        "--out RUN, and --labeler RUN",
+        f"no labeler was trained on glove '{shown}', so that the one for any layout labels it, which {how}; "
+        f"a better one takes handsim generate --glove {shown} --out SET && handsim train SET --out RUN, and "
+        "--labeler RUN",
         HandSimWarning,
         stacklevel=3,
     )
-    return _for_any(layout)
-
-
-def _is_worn(layout: MarkerLayout, designed: MarkerLayout) -> bool:
-    """Whether a layout is a designed one as somebody wears it: markers slip, but stay on their bones."""
-    return layout.name == designed.name and [(one.name, one.bone) for one in layout.markers] == [
-        (one.name, one.bone) for one in designed.markers
-    ]
-
-
-def _for_any(layout: MarkerLayout) -> Labeler:
-    from train.any_layout.fine_tuning import fine_tuned_labeler  # torch
-
-    return fine_tuned_labeler(layout)
+    return learned_labeler(layout)
 
 
 def _of(labeler: Any) -> Labeler:

@@ -34,7 +34,8 @@ from train.simulation.held_out import held_out_markers
 from train.simulation.room_settings import KINDS, TWINS
 from train.simulation.takes import simulate_take
 
-PUBLISHED_GAPS: Final = "3-4", "24-43"  # median and p90 of real finger markers' gaps [frames], as in docs
+# Median and p90 of real finger markers' gaps [frames]; docs/room_numbers.md.
+PUBLISHED_GAPS: Final = "3-4", "24-43"
 FIGURES: Final = {
     "slot_accuracy": "Accuracy (slots)",
     "point_accuracy": "Accuracy (points)",

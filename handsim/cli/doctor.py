@@ -83,6 +83,7 @@ def examine() -> list[Finding]:
         check_drawing(*_finish(drawing)),
         check_gpu(*_finish(gpu)),
         check_kernel_cache(),
+        check_learned_gloves(),
         *check_room(),
     ]
 
@@ -180,6 +181,15 @@ def check_kernel_cache() -> Finding:
     remedy = "" if lasts and writable else f"set {VARIABLE} to a folder of yours that lasts"
     found = str(folder) if writable else f"{folder}, which cannot be written"
     return Finding("compiled kernels", found, "a folder that lasts", remedy, needed=False)
+
+
+def check_learned_gloves() -> Finding:
+    """Where the labelers of gloves that were learned are kept, and how many there are."""
+    from platformdirs import user_cache_dir
+
+    folder = Path(user_cache_dir("handsim", appauthor=False)) / "gloves"
+    count = len(list(folder.glob("*.safetensors")))
+    return Finding("learned gloves", f"{count} in {folder}")
 
 
 def check_room() -> Iterator[Finding]:

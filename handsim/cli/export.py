@@ -15,29 +15,30 @@ from handsim.app.messages import print_line
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import check_outputs
 from handsim.motion_files.motion import UpAxis
+from track.user import load_user
 
 
 def export(
     source: Annotated[str, tyro.conf.Positional], out: Path, fps: float | None = None, up: UpAxis = "z"
 ) -> None:
-    """Write the motion of a take, or a trained labeler, for other programs.
+    """Write the motion of a take, a user's hand, or a trained labeler, for other programs.
 
     Args:
-        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); or a labeler, by
-            the name of a glove with a shipped one or the folder of a trained one.
+        source: A take (.npz, of `handsim track` or the .truth.npz of `handsim simulate`); a user's file
+            (.json); or a labeler, by the name of a glove with a shipped one or the folder of a trained one.
         out: The file. Of a take .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint
             angles and positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json;
-            of a labeler .onnx, which labels without torch.
+            of a user .xml (MuJoCo), .urdf or .glb; of a labeler .onnx, which labels without torch.
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default.
     """
     if source.lower().endswith((".npz", f".npz{GROWING}")):
         _export_take(Path(source), out, fps, up)
     elif source.lower().endswith(".json"):
-        raise ArgumentError(
-            f"cannot export '{source}', expected a take (.npz) or a labeler; `handsim hand --shape` writes "
-            "the hand of a user's file"
-        )
+        check_outputs([source], [out])
+        user = load_user(source)
+        user.export(out)
+        print_line(f"{out}: {user.of_side().side} hand of {source}; handsim hand --shape has more options")
     else:
         _export_labeler(source, out)
 

@@ -198,14 +198,14 @@ def score_glove(
     from track.glove_advice.advice import advice
     from track.glove_advice.layout_score import score_layout
     from track.glove_advice.score_page import write_score_page
-    from train.any_layout.fine_tuning import fine_tuned_labeler
+    from train.any_layout.learned_gloves import learned_labeler
     from train.glove_labeler import load_labeler
 
     rng = np.random.default_rng(seed)
     with Console(stderr=True).status("simulating hands") as status:
         hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
-        status.update("learning the layout, about a minute")
-        known = fine_tuned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
+        status.update("learning the layout, about a minute the first time")
+        known = learned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
         status.update("labeling")
         score = score_layout(layout, hands, known, rng=rng)
     _tell(score)

@@ -125,7 +125,7 @@ def render(
         take: A tracked take (.npz), or the truth of a simulated one (.truth.npz).
         out: Folder for the pictures, their annotations and contact_sheet.png; or a folder of an object store,
             as s3://bucket/prefix (docs/object_stores.md).
-        poses: Poses of your own (.npz) instead of a take; docs/own_poses.md has the arrays.
+        poses: Poses of your own (.npz) instead of a take; docs/rendering.md has the arrays.
         hands: Whose poses these are, in the file's order: right, left, or both.
         people: Number of people that they are distributed over; one for each shard when not given.
         glove: Their marker layout with --dress glove: a shipped name or the path of a .toml file.

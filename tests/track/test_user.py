@@ -6,11 +6,13 @@ import dataclasses
 import json
 import os
 
+import mujoco
 import numpy as np
 import pytest
 
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
+from handsim.cli.main import main
 from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
@@ -54,6 +56,18 @@ def test_what_cannot_be_saved_is_told(hands, tmp_path):
     with pytest.raises(UserError, match="cannot be written"):
         User(hands).save(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_user_s_hand_leaves_with_its_markers(hands, tmp_path, capsys):
+    user = User(hands)
+    user.save(tmp_path / "user.json")
+    user.export(tmp_path / "left.xml", "left")
+    assert main(["export", str(tmp_path / "user.json"), "--out", str(tmp_path / "hand.xml")]) == 0
+    assert capsys.readouterr().out.startswith(f"{tmp_path / 'hand.xml'}: right hand of")
+    for name, hand in (("left.xml", hands[0]), ("hand.xml", hands[1])):
+        assert mujoco.MjModel.from_xml_path(str(tmp_path / name)).nsite == hand.layout.num_markers
+    with pytest.raises(ArgumentError, match=r"expected a name that ends in \.xml, \.urdf, \.glb"):
+        user.export(tmp_path / "hand.stl")
 
 
 def spoil_schema(content):

@@ -18,7 +18,8 @@ from train.labelers.set_labeler import TrainedSetLabeler
 
 
 @pytest.fixture
-def quick(monkeypatch):
+def quick(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 64, "seed": 0})
 
 

@@ -50,7 +50,7 @@ def fine_tuned_labeler(
         LayoutError: A marker misses the skin.
     """
     rng = np.random.default_rng(seed)
-    labeler = LayoutLabeler(layout, seed=seed)
+    labeler = LayoutLabeler.at_once(layout, seed=seed)
     rows = _simulated_rows(layout, as_rig(rig), 2 * num_clouds // 3, rng)
     network = copy.deepcopy(labeler.network).train()
     recipe = batch_recipe(TrainConfig(batch=_BATCH), layout.num_markers)

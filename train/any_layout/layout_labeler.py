@@ -7,10 +7,10 @@ every two markers over people and poses, and the pose prior (`train.matching.pos
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import torch
@@ -33,7 +33,8 @@ from train.threads import labeling_threads
 NUM_POSES: Final = 40_000
 """Poses from which a layout is known; fewer make a coarser pose prior."""
 WEIGHTS, CARD = "any_layout.safetensors", "any_layout.json"
-_SHIPPED: Final = Path(__file__).parents[1] / "weights"
+SHIPPED: Final = Path(__file__).parents[1] / "weights"
+_NETWORK, _PRIOR, _DISTANCES = "network.", "prior.", "distances"
 _CHUNK: Final = 500  # poses
 
 
@@ -42,30 +43,65 @@ class LayoutLabeler:
 
     Args:
         layout: The glove.
-        network: The network; the shipped one when not given.
-        num_poses: Poses from which the layout is known.
-        seed: Of those poses.
-
-    Raises:
-        LayoutError: A marker misses the skin.
+        network: The network.
+        distances: What the network gets of the layout, see `mean_features`.
+        prior: What it knows of hands as wholes.
     """
 
     def __init__(
         self,
         layout: MarkerLayout,
-        network: LayoutNetwork | None = None,
-        *,
-        num_poses: int = NUM_POSES,
-        seed: int = 0,
+        network: LayoutNetwork,
+        distances: Float[Tensor, "1 M M K"],
+        prior: PosePrior | None,
     ) -> None:
+        self.network, self.distances, self.prior = network.eval(), distances, prior
+        self.marker_names = layout.names
+
+    @classmethod
+    def at_once(cls, layout: MarkerLayout, *, num_poses: int = NUM_POSES, seed: int = 0) -> Self:
+        """The shipped network with what a few seconds of simulation tell of a layout.
+
+        Args:
+            layout: The glove.
+            num_poses: Poses from which the layout is known.
+            seed: Of those poses.
+
+        Raises:
+            LayoutError: A marker misses the skin.
+        """
         rng = np.random.default_rng(seed)
         markers = sample_worn_markers(layout, num_poses, rng=rng)
-        self.network = (shipped_network() if network is None else network).eval()
-        self.marker_names = layout.names
-        self.prior: PosePrior | None = learn_pose_prior(markers, rng=rng)
-        """What it knows of hands as wholes."""
-        self.distances = mean_features(markers, self.network.config)[None]
-        """What the network gets of the layout."""
+        network, prior = shipped_network(), learn_pose_prior(markers, rng=rng)
+        return cls(layout, network, mean_features(markers, network.config)[None], prior)
+
+    def tensors(self) -> dict[str, NDArray[np.generic]]:
+        """All that it has learned, by name, for a file."""
+        parts = {f"{_NETWORK}{name}": value.numpy() for name, value in self.network.state_dict().items()}
+        prior = {} if self.prior is None else self.prior.tensors()
+        parts |= {f"{_PRIOR}{name}": value for name, value in prior.items()}
+        return parts | {_DISTANCES: self.distances.numpy()}
+
+    @classmethod
+    def of_tensors(cls, layout: MarkerLayout, tensors: Mapping[str, NDArray[np.generic]]) -> Self:
+        """The labeler out of a file's tensors.
+
+        Raises:
+            WeightsError: They are not those of a labeler of this layout.
+        """
+        network = LayoutNetwork(LayoutNetworkConfig())
+        parts, prior = (
+            {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
+            for prefix in (_NETWORK, _PRIOR)
+        )
+        try:
+            distances = torch.from_numpy(np.array(tensors[_DISTANCES]))
+            network.load_state_dict({name: torch.from_numpy(np.array(one)) for name, one in parts.items()})
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise WeightsError(f"not a labeler of glove '{layout.name}': {error}") from error
+        if distances.shape[:3] != (1, layout.num_markers, layout.num_markers):
+            raise WeightsError(f"not a labeler of the {layout.num_markers} markers of glove '{layout.name}'")
+        return cls(layout, network, distances, PosePrior.of_tensors(prior) if prior else None)
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
@@ -101,11 +137,11 @@ def shipped_network() -> LayoutNetwork:
 
     network = LayoutNetwork(LayoutNetworkConfig())
     try:
-        tensors = load_file(_SHIPPED / WEIGHTS)
+        tensors = load_file(SHIPPED / WEIGHTS)
         network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
     except (SafetensorError, OSError, RuntimeError) as error:
         raise WeightsError(
-            f"{_SHIPPED / WEIGHTS} is missing or damaged; install handsim again ({error})"
+            f"{SHIPPED / WEIGHTS} is missing or damaged; install handsim again ({error})"
         ) from error
     return network
 

@@ -58,7 +58,7 @@ Sections = dict[str, Values]
 
 
 def read_opencv_cameras(path: Path) -> tuple[Camera, ...]:
-    """The camera of a calibration, both of a stereo pair, or all of a file (docs/own_poses.md has the names).
+    """The camera of a calibration, both of a stereo pair, or all of a file (docs/rendering.md has the names).
 
     Args:
         path: A `.yml`, `.yaml` or `.json` file. Of `intrinsics.yml` and `extrinsics.yml`, as OpenCV's stereo

@@ -136,7 +136,7 @@ def test_a_take_without_a_hand_is_refused(folder, tmp_path, capsys):
         ("tracked.npz", "hands.fbx", ", ".join(ENDINGS)),
         ("tracked.npz", "hands.onnx", "cannot write a take"),
         ("dense19", "hands.glb", "expected a name that ends in .onnx; takes, which end in .npz, become .glb"),
-        ("user.json", "hand.xml", "`handsim hand --shape` writes the hand of a user's file"),
+        ("user.json", "hand.xml", "user.json: cannot be read"),
         ("missing.npz", "hands.glb", "cannot be read"),
         ("tracked.npz", "tracked.npz", "expected a name that ends in"),
     ],

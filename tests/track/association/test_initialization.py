@@ -13,7 +13,7 @@ from handsim.space.transforms import random_quaternions
 from poses.shapes.validity import sample_valid_angles
 from track.association.hand_state import HandState
 from track.association.initialization import MOST_POINTS, HandInitializer
-from train.labelers.storage import load_labeler
+from train import load_labeler
 
 SIDES: tuple[Side, Side] = ("right", "left")
 

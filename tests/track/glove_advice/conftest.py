@@ -24,5 +24,5 @@ def tips_hands(tips):
 
 @pytest.fixture(scope="session")
 def tips_score(tips, tips_hands):
-    labeler = LayoutLabeler(tips, num_poses=2000)
+    labeler = LayoutLabeler.at_once(tips, num_poses=2000)
     return score_layout(tips, tips_hands, labeler, rng=np.random.default_rng(1))

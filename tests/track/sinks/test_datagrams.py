@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
-import time
+from types import SimpleNamespace
 
 import msgpack
 import pytest
@@ -13,6 +13,7 @@ from pythonosc.dispatcher import Dispatcher
 from pythonosc.osc_server import BlockingOSCUDPServer
 
 from handsim.errors import ArgumentError
+from tests.waiting import LONG, wait_for
 from track.sinks import datagrams
 from track.sinks.addresses import open_sink
 
@@ -21,7 +22,7 @@ from track.sinks.addresses import open_sink
 def receiver():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.bind(("127.0.0.1", 0))
-        one.settimeout(2.0)
+        one.settimeout(LONG)
         yield one
 
 
@@ -35,9 +36,7 @@ def test_frames_reach_an_osc_server(message):
         for number in range(20):
             sink.send(message(number))
         sink.close()
-        until = time.monotonic() + 2.0
-        while sum(address == "/handsim/frame" for address, _ in heard) < 20 and time.monotonic() < until:
-            time.sleep(0.01)
+        wait_for(lambda: sum(address == "/handsim/frame" for address, _ in heard) == 20)
         server.shutdown()
     frames = [values[0] for address, values in heard if address == "/handsim/frame"]
     assert frames == list(range(20)) and heard[0] == ("/handsim/schema", (1,))
@@ -56,20 +55,15 @@ def test_documents_reach_a_socket(query, decode, receiver, message):
 
 
 def test_who_listens_later_hears_the_header_too(receiver, message, monkeypatch):
-    monkeypatch.setattr(datagrams, "_HEADERS", 0.2)
+    now = [50.0]
+    monkeypatch.setattr(datagrams, "time", SimpleNamespace(monotonic=lambda: now[0]))
     sink = open_sink(f"udp://127.0.0.1:{receiver.getsockname()[1]}?points=yes")
-    kinds = []
     for number in range(8):
         sink.send(message(number))
-        time.sleep(0.05)
-    receiver.settimeout(0.05)
-    try:
-        while True:
-            kinds.append(json.loads(receiver.recv(65536)))
-    except TimeoutError:
-        pass
-    assert 2 <= [one["type"] for one in kinds].count("header") <= 4
-    assert len(kinds[1]["points"]) == len(kinds[1]["labels"]) == 5
+        now[0] += 0.25
+    got = [json.loads(receiver.recv(65536)) for _ in range(10)]
+    assert [one["type"] for one in got] == ["header", *["frame"] * 4] * 2
+    assert len(got[1]["points"]) == len(got[1]["labels"]) == 5
     sink.close()
 
 

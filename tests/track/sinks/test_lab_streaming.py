@@ -52,13 +52,13 @@ from conftest import make_message
 from track.sinks.addresses import open_sink
 sink = open_sink("lsl:hands")
 sink.send(make_message(0))
-(info,) = pylsl.resolve_byprop("name", "hands", timeout=10.0)
+(info,) = pylsl.resolve_byprop("name", "hands", timeout=120.0)
 inlet = pylsl.StreamInlet(info)
-inlet.open_stream(timeout=10.0)
+inlet.open_stream(timeout=120.0)
 for number in range(1, 6):
     sink.send(make_message(number))
-samples = [inlet.pull_sample(timeout=5.0)[0] for _ in range(5)]
-described = inlet.info(timeout=5.0)
+samples = [inlet.pull_sample(timeout=120.0)[0] for _ in range(5)]
+described = inlet.info(timeout=120.0)
 labels, units = described.get_channel_labels(), described.get_channel_units()
 print(json.dumps([samples, labels, units, described.type(), described.desc().child_value("schema")]))
 sink.close()

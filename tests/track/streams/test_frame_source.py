@@ -11,6 +11,7 @@ import pytest
 
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
+from tests.waiting import LONG
 from track.streams.frame_source import LiveStream, SourceStream, StreamedFrame, capture_frames
 
 
@@ -24,7 +25,8 @@ class Listed:
     """A source of given frames; an exception among them is raised."""
 
     def __init__(self, *frames: object, waits: bool = False) -> None:
-        self.frames, self.waits, self.closed = frames, waits, threading.Event()
+        self.frames, self.waits = frames, waits
+        self.closed, self.waiting = threading.Event(), threading.Event()
 
     def __iter__(self):
         for one in self.frames:
@@ -32,6 +34,7 @@ class Listed:
                 raise one
             yield one
         if self.waits:
+            self.waiting.set()
             self.closed.wait()
 
     def close(self) -> None:
@@ -57,7 +60,9 @@ def test_points_that_are_missing_are_left_out():
 
 
 def test_a_silence_is_told_with_the_last_number():
-    stream = SourceStream(Listed(frame(3), waits=True), "mine", silence=0.05)
+    source = Listed(frame(3), waits=True)
+    stream = SourceStream(source, "mine", silence=0.05)
+    assert source.waiting.wait(LONG)
     first, second, third = itertools.islice(stream, 3)
     assert not first.silent and second.silent and third.silent
     assert (second.number, second.time, second.points.shape) == (3, 0.03, (0, 3))
@@ -67,8 +72,9 @@ def test_a_silence_is_told_with_the_last_number():
 
 def test_it_ends_when_it_is_to_end_after_what_has_come():
     over = threading.Event()
-    stream = SourceStream(Listed(*map(frame, range(5)), waits=True), "mine", ended=over.is_set)
-    time.sleep(0.1)
+    source = Listed(*map(frame, range(5)), waits=True)
+    stream = SourceStream(source, "mine", ended=over.is_set)
+    assert source.waiting.wait(LONG)
     over.set()
     assert [one.number for one in stream] == [0, 1, 2, 3, 4]
     stream.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections import Counter, defaultdict
@@ -22,9 +23,11 @@ from handsim.hand.model import join_qpos
 from handsim.space.objects import named_object
 from handsim.space.transforms import random_quaternions
 from poses.shapes.sampling import sample_poses
+from tests.waiting import wait_for
 from track.viewer.server import LOOPBACK, opened_server
 
 FRAMES = 30
+_MARKS = itertools.count()
 
 
 class Page:
@@ -40,6 +43,7 @@ class Page:
         self.camera: dict[str, np.ndarray] = {}
         self.counts: Counter[str] = Counter()
         self.bytes = 0
+        self._server, self._mark = server, ""
         self._socket = connect(
             f"ws://{server.get_host()}:{server.get_port()}",
             subprotocols=[f"viser-v{viser.__version__}"],
@@ -61,18 +65,18 @@ class Page:
         self.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
 
     def settle(self, quiet: float = 0.3) -> None:
-        """Wait until nothing more comes."""
+        """Wait until all that the server was to send is here, and nothing more comes."""
+        mark = f"mark {next(_MARKS)}"
+        self._server.gui.set_panel_label(mark)  # sent after all that waits
+        self.wait(lambda: self._mark == mark)
         seen = -1
         while seen != self.bytes:
             seen = self.bytes
             time.sleep(quiet)
 
-    def wait(self, condition: Callable[[], bool], limit: float = 30.0) -> None:
+    def wait(self, condition: Callable[[], bool]) -> None:
         """Wait until something is so."""
-        end = time.monotonic() + limit
-        while not condition():
-            assert time.monotonic() < end, "it never came"
-            time.sleep(0.02)
+        wait_for(condition)
 
     def says(self, words: str) -> bool:
         """Whether a text of the panel has these words."""
@@ -109,6 +113,9 @@ class Page:
 
     def _take(self, message: dict) -> None:
         kind, name = message["type"], message.get("name")
+        if kind == "SetGuiPanelLabelMessage":
+            self._mark = message["label"]
+            return
         self.counts[kind] += 1
         if kind == "SetBonePositionMessage":
             self.bones[name][message["bone_index"]]["position"] = message["position"]

@@ -21,7 +21,7 @@ from train.labelers.storage import shipped_labelers
 
 @pytest.fixture(scope="module")
 def labeler():
-    return LayoutLabeler(load_layout("starter15"), num_poses=8000)
+    return LayoutLabeler.at_once(load_layout("starter15"), num_poses=8000)
 
 
 @pytest.mark.parametrize(("corruption", "least"), [(Corruption(0, 0), 0.93), (Corruption(4, 2), 0.80)])
@@ -35,7 +35,7 @@ def test_labels_follow_the_order_of_the_layout(labeler):
     """The same glove with its markers listed backwards: the same names."""
     layout = load_layout("starter15")
     backwards = dataclasses.replace(layout, markers=layout.markers[::-1])
-    other = LayoutLabeler(backwards, num_poses=8000)
+    other = LayoutLabeler.at_once(backwards, num_poses=8000)
     assert other.marker_names == layout.names[::-1]
     clouds = list(sample_worn_markers(layout, 60, rng=np.random.default_rng(7)))
     names = [
@@ -49,6 +49,7 @@ def test_labels_follow_the_order_of_the_layout(labeler):
 
 def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 192, "seed": 0})
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     layout = load_layout("starter6")
     save_layout(tmp_path / "mine.toml", layout)
     with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):
@@ -60,7 +61,7 @@ def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, monkeyp
 def test_the_network_is_saved_and_read_again(tmp_path, monkeypatch):
     network = shipped_network()
     save_layout_network(tmp_path, network, 1)
-    monkeypatch.setattr(layout_labeler, "_SHIPPED", tmp_path)
+    monkeypatch.setattr(layout_labeler, "SHIPPED", tmp_path)
     shipped_network.cache_clear()
     try:
         for name, tensor in shipped_network().state_dict().items():

@@ -1,0 +1,77 @@
+"""A hand that does not move, for other programs: a MuJoCo model, a URDF, a rigged mesh, or its skin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+import trimesh
+
+from gloves.fit import GloveFit, attach
+from gloves.layout import load_layout
+from gloves.takes.take import Take
+from handsim.errors import ArgumentError
+from handsim.files.atomic import atomic_write
+from handsim.hand.mjcf import build_spec
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.topology import NUM_JOINTS
+from handsim.hand.urdf import hand_urdf
+
+ENDINGS: Final = (".xml", ".urdf", ".glb")
+MESH_ENDINGS: Final = (".glb", ".obj", ".ply", ".stl")
+_USUAL_GLOVE: Final = "dense19"
+
+
+def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = False) -> None:
+    """Write a hand in the flat pose; meters, radians, kilograms.
+
+    Args:
+        path: The file: .xml (MuJoCo: free joint, twenty hinges, capsules), .urdf, or .glb (its skin with
+            bones and weights, y up).
+        hand: The hand; markers of its glove become sites of the .xml.
+        actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
+
+    Raises:
+        ArgumentError: The name ends otherwise, or servos are asked for in a file that has none.
+        OSError: The file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in ENDINGS:
+        raise ArgumentError(
+            f"cannot write a hand as '{path}', expected a name that ends in {', '.join(ENDINGS)}"
+        )
+    if actuators and suffix != ".xml":
+        raise ArgumentError(f"cannot write servos to '{path}', expected a name that ends in .xml")
+    model = hand.model if isinstance(hand, GloveFit) else hand
+    if suffix == ".glb":  # a take has gloves; the file has none
+        worn = hand if isinstance(hand, GloveFit) else attach(load_layout(_USUAL_GLOVE), model)
+        flat = join_qpos(np.zeros((1, NUM_JOINTS)))
+        Take.of_poses([worn], flat[:, None], rate=1.0).export(path)
+        return
+    with atomic_write(path) as temporary:
+        if suffix == ".urdf":
+            temporary.write_text(hand_urdf(model), "utf-8")
+            return
+        sites = hand.attachment.sites(model) if isinstance(hand, GloveFit) else ()
+        spec = build_spec(model.skeleton, model.capsules, sites=sites, actuators=actuators)
+        spec.compile()  # fills in what the XML writer asks for
+        temporary.write_text(spec.to_xml(), "utf-8")
+        mujoco.MjModel.from_xml_path(str(temporary))  # before it takes its name
+
+
+def write_skin(path: Path, model: HandModel) -> None:
+    """Write the skin in the flat pose [m], in the wrist's frame, in the format of the file's ending.
+
+    Args:
+        path: The file, .glb, .obj, .ply or .stl.
+        model: The hand.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    surface = model.surface
+    skin = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    with atomic_write(path) as temporary:
+        skin.export(temporary, file_type=path.suffix.lower()[1:])

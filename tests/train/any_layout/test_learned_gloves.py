@@ -1,0 +1,61 @@
+"""A glove is learned once: kept, read again, learned anew where the file is damaged, and not kept forever."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.layout import load_layout
+from train.any_layout import learned_gloves
+from train.any_layout.fine_tuning import fine_tuned_labeler
+from train.any_layout.learned_gloves import cache_folder, is_learned, learned_labeler
+
+CLOUD = np.random.default_rng(0).normal(0, 0.05, (8, 3))
+
+
+@pytest.fixture(autouse=True)
+def own_cache(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 64, "seed": 0})
+
+
+def never(*_args, **_options):
+    raise AssertionError("it was learned again")
+
+
+def test_a_glove_is_learned_once(monkeypatch):
+    layout = load_layout("starter6")
+    assert not is_learned(layout)
+    first = learned_labeler(layout)
+    assert is_learned(layout) and len(learned_gloves.learned_gloves()) == 1
+    monkeypatch.setattr(learned_gloves, "fine_tuned_labeler", never)
+    again = learned_labeler(layout)
+    for one, other in zip(first.label_frames([CLOUD]), again.label_frames([CLOUD]), strict=True):
+        np.testing.assert_array_equal(one.labels, other.labels)
+        np.testing.assert_array_equal(one.confidence, other.confidence)
+    moved = dataclasses.replace(layout.markers[0], along=layout.markers[0].along + 0.05)
+    assert not is_learned(dataclasses.replace(layout, markers=(moved, *layout.markers[1:])))
+
+
+def test_a_damaged_file_is_learned_anew():
+    layout = load_layout("starter6")
+    learned_labeler(layout)
+    (file,) = cache_folder().iterdir()
+    file.write_bytes(b"nothing")
+    assert learned_labeler(layout).label_frames([CLOUD])[0].labels.shape == (8,)
+    assert len(file.read_bytes()) > 1000
+
+
+def test_the_least_recently_used_go(monkeypatch):
+    monkeypatch.setattr(learned_gloves, "MOST", 1)
+    for name in ("starter6", "tips8"):
+        learned_labeler(load_layout(name))
+    assert not is_learned(load_layout("starter6")) and is_learned(load_layout("tips8"))
+
+
+def test_a_cache_that_cannot_be_written_costs_no_labels(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert learned_labeler(load_layout("starter6")).label_frames([CLOUD])[0].labels.shape == (8,)
