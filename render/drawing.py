@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
+from handsim._checks import check_type
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera
 from handsim.space.cameras import CameraRig
@@ -77,8 +78,10 @@ def draw(
 def configured(config: RenderConfig | None, camera: Cameras | None, seed: int | None) -> RenderConfig:
     """A configuration with the camera and the seed that were named beside it."""
     config = RenderConfig() if config is None else config
+    check_type("config", config, RenderConfig, "a RenderConfig")
     if seed is not None:
-        config = dataclasses.replace(config, seed=seed)
+        check_type("seed", seed, (int, np.integer), "a whole number")
+        config = dataclasses.replace(config, seed=int(seed))
     if camera is None:
         return config
     if isinstance(camera, str):
@@ -128,11 +131,13 @@ class Drawing:
         if frames is None:
             present = np.isfinite(self.take.qpos[..., 0]).any(axis=1)
             return [n for n in range(0, self.take.num_frames, self.config.every) if present[n]]
-        numbers = [int(number) for number in frames]
+        check_type("frames", frames, Iterable, "numbers of frames")
+        numbers = list(frames)
         for number in numbers:
+            check_type("a frame", number, (int, np.integer), "a whole number")
             if not 0 <= number < self.take.num_frames:
                 raise ArgumentError(f"frame {number} was asked for, expected 0 to {self.take.num_frames - 1}")
-        return numbers
+        return [int(number) for number in numbers]
 
     def shards(self) -> list[list[int]]:
         """Frames of each shard."""

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
+from handsim._checks import check_type
 from handsim.app.interrupts import Stopped
 from handsim.app.output import Make, Output, Place, open_output, place_of
 from handsim.app.workers import check_workers, run_jobs
@@ -86,6 +87,7 @@ def render_take(
         HandSimError: The take or the settings cannot be drawn, or all frames would be left out; finished
             shards are kept.
     """
+    check_type("formats", formats, (str, list, tuple), "names of formats", FORMATS)
     formats = (formats,) if isinstance(formats, str) else tuple(formats)
     config = configured(config, camera, None).settled()
     _check_formats(formats, config)
@@ -171,6 +173,7 @@ def left_out_frames(out: str | Place) -> list[int]:
 
 def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
     for name in formats:
+        check_type("a format", name, str, "its name", FORMATS)
         if name not in FORMATS:
             raise HandSimError(choices(name, FORMATS, noun="format"))
         if name in NEED_COLORS and "rgb" not in config.passes:

@@ -15,18 +15,19 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
+from handsim._checks import check_number, check_span, check_type, shown_value
 from handsim.errors import ArgumentError, choices
 from handsim.hand.keypoints import NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.records import pack_hand
 from handsim.hand.shape import HandShape, sample_shape
 from handsim.hand.topology import NUM_QPOS, SIDES, Side
-from handsim.space.camera import Camera, preset
+from handsim.space.camera import PRESETS, Camera, preset
 from poses import PoseSampler, sample_poses
 from poses.shapes.sampling import load_sampler, mixed_angles
 from render.cameras.viewpoints import around_hands, crop_around
 from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
-from render.drawing import open_studio, sample_choices
+from render.drawing import configured, open_studio, sample_choices
 from render.frames import HandTruth, RenderedFrame
 from render.sensors.depth_noise import DepthNoiseConfig
 from render.studio import Moment, Studio
@@ -127,21 +128,25 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         super().__init__()
         if sum(given is not None for given in (sampler, poses, takes)) > 1:
             raise ArgumentError("expected one of sampler, poses and takes")
+        check_type("side", side, str, "left, right or either")
         if side not in _SIDE_CHOICES:
             raise ArgumentError(choices(side, _SIDE_CHOICES, noun="side"))
-        if min(people, sitting, batch, start + 1) < 1 or not 0.05 <= fill[0] <= fill[1] <= 1.0:
-            raise ArgumentError(
-                f"people is {people}, sitting {sitting}, batch {batch}, start {start} and fill {fill}, "
-                "expected numbers of at least 1, a start of at least 0, and two shares of 0.05 to 1"
-            )
-        self.config = _settled(RenderConfig() if config is None else config)
-        self.seed = self.config.seed if seed is None else seed
+        counts = {"people": people, "sitting": sitting, "batch": batch, "start": start}
+        for name, count in counts.items():
+            check_type(name, count, (int, np.integer), "a whole number")
+            check_number(name, count, 0 if name == "start" else 1)
+        check_span("fill", fill, 0.05)
+        check_number("the greater share of fill", fill[1], 0.05, 1.0)
+        self.config = _settled(configured(config, None, seed))
+        self.seed = self.config.seed
         self._camera = _camera(self.config.view.camera if camera is None else camera, crop)
         self._crop, self._fill = crop, fill
         self._people, self._sitting, self._batch, self._start = people, sitting, batch, start
         self._model, self._side, self._glove = model, side, glove
         self._sampler = mixed_angles if sampler is None else load_sampler(sampler)
-        self._poses = None if poses is None else np.asarray(poses, dtype=np.float64)
+        self._poses = None if poses is None else _rows(poses)
+        if takes is not None:
+            check_type("takes", takes, (Take, str, Path, list, tuple), "a Take or its path, or several")
         given = (takes,) if isinstance(takes, Take | str | Path) else takes or ()
         self._takes = [load_subject(source_of(take, model=model), seed=self.seed) for take in given]
         if len({len(one.take.hands) for one in self._takes}) > 1:
@@ -251,15 +256,27 @@ def _settled(config: RenderConfig) -> RenderConfig:
 
 def _camera(camera: Camera | str, crop: int | None) -> Camera:
     """The camera that is placed around hands."""
+    check_type("camera", camera, (Camera, str), "a Camera or the name of a preset", PRESETS)
     found = preset(camera) if isinstance(camera, str) else camera
-    if not isinstance(found, Camera):
-        raise ArgumentError(f"camera is {camera!r}, expected a Camera or the name of a preset")
+    if crop is not None:
+        check_type("crop", crop, (int, np.integer), "a number of pixels")
     if crop is not None and (crop < 16 or found.lens.kind != "pinhole"):
         raise ArgumentError(
             f"crop is {crop} and the camera's lens '{found.lens.kind}', expected 16 pixels or more of a "
             "pinhole camera"
         )
     return found
+
+
+def _rows(poses: ArrayLike) -> NDArray[np.float64]:
+    """A user's poses, a row a pose."""
+    try:
+        rows = np.asarray(poses, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"poses is {shown_value(poses)}, expected an array of numbers") from error
+    if rows.ndim not in {2, 3} or not len(rows):
+        raise ArgumentError(f"poses has shape {rows.shape}, expected (T, 20), (T, 27) or (T, 2, 27)")
+    return rows
 
 
 def _picture_arrays(frame: RenderedFrame) -> dict[str, NDArray[np.generic]]:

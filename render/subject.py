@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
 from gloves.takes.take import Take, load_take
+from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError, choices
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, load_model
@@ -211,6 +212,8 @@ def subject_of_poses(
     models = models_of(model, 2 if array.ndim == 3 else 1)
     if model is not None and person is not None and people is None:
         raise ArgumentError("person says who strikes each pose, and the model is one hand; give people")
+    if people is not None:
+        check_type("people", people, (int, list, tuple), "a number of people, or their hands")
     count = people if isinstance(people, int) else None
     _check_people(count)
     known = () if people is None or isinstance(people, int) else people

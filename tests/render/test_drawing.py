@@ -84,6 +84,9 @@ def test_takes_are_drawn_from_memory_and_from_files_alike(tmp_path):
         ({"model": ("M", "L")}, "the models are of 2 hands .right and right. and the poses of 1"),
         ({"camera": 7}, "camera is 7, expected a Camera"),
         ({"camera": "webcam"}, "unknown camera 'webcam'"),
+        ({"frames": 2.5}, "frames is 2.5, expected numbers of frames"),
+        ({"frames": ["a"]}, "a frame is 'a', expected a whole number"),
+        ({"seed": "a"}, "seed is 'a', expected a whole number"),
         ({"frames": [3]}, "frame 3 was asked for, expected 0 to 2"),
     ],
 )
