@@ -1,8 +1,8 @@
 """Takes of two hands that are as unlike a model as real hands are: anybody's, fast, in skin that moves.
 
-The figures are those of the published captures of Han et al. 2018 (docs/room_numbers.md): markers are 1.5 mm
-per axis from any hand that moves as ours does, three tenths of that variance repeat in similar poses, and half
-of the captures move about twice as far from frame to frame as simulated hands do.
+The figures are those of the published captures of Han et al. 2018 (docs/room.md): markers are 1.5 mm per axis
+from any hand that moves as ours does, three tenths of that variance repeat in similar poses, and half of the
+captures move about twice as far from frame to frame as simulated hands do.
 """
 
 from __future__ import annotations
