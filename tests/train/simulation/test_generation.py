@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,7 @@ from handsim.hand.shape import Population
 from handsim.space.cameras import as_rig, save_rig
 from poses.shapes.couplings import HIGH, LOW
 from tests.rigs import mixed_rig
+from tests.waiting import wait_for
 from track.viewer.recordings.datasets import DatasetRecording
 from train.data.shards import MANIFEST, Dataset, hands_name, redrawn_name, rows_name
 from train.reports.dataset_page import write_report
@@ -45,15 +45,15 @@ if __name__ == "__main__":
     generation.make_dataset(config, Path(sys.argv[1]), workers=1)
 """
 
-# A pause after each shard, so that the kill comes before the end however busy the machine is.
-SLOWLY = """
-import time
+# Two shards and no more, so that the kill comes before the end however busy the machine is.
+STALLED = """
+import threading
 make_shard = generation.make_shard
-def make_slowly(*arguments):
-    shard = make_shard(*arguments)
-    time.sleep(1.0)
-    return shard
-generation.make_shard = make_slowly
+def make_two(config, out, shard):
+    if shard == 2:
+        threading.Event().wait()
+    return make_shard(config, out, shard)
+generation.make_shard = make_two
 """
 
 
@@ -117,13 +117,13 @@ def environment() -> dict[str, str]:
 
 def test_a_killed_run_goes_on_to_the_same_bytes(finished, tmp_path):
     out, script = tmp_path / "killed", tmp_path / "make.py"
-    script.write_text(COMMAND.replace("if __name__", SLOWLY + "if __name__"))
+    script.write_text(COMMAND.replace("if __name__", STALLED + "if __name__"))
     process = subprocess.Popen([sys.executable, script, out], env=environment())
-    deadline = time.monotonic() + 60
-    while not (out / rows_name(1)).exists() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    try:
+        wait_for((out / rows_name(1)).exists)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
     (out / ".rows-00002.tmp-1.npy").write_bytes(
         b"half a shard"
     )  # what a kill in the middle of a write leaves

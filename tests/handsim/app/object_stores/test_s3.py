@@ -33,6 +33,7 @@ from tests.handsim.app.object_stores.stored_set import (
     contents,
     write_three,
 )
+from tests.waiting import wait_for
 from train.data.shards import MANIFEST
 from train.simulation import generation
 from train.simulation.generation import make_dataset
@@ -98,13 +99,6 @@ def answers(port: int) -> bool:
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
         return True
     return False
-
-
-def wait_for(condition, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 class Toll:
