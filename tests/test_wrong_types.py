@@ -26,6 +26,7 @@ def flat(model: HandModel, num_poses: int, *, rng: np.random.Generator) -> np.nd
 VALID: dict[str, dict[str, object]] = {
     "handsim.join_qpos": {"angles": np.zeros((1, 20))},
     "handsim.load_rig": {"rig": "six"},
+    "handsim.look_at": {"position": (0, 0, 1), "target": (0, 0, 0)},
     "handsim.sample_shape": {"side": "right", "rng": RNG},
     "poses.load_gestures": {},
     "poses.sample_motion": {"model": "M", "duration": 0.1, "rng": RNG},

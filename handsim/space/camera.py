@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, choices
@@ -151,9 +151,17 @@ def pinhole(
     return Camera(name, size, np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]]))
 
 
-def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
-    """`T_world_camera` of a camera at `position` [m] that looks at `target` [m], upright (world z)."""
-    forward = (target - position) / np.linalg.norm(target - position)
+def look_at(position: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "4 4"]:
+    """`T_world_camera` of a camera at a position (3,) [m] that looks at a target (3,) [m], upright (world z).
+
+    Raises:
+        ArgumentError: One of them is no point, or both are one.
+    """
+    position, target = check_array("position", position, (3,)), check_array("target", target, (3,))
+    distance = np.linalg.norm(target - position)
+    if distance == 0.0:
+        raise ArgumentError(f"target is the position, {position}, expected another point to look at")
+    forward = (target - position) / distance
     up = np.array([0.0, 0.0, 1.0]) if abs(forward[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
