@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 from jaxtyping import Bool
 
-from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-from gloves.takes.take import Take
-from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
 from handsim.errors import HandSimWarning
-from handsim.files.outputs import check_outputs
-from track.capture_labeling import label_capture, labeled_points
-from train.threads import label_on
+
+if TYPE_CHECKING:
+    from gloves.takes.take import Take
 
 
 def label(
@@ -40,6 +36,13 @@ def label(
             not given.
         threads: Threads of the labeler; more than one helps a large network on an idle machine.
     """
+    from gloves.captures.formats import WRITABLE, check_suffix, write_capture
+    from handsim.app.messages import print_line
+    from handsim.app.progress import progress_bar
+    from handsim.files.outputs import check_outputs
+    from track.capture_labeling import label_capture, labeled_points
+    from train.threads import label_on
+
     label_on(threads)
     check_suffix(out, WRITABLE)  # before the work, not after it
     check_outputs((capture, glove, labeler), [out])

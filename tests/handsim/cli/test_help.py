@@ -33,7 +33,7 @@ def test_help_shows_no_types_and_no_empty_defaults(words, capsys, monkeypatch):
         assert odd not in said, odd
 
 
-@pytest.mark.parametrize("words", [[], ["demo"], ["evaluate"]])
+@pytest.mark.parametrize("words", [[], ["demo"], ["evaluate"], ["label"]])
 def test_help_loads_nothing_heavy(words):
     code = "import sys; from handsim.cli.main import main\ntry: main(sys.argv[1:])\nexcept SystemExit: pass\n"
     code += "print(sorted(set(sys.modules) & {'torch', 'numba', 'mujoco', 'scipy', 'matplotlib'}))"
