@@ -17,6 +17,11 @@ from train.labelers.protocol import LABELERS
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 SLOW = {
     "calibration",
+    "cluster",
+    "live_output",
+    "rendering",
+    "stored_arrays",
+    "tracking",
     "formats",
     "training_on_many_devices",
     "tracking_commands",

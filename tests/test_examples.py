@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 
-SLOW = ("05", "11", "14")
+SLOW = ("05", "06", "07", "11", "14")
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from track.capture_tracking import track_capture
 from track.config import TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.kinematics.pose_solver import PoseSolver
-from track.setup import BOTH, AnyHands, Size, TrackerSetup, measured_user
+from track.setup import BOTH, AnyHands, Size, TrackerSetup, found_user
 from track.streams.frame_source import checked_frames
 from track.user import User
 from train.labelers.protocol import Labeler
@@ -87,7 +87,8 @@ def calibrate(
     first, network = setup.user, setup.labeler
     start = first.hands
     if setup.is_measured:
-        first = measured_user(sample_frames(checked_frames(source)), first.layout, first.sides, network)
+        found = found_user(sample_frames(checked_frames(source)), first.layout, first.sides, network)
+        first = found or first
         start = tuple(attach(hand.layout, hand.model) for hand in first)
     take = _label(source, first, network, told)
     done = _calibrate(take, start, told)

@@ -134,9 +134,9 @@ def measured_user(
     frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
 ) -> User:
     """The user whose hands are in some frames; of size M, with a warning, if no hand is found."""
-    size = fit_size(frames, layout, sides, labeler)
-    if size is not None:
-        return User(size.hands(sides), f"auto, {size}")
+    found = found_user(frames, layout, sides, labeler)
+    if found is not None:
+        return found
     warnings.warn(
         f"no hand was found to measure its size; size {USUAL_SIZE} is used, or name a size",
         HandSimWarning,
@@ -144,6 +144,14 @@ def measured_user(
     )
     usual = nominal_user(layout, USUAL_SIZE, sides)
     return User(usual.hands, f"auto, {USUAL_SIZE}")
+
+
+def found_user(
+    frames: Sequence[StreamedFrame], layout: MarkerLayout, sides: Sequence[Side], labeler: Labeler
+) -> User | None:
+    """The user whose hands are in some frames, measured; None if no hand is found."""
+    size = fit_size(frames, layout, sides, labeler)
+    return None if size is None else User(size.hands(sides), f"auto, {size}")
 
 
 def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:

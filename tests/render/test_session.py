@@ -195,6 +195,7 @@ def test_a_full_disk_is_one_sentence_and_finished_tars_are_kept(path, tmp_path):
     assert (tmp_path / "out" / "shard-00001.tar").is_file()
 
 
+@pytest.mark.slow
 def test_no_driver_is_one_sentence_where_opengl_is_wanted(path, tmp_path):
     command = [sys.executable, "-c", MAIN, "render", str(path), "--every", "48", "--workers", "1"]
     environment = {**os.environ, "PYOPENGL_PLATFORM": "egl", "EGL_DEVICE_ID": "4711"}

@@ -180,6 +180,7 @@ def test_bodies_are_kept_beside_the_hands(user, labeler, capture, truth):
     assert (take.labels[2:][~there] < first).all()
 
 
+@pytest.mark.slow
 def test_after_the_warm_up_no_kernel_is_compiled_any_more():
     """A live stream would wait for it: also the kernels of unsure labels are there."""
     run = """

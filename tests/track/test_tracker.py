@@ -140,7 +140,7 @@ def test_hands_labelers_and_settings_of_another_type_are_refused(take, labeler):
         (("right", labeler), "a hand is 'r', expected one in its glove"),
         (([], labeler), "hands are [], expected a left hand"),
         (([hands[0]] * 2, labeler), "expected a left hand, a right hand, or one of each"),
-        ((hands, 3), "labeler is 3, expected a Labeler"),
+        ((hands, 3), "labeler is 3, expected a MarkerLayout, the name or path of one, a Labeler"),
         ((hands, labeler, (), {}), "config is {}, expected a TrackerConfig"),
     ):
         with pytest.raises(ArgumentError) as error:

@@ -33,7 +33,7 @@ from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
 
-pytestmark = pytest.mark.xdist_group("many devices")  # what they share is made once
+pytestmark = [pytest.mark.xdist_group("many devices"), pytest.mark.slow]  # what they share is made once
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
 ONE = TrainConfig(samples=640, batch=32, network=SMALL)

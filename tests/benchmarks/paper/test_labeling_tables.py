@@ -97,6 +97,7 @@ def test_table_3_has_a_row_a_capture_with_the_papers_figures(capsys, monkeypatch
     assert any("real finger markers" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_table_4_has_a_column_a_test_set(capsys, monkeypatch, takes):
     monkeypatch.setenv("COLUMNS", "200")
     # The same captures, but short.

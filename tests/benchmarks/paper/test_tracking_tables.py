@@ -116,6 +116,7 @@ def test_few_cameras(capsys):
     assert set(tables) == {(HAN, "calibrated"), *((name, users) for name in METHODS for users in USERS)}
 
 
+@pytest.mark.slow
 def test_the_paper_has_no_figures_of_other_gloves(capsys):
     assert command(["cameras", "--num-frames", "6", "--glove", "sparse13"]) == 0
     said = capsys.readouterr().out

@@ -68,6 +68,7 @@ def user(tmp_path_factory):
     return folder, GloveFit(model, worn)
 
 
+@pytest.mark.slow
 def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     folder, true = user
     (found,) = load_user(folder / "user.json")
@@ -184,6 +185,7 @@ def test_hands_that_are_not_there_get_the_usual_size(tmp_path, capsys):
     assert "no hand was found to measure its size; size M is used" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_bodies_are_followed_beside_the_hands(capture, tmp_path, capsys):
     truth = load_take(capture.with_suffix(".truth.npz"))
     wand, out, labeled = tmp_path / "wand.toml", tmp_path / "take.npz", tmp_path / "labeled.c3d"
@@ -254,6 +256,7 @@ def test_the_same_command_writes_the_same_bytes(capture, tmp_path):
     assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_command_and_python_track_alike(capture, tmp_path):
     """The size is measured, a body is tracked, and a label is corrected."""
     command, python = tmp_path / "command.npz", tmp_path / "python.npz"

@@ -79,6 +79,7 @@ def calibrated() -> dict[str, tuple[GloveFit, Calibration, list]]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", SIDES)
 def test_a_hand_and_its_glove_come_back(side):
     true, result, _ = calibrated()[side]
@@ -103,6 +104,7 @@ def test_errors_are_as_large_as_told():
     assert result.length_errors.max() < 0.005
 
 
+@pytest.mark.slow
 def test_touches_are_found_and_closed():
     _, result, _ = calibrated()["right"]
     fingers = {touch.finger for touch in result.touches if touch.weight > 0.5}

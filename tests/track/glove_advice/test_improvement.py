@@ -28,6 +28,7 @@ def search_of(layout, keep=(), seed=0):
     return Improvement(layout, load_rig("figure5"), keep, rng=np.random.default_rng(seed))
 
 
+@pytest.mark.slow
 def test_a_hopeless_layout_gets_better_and_keeps_what_it_shall():
     search = search_of(hopeless(), keep=("P2",))
     before, steps = search.worth, []

@@ -63,6 +63,7 @@ def garbage(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, float]:
     return points, ids, draw(TIMES)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(frames=st.lists(garbage(), min_size=1, max_size=6), lead=st.booleans(), data=st.data())
 def test_garbage_never_raises_and_leaves_nothing_behind(bench, frames, lead, data):

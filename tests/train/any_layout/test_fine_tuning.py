@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from gloves.layout import load_layout
 from train.any_layout.fine_tuning import fine_tuned_labeler
@@ -12,6 +13,7 @@ from train.data.augmentation import Corruption
 from train.evaluate import evaluate_labeler
 
 
+@pytest.mark.slow
 def test_a_glove_of_tips_is_labeled_better_after_some_steps():
     layout = load_layout("tips8")
     markers = sample_worn_markers(layout, 300, rng=np.random.default_rng(1))
@@ -29,6 +31,7 @@ def test_a_glove_of_tips_is_labeled_better_after_some_steps():
         assert value.equal(shipped[name])
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_labeler():
     layout = load_layout("starter6")
     one, other = (fine_tuned_labeler(layout, num_clouds=192, seed=3) for _ in range(2))

@@ -39,6 +39,7 @@ def test_a_glove_is_learned_once(monkeypatch):
     assert not is_learned(dataclasses.replace(layout, markers=(moved, *layout.markers[1:])))
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_learned_anew():
     layout = load_layout("starter6")
     learned_labeler(layout)
@@ -48,6 +49,7 @@ def test_a_damaged_file_is_learned_anew():
     assert len(file.read_bytes()) > 1000
 
 
+@pytest.mark.slow
 def test_the_least_recently_used_go(monkeypatch):
     monkeypatch.setattr(learned_gloves, "MOST", 1)
     for name in ("starter6", "tips8"):

@@ -82,6 +82,7 @@ def test_kept_cameras_stay_and_too_many_have_no_room(candidates):
         search.grow(11)
 
 
+@pytest.mark.slow
 def test_a_plan_beats_cameras_in_a_row():
     old = CameraRig("row", named_rig("figure5").cameras[:2])
     wide = pinhole("wide", (1664, 1088), 1188.0)

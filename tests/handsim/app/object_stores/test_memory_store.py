@@ -32,7 +32,7 @@ from tests.handsim.app.object_stores.stored_set import (
 from train.data.shards import MANIFEST, Dataset, array_bytes, row_dtype, rows_name, save_array
 from train.simulation.generation import make_dataset
 
-pytestmark = pytest.mark.xdist_group("object stores")  # what they share is made once
+pytestmark = [pytest.mark.xdist_group("object stores"), pytest.mark.slow]  # what they share is made once
 
 
 def test_a_training_set_in_a_store_has_the_bytes_of_a_folder(memory, whole, tmp_path):
