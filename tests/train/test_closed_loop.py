@@ -134,7 +134,7 @@ def test_training_goes_on_to_the_same_weights(run, tmp_path):
     ("arguments", "sentence"),
     [
         (["label", "TAKE", "--glove", "dense91", "--out", "OUT"], "unknown glove 'dense91'"),
-        (["label", "TAKE", "--labeler", "nowhere", "--out", "OUT"], "unknown labeler 'nowhere'"),
+        (["label", "TAKE", "--labeler", "nowhere", "--out", "OUT"], "unknown labeler or glove 'nowhere'"),
         (["label", "missing.trc", "--labeler", "RUN", "--out", "OUT"], "missing.trc: cannot be read"),
         (["label", "TAKE", "--glove", "sparse13", "--labeler", "RUN", "--out", "OUT"], "the labeler knows"),
         (["evaluate", "TAKE", "--labeler", "RUN", "--ghosts", "-1"], "expected 0 or more"),
