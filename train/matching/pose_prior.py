@@ -83,7 +83,7 @@ class PosePrior:
             return -np.inf
         nearest = self.nearest(points, labels, mirrored=mirrored, count=NEAREST, among=among)
         tables = self.means, self.directions, self.spreads, self.log_weights
-        return float(_log_density(seen_as_right(points, mirrored), labels, nearest, *tables))
+        return float(log_density(seen_as_right(points, mirrored), labels, nearest, *tables))
 
     def nearest(
         self,
@@ -200,7 +200,7 @@ def _largest_root(product: Float[np.ndarray, "9"], above: float, tolerance: floa
 
 
 @kernel
-def _log_density(
+def log_density(
     cloud: Float[np.ndarray, "N 3"],
     labels: Int[np.ndarray, "N"],
     chosen: Int[np.ndarray, "C"],

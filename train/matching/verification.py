@@ -24,6 +24,7 @@ from train.matching.pose_prior import (
     NEAREST,
     PosePrior,
     factor_of,
+    log_density,
     log_normal,
     means_by_marker,
     procrustes_errors,
@@ -128,7 +129,7 @@ def _verify(
                 density = -np.inf
                 if len(known) >= _LEAST:
                     cloud, known_labels = seen_as_right(points[known], mirrored), fresh[known]
-                    density = _log_density(
+                    density = _log_density_of_near(
                         cloud, known_labels, near, table, means, directions, spreads, log_weights,
                         sets, stored, factors, counts,
                     )  # fmt: skip
@@ -142,7 +143,7 @@ def _verify(
 
 
 @kernel
-def _log_density(
+def _log_density_of_near(
     cloud: Float[np.ndarray, "N 3"],
     labels: Int[np.ndarray, "N"],
     near: Int[np.ndarray, "C"],
@@ -199,16 +200,7 @@ def _near_components(
     for mirrored in (False, True):
         cloud = seen_as_right(points[known], mirrored)
         chosen = np.argsort(procrustes_errors(cloud, known_labels, table))[:_NEAR]
-        density = -np.inf
-        for component in chosen[:NEAREST]:
-            spread = float(spreads[component])
-            lower = factor_of(known_labels, directions[component], spread)
-            residual = residual_of(cloud, known_labels, means[component])
-            log = log_weights[component] + log_normal(
-                residual, known_labels, directions[component], lower, spread
-            )
-            high = max(density, log)
-            density = high + np.log(np.exp(density - high) + np.exp(log - high))
+        density = log_density(cloud, known_labels, chosen[:NEAREST], means, directions, spreads, log_weights)
         if density > best or not len(near):
             best, near, left = density, chosen, mirrored
     return near, left
