@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
+from handsim.hand.skeleton import build_skeleton
+from handsim.hand.skin.surface import rest_vertices
 from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS
 from handsim.space.transforms import quaternion_matrix
 from track.calibration.contacts import contact_geometry, initialize_contacts
@@ -75,12 +77,13 @@ def standard_errors(
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
 
-    def on_bones(shape: HandShape) -> NDArray[np.float64]:
-        model = HandModel(shape)
-        rest = model.rest_transforms[bones]
-        points = skin_points(estimate.coordinates, patch.corners(model.surface.vertices))[0]
-        local: NDArray[np.float64] = np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3])
-        return local
+    def on_bones(shapes: list[HandShape]) -> NDArray[np.float64]:
+        local = []
+        for shape, vertices in zip(shapes, rest_vertices(shapes), strict=True):
+            rest = build_skeleton(shape).rest_transforms()[bones]
+            points = skin_points(estimate.coordinates, patch.corners(vertices))[0]
+            local.append(np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3]))
+        return np.array(local)
 
     count = len(bones)
     jacobian = np.zeros((count, 3, len(covariance)))
