@@ -12,8 +12,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.spatial.distance import pdist, squareform
 
 from gloves.layout import MarkerLayout
 from handsim.hand.model import join_qpos
@@ -109,9 +107,24 @@ def _longest_link(markers: Float[np.ndarray, "M 3"], rng: np.random.Generator) -
     return longest_link(markers[seen])
 
 
+@kernel
 def longest_link(points: Float[np.ndarray, "N 3"]) -> float:
-    """The least distance at which points are linked to one group [m]."""
-    return float(minimum_spanning_tree(squareform(pdist(points))).max())
+    """The least distance at which points are linked to one group [m]: the longest edge of their tree (Prim)."""
+    nearest, linked = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.bool_)
+    here, longest = 0, 0.0
+    for _ in range(len(points) - 1):
+        linked[here] = True
+        last, here = here, -1
+        for other in range(len(points)):
+            if not linked[other]:
+                squared = 0.0
+                for axis in range(3):
+                    squared += (points[last, axis] - points[other, axis]) ** 2
+                nearest[other] = min(nearest[other], squared)
+                if here < 0 or nearest[other] < nearest[here]:
+                    here = other
+        longest = max(longest, nearest[here])
+    return float(np.sqrt(longest))
 
 
 @kernel
