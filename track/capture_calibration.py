@@ -11,7 +11,6 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.distance import cdist
 
 from gloves.fit import GloveFit, attach
 from gloves.takes.take import INITIALIZED, TRACKED, Take
@@ -187,6 +186,8 @@ def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
 
 def _leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
     """Whether too many missing markers had an unlabeled point nearby."""
+    from scipy.spatial.distance import cdist
+
     left, total = 0, 0
     for one in done:
         side = one.hand.side

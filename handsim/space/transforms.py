@@ -8,7 +8,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""
@@ -38,6 +37,8 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
 
 def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation matrices."""
+    from scipy.spatial.transform import Rotation
+
     quaternions: NDArray[np.float64] = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
     return quaternions
 
@@ -59,6 +60,8 @@ def transform_poses(transforms: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float6
 
 def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation vectors [rad]."""
+    from scipy.spatial.transform import Rotation
+
     quaternions: NDArray[np.float64] = Rotation.from_rotvec(vectors).as_quat(scalar_first=True)
     return quaternions
 

@@ -12,7 +12,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout
@@ -179,6 +178,8 @@ def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> t
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
     """The argument between two bounds [m] with the least value of a function."""
+    from scipy.optimize import minimize_scalar
+
     result = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": _PRECISION})
     return float(result.x)
 

@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
@@ -46,6 +45,8 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
         qpos: Poses of a fitted hand, two or more.
         residuals: Model minus marker [m], NaN where a marker is missing.
     """
+    from scipy.spatial import cKDTree
+
     local = np.einsum("tji,tmj->tmi", quaternion_matrix(qpos[:, 3:7]), residuals)
     nearest = cKDTree(qpos[:, 7:]).query(qpos[:, 7:], k=2)[1][:, 1]
     products, squares = local * local[nearest], 0.5 * (local**2 + local[nearest] ** 2)

@@ -109,7 +109,7 @@ def _longest_link(markers: Float[np.ndarray, "M 3"], rng: np.random.Generator) -
 
 @kernel
 def longest_link(points: Float[np.ndarray, "N 3"]) -> float:
-    """The least distance at which points are linked to one group [m]: the longest edge of their tree (Prim)."""
+    """The least distance at which points are linked to one group [m], as Prim grows their tree."""
     nearest, linked = np.full(len(points), np.inf), np.zeros(len(points), dtype=np.bool_)
     here, longest = 0, 0.0
     for _ in range(len(points) - 1):

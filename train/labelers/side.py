@@ -110,4 +110,4 @@ def _volume(markers: Float[np.ndarray, "M 3"], four: Int[np.ndarray, "4"]) -> fl
     ax, ay, az = markers[four[1], 0] - x, markers[four[1], 1] - y, markers[four[1], 2] - z
     bx, by, bz = markers[four[2], 0] - x, markers[four[2], 1] - y, markers[four[2], 2] - z
     cx, cy, cz = markers[four[3], 0] - x, markers[four[3], 1] - y, markers[four[3], 2] - z
-    return (ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz
+    return float((ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz)

@@ -135,9 +135,7 @@ class CageHands(NamedTuple):
             np.stack([shape.bone_lengths for shape in shapes]),
             np.stack([shape.knuckles for shape in shapes]),
             np.stack([shape.radii for shape in shapes]),
-            np.stack(
-                [build_skeleton(shape.with_side("right")).rest_transforms()[1::3] for shape in shapes]
-            ),
+            np.stack([build_skeleton(shape.with_side("right")).rest_transforms()[1::3] for shape in shapes]),
         )
 
     def ring_girths(self) -> Float[np.ndarray, "B R"]:
@@ -213,7 +211,8 @@ class CageHands(NamedTuple):
         local = np.concatenate([along[..., None], offsets], axis=-1)
         frames = self.frames[:, None, digits]
         flat = local.reshape(*local.shape[:3], -1, 3) @ frames[..., :3, :3].swapaxes(-1, -2)
-        return (flat + frames[..., None, :3, 3]).reshape(local.shape)
+        points: NDArray[np.float64] = (flat + frames[..., None, :3, 3]).reshape(local.shape)
+        return points
 
     def _palm(self, wide: NDArray[np.float64], deep: NDArray[np.float64]) -> NDArray[np.float64]:
         """The palm's rows (B, 3, 8, 18, 3) at three scales of breadth and thickness [m]."""

@@ -137,8 +137,8 @@ def _fitted_cages(hands: CageHands, template: _Template) -> np.ndarray:
         across = np.ptp(points[:, template.knuckle_loop, 1], axis=1)
         sideways[:, :palm] *= (hands.breadth / across)[:, None]
         upwards[:, :palm] *= -hands.palm_thickness[:, None] / np.diff(points[:, template.back_and_palm, 2])
-    cages = still + sideways[..., None] * wide + upwards[..., None] * deep
-    return cages
+    fitted: np.ndarray = still + sideways[..., None] * wide + upwards[..., None] * deep
+    return fitted
 
 
 def vertex_normals(
