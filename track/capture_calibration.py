@@ -26,10 +26,10 @@ from track.calibration.user_calibration import (
     calibrate_hands,
 )
 from track.capture_tracking import track_capture
-from track.config import TrackerConfig
+from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.kinematics.pose_solver import PoseSolver
-from track.setup import BOTH, AnyHands, Size, TrackerSetup, found_user
+from track.setup import AnyHands, TrackerSetup, found_user
 from track.streams.frame_source import checked_frames
 from track.user import User
 from train.labelers.protocol import Labeler

@@ -14,10 +14,11 @@ from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
 from handsim.hand.topology import NUM_QPOS
+from track.config import BOTH
 from track.finder.frame_hands import HandFinder
 from track.finder.labeling import label_hands
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
-from track.setup import BOTH, USUAL_SIZE
+from track.setup import USUAL_SIZE
 from track.user import nominal_user
 from train.glove_labeler import load_labeler
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from handsim.errors import ArgumentError
 from handsim.hand.topology import Side
-from track.setup import BOTH, AnyHands, Size
-from track.user import load_user
+from track.config import BOTH, Size
+
+if TYPE_CHECKING:
+    from track.setup import AnyHands
 
 
 def chosen_hands(
@@ -25,6 +28,8 @@ def chosen_hands(
         UserError: The file cannot be read.
         ArgumentError: Size and file are both given, or the file has no such hand.
     """
+    from track.user import load_user
+
     if shape is None:
         return BOTH if hands is None else hands, size or "auto"
     if size is not None:

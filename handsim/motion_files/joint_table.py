@@ -15,7 +15,8 @@ from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES
-from handsim.motion_files.motion import Motion, PosedHand, UpAxis, posed_hands
+from handsim.motion_files.motion import Motion, PosedHand, posed_hands
+from handsim.space.transforms import UpAxis
 
 NUMBERS: Final[tuple[str, ...]] = (
     *(f"wrist_{axis}_m" for axis in "xyz"),

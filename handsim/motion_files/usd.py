@@ -25,12 +25,12 @@ from handsim.motion_files.motion import (
     Motion,
     PosedBody,
     PosedHand,
-    UpAxis,
     changes,
     posed_bodies,
     posed_hands,
     seconds_of,
 )
+from handsim.space.transforms import UpAxis
 
 _SKIN_COLOR: Final = (0.66, 0.38, 0.28)
 _THING_COLOR: Final = (0.16, 0.2, 0.26)

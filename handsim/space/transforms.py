@@ -5,10 +5,14 @@ Quaternions are wxyz (MuJoCo's order). A matrix `T_a_b` maps coordinates of fram
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+UpAxis = Literal["y", "z"]
+"""The axis of a file that points up."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""
 

@@ -204,9 +204,7 @@ class Problem:
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._faces(estimate))
         corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
-        skeleton = np.ascontiguousarray(
-            shape_jacobian(self.shape, estimate.parameters, skeleton_parameters)
-        )
+        skeleton = np.ascontiguousarray(shape_jacobian(self.shape, estimate.parameters, skeleton_parameters))
         by_pose, by_shared = self._marker_jacobians(
             estimate, fit, _part(corners, 0, count), rest[:count], skeleton
         )
