@@ -121,7 +121,7 @@ def _train(
     with _curves_closed(fabric), ranks.losses_told():
         with ranks.signals_noted():
             run = _prepare(dataset, config, out, fabric, ranks)
-            chosen = TrainingThreads(_threads(threads, fabric), run.try_step)
+            chosen = TrainingThreads(_threads(threads, fabric))
             with chosen.in_use(), run.kept(out / CHECKPOINT):
                 _do_steps(run, chosen, out / CHECKPOINT, progress, save_every)
         with chosen.in_use(), run.kept(out / CHECKPOINT):
@@ -138,8 +138,8 @@ def _do_steps(
     state, config = run.state, run.state.config
     saved = time.monotonic()
     while run.is_unfinished():
-        chosen.renew()
-        loss = run.step()
+        with chosen.timed_step():
+            loss = run.step()
         if progress is not None and state.fabric.is_global_zero:
             progress(min(state.done, config.samples), config.samples, loss)
         if time.monotonic() - saved > save_every:
@@ -253,11 +253,6 @@ class _Run:
         if interrupted():
             raise Stopped(interrupted.number)
         return loss
-
-    def try_step(self) -> None:
-        """Do the work of the next step; the state stays as it is."""
-        batch, rng = self._draw()
-        self.state.try_step(batch, rng=rng)
 
     def _draw(self) -> tuple[Batch, np.random.Generator]:
         """The batch of the next step, and the generator that the step goes on with."""

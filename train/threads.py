@@ -15,7 +15,8 @@ from typing import Final
 from handsim.errors import ArgumentError
 
 _MOST: Final = 1024
-_STEPS: Final = 2  # of each number of threads that are measured, after one to warm up
+_STEPS: Final = 2  # of each number of threads whose faster one counts, after one to warm up
+_SLOWER: Final = 1.5  # times of steps, over the usual one, from which on the other number is tried
 _GAIN: Final = 1.15  # by which more threads must be faster to be worth the cores of others
 _labeling: ContextVar[int] = ContextVar("labeling", default=1)
 
@@ -63,30 +64,36 @@ def torch_threads(count: int) -> Iterator[None]:
 class TrainingThreads:
     """The number of threads that training uses: a given one, or the faster of one and all.
 
+    The steps of the training itself tell: now and then, and as soon as they take longer than they did, the
+    next few are made with the other number, and the faster of both stays.
+
     Args:
         given: A number, which then holds.
-        step: Does what a training step does and changes nothing.
         now: Returns the time [s].
     """
 
-    AGAIN: Final = 300.0
-    """Time between two measurements [s]: others may begin or end their work."""
+    AGAIN: Final = 60.0
+    """Least time between two trials [s]: others may begin or end their work."""
+    SHARE: Final = 20.0
+    """Least time between two trials, in times of the trial before; a quarter of it where steps have become
+    slower."""
 
-    def __init__(
-        self, given: int | None, step: Callable[[], None], *, now: Callable[[], float] = time.perf_counter
-    ) -> None:
+    def __init__(self, given: int | None, *, now: Callable[[], float] = time.perf_counter) -> None:
         import torch
 
         check_threads(given)
         self.count = given or 1
-        self._step, self._now = step, now
+        self._now = now
         self._most = torch.get_num_threads()  # what the cores and OMP_NUM_THREADS allow
-        self._measured = -float("inf")
         self._fixed = given is not None or self._most == 1
+        self._steps: list[float] = []  # times of the steps since the number changed, the first left out
+        self._usual = 0.0  # time of a step with this number; none is known yet
+        self._trial: float | None = None  # time of a step with the other number, while this one is tried
+        self._due = self._soonest = -float("inf")
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Within the block torch and labelers use the chosen number, which `renew` may change."""
+        """Within the block torch and labelers use the chosen number, which steps may change."""
         before = _labeling.get()
         with torch_threads(self.count):
             try:
@@ -94,32 +101,38 @@ class TrainingThreads:
             finally:
                 _labeling.set(before)
 
-    def renew(self) -> None:
-        """Choose anew, within `in_use`, if the last choice was long ago."""
+    @contextmanager
+    def timed_step(self) -> Iterator[None]:
+        """Around each step, within `in_use`: use the chosen number, and learn from how long it takes."""
         import torch
 
-        if not self._fixed and self._now() - self._measured > self.AGAIN:
-            self.count = self._choose()
-            self._measured = self._now()
         torch.set_num_threads(self.count)
         _labeling.set(self.count)
-
-    def _choose(self) -> int:
-        """One thread, unless all of them are clearly faster."""
-        self._time(1)
-        alone = min(self._time(1) for _ in range(_STEPS))
-        for _ in range(1 + _STEPS):  # the first may start threads
-            together = self._time(self._most)
-            if together * _GAIN < alone:
-                return self._most
-            if together > 2.0 * alone:  # a busy machine: no more of these slow steps
-                return 1
-        return 1
-
-    def _time(self, threads: int) -> float:
-        import torch
-
-        torch.set_num_threads(threads)
         start = self._now()
-        self._step()
-        return self._now() - start
+        yield
+        if not self._fixed:
+            self._learn(self._now() - start)
+
+    def _learn(self, took: float) -> None:
+        """Begin a trial of the other number if it is due, or end one."""
+        self._steps.append(took)
+        if len(self._steps) <= _STEPS:  # the first may start threads
+            return
+        step = min(self._steps[-_STEPS:])
+        if self._trial is not None:
+            spent = sum(self._steps)
+            alone, together = (step, self._trial) if self.count == 1 else (self._trial, step)
+            best = self._most if together * _GAIN < alone else 1
+            self._usual, self._trial = alone if best == 1 else together, None
+            self._due = self._now() + max(self.AGAIN, self.SHARE * spent)
+            self._soonest = self._now() + 0.25 * self.SHARE * spent
+            self._use(best)
+        elif self._now() >= (self._soonest if step > _SLOWER * self._usual else self._due):
+            self._trial = step
+            self._use(1 if self.count > 1 else self._most)
+
+    def _use(self, count: int) -> None:
+        """Use this number from the next step on."""
+        if count != self.count:
+            self._steps = []
+        self.count = count

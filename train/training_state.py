@@ -171,15 +171,6 @@ class TrainingState:
             if not (torch.isfinite(mean[name]).all() and torch.isfinite(content["network"][name]).all()):
                 raise ValueError(f"{name} is not finite")
 
-    def try_step(self, batch: Batch, *, rng: np.random.Generator) -> None:
-        """Do the work of a step, to time it; the state stays as it is."""
-        kept = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
-        try:
-            self.fabric.backward(self._loss(batch, rng))
-        finally:
-            self.optimizer.zero_grad()
-            self.network.load_state_dict(kept)  # means of batch normalization move in a forward pass
-
 
 def _optimizer(config: TrainConfig, network: nn.Module) -> torch.optim.Optimizer:
     if config.optimizer == "sgd":
