@@ -1,15 +1,14 @@
-"""Speed of rendering, accuracy of depth, and memory.
+"""Accuracy of drawn depth, and memory; and the pictures that `benchmarks.speed` times.
 
-    MUJOCO_GL=egl python -m benchmarks.rendering [speed accuracy memory] [--frames 200 --images 20000]
+    python -m benchmarks.rendering [accuracy memory] [--frames 200 --images 20000]
 
-speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
-    colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
-    loop that a user would write with pyrender (the same meshes, plain material, one light) and MuJoCo's own
-    renderer (the hand's capsules, no skin), each for depth and for colors.
 accuracy: depth and ids against embree through trimesh on the same triangles.
 memory: resident memory over many pictures.
 
-Speeds are medians over rounds of the machine's clock: run it where nothing else runs.
+What is timed are 640 x 480 pictures of two hands from a simulated take: depth alone; colors, depth, ids and
+keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the loop that a user would write
+with pyrender (the same meshes, plain material, one light) and MuJoCo's own renderer (the hand's capsules, no
+skin), each for depth and for colors.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ import argparse
 import dataclasses
 import functools
 import os
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -45,15 +43,15 @@ from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from train.simulation.takes import simulate_take
 
-SECTIONS: Final = ("speed", "accuracy", "memory")
+SECTIONS: Final = ("accuracy", "memory")
 ROUNDS: Final = 3
 PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None, painter="compiled")
 DEPTH: Final = dataclasses.replace(PLAIN, passes=("depth",))
 COLORS: Final = dataclasses.replace(PLAIN, passes=("rgb", "depth", "ids"))
 KINDS: Final = {
-    "depth": DEPTH,
-    "colors, depth, ids, keypoints": COLORS,
-    "- painted by OpenGL": dataclasses.replace(COLORS, painter="opengl"),
+    "depth": ("depth", DEPTH),
+    "colors": ("colors, depth, ids, keypoints", COLORS),
+    "opengl": ("the same painted by OpenGL", dataclasses.replace(COLORS, painter="opengl")),
 }
 
 
@@ -133,28 +131,13 @@ def mujoco_loop(take: Take, color: bool) -> None:
             renderer.render()
 
 
-def speed(frames: int) -> Figures:
-    take, cores = a_take(frames), os.cpu_count() or 1
-    print(f"\nimages per second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
-    figures: Figures = {}
-    with tempfile.TemporaryDirectory() as folder:
-        jobs = {name: functools.partial(draw, config, frames) for name, config in KINDS.items()}
-        jobs["- written as WebDataset"] = functools.partial(draw_and_write, COLORS, Path(folder), frames)
-        for name, job in jobs.items():
-            rates = rate(lambda job=job: job(0), frames), rate_in_processes(job, cores, frames)
-            print(f"  {name:32s} {rates[0]:8.1f} {rates[1]:8.1f}")
-            key = name.strip("- ").split()[-1 if name.startswith("- painted") else 0].strip(",").lower()
-            figures[key] = (f"pictures per second, one process | {cores}: {name}", rates)
-    loops: dict[str, list[float]] = {"pyrender": [], "mujoco": []}
-    for color, name in ((False, "depth"), (True, "colors")):
-        loops["pyrender"].append(rate(lambda c=color: plain_pyrender(take, c), frames))
-        print(f"  plain pyrender loop, {name:11s} {loops['pyrender'][-1]:8.1f}")
-        loops["mujoco"].append(rate(lambda c=color: mujoco_loop(take, c), frames))
-        print(f"  MuJoCo's renderer, {name:13s} {loops['mujoco'][-1]:8.1f}")
-    what = {"pyrender": "a plain pyrender loop", "mujoco": "MuJoCo's renderer, capsules without skin"}
-    for key, rates_of in loops.items():
-        figures[key] = (f"pictures per second, one process, {what[key]}: depth | colors", rates_of)
-    return figures
+def jobs(frames: int, folder: Path) -> dict[str, tuple[str, Callable[[int], int]]]:
+    """What is drawn, with its name in words; a job draws one shard, in `folder` if it writes it."""
+    drawn: dict[str, tuple[str, Callable[[int], int]]] = {
+        key: (name, functools.partial(draw, config, frames)) for key, (name, config) in KINDS.items()
+    }
+    writing = functools.partial(draw_and_write, COLORS, folder, frames)
+    return drawn | {"written": ("the same written as WebDataset", writing)}
 
 
 def accuracy(frames: int) -> Figures:
@@ -224,8 +207,7 @@ def main() -> None:
         parser.error("--save keeps the figures of one section")
     print(describe())
     for name in options.section or SECTIONS:
-        section = {"speed": speed, "accuracy": accuracy}.get(name, memory)
-        figures = section(options.images if name == "memory" else options.frames)
+        figures = memory(options.images) if name == "memory" else accuracy(options.frames)
         save_figures(options.save, figures)
 
 
