@@ -103,7 +103,8 @@ class HandModel:
         Raises:
             ArgumentError: `qpos` is not (T, 27) or not finite.
         """
-        return penetration_depth(self.capsules, self.forward_kinematics(qpos))
+        values = check_array("qpos", qpos, (None, NUM_QPOS))
+        return penetration_depth(self.capsules, bone_transforms(self.skeleton, values))
 
 
 def load_model(model: HandModel | HandShape | str) -> HandModel:
