@@ -24,6 +24,7 @@ _SAME_RATE: Final = 0.02  # by which two rates may differ: 119.88 is called 120,
 _COARSEST: Final = 1  # decimals of times, at least; whole seconds are no times of frames
 _FINEST: Final = 9  # decimals
 _UNEVEN: Final = 0.1  # of the step between two frames, by which times without a stated rate may differ
+_JITTER: Final = 0.25  # of a frame's time, which times vary by where nothing is missing
 _MOST_MISSING: Final = 10  # times as many frames as are there
 _MOST_DIGITS: Final = 12  # of a count
 _SHOWN: Final = 3  # gaps that a sentence names
@@ -236,7 +237,7 @@ def _with_gaps_in_time(steps: Int[np.ndarray, "T-1"], ticks: _Ticks) -> Int[np.n
             f"from row {row + 1} to row {row + 2} the frame's number goes on by {steps[row]}, and its time, "
             f"from {first:g} s to {second:g} s, by {(second - first) / interval:.3g} frames"
         )
-    gaps = np.where(excess > 0.0, np.maximum(np.round(excess + made_up), 0.0), 0.0)
+    gaps = np.where(excess > 0.0, np.maximum(np.round(excess + made_up - _JITTER), 0.0), 0.0)
     return steps + gaps.astype(np.int64)
 
 
@@ -253,8 +254,8 @@ def _check_missing(
     row = int(np.argmax(steps))
     at = "" if times is None else f", from {times[row]:g} s to {times[row + 1]:g} s"
     raise CaptureError(
-        f"{steps[row] - 1} frames are missing behind frame {numbers[row]}{at}, and {there} are there; correct "
-        "the numbers or the times, or cut the capture there"
+        f"{steps[row] - 1} frames are missing behind frame {numbers[row]}{at}, and {there} are there; "
+        "correct the numbers or the times, or cut the capture there"
     )
 
 
