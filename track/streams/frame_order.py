@@ -6,9 +6,9 @@ tenth of a second where others have come out of order in the last ten seconds. W
 counted.
 
 A frame continues the stream when its time and its number go on by no more than they explain each other, and
-its time by no more than its arrival explains, and eight frames. Any other frame is a jump, which is believed
-only when it lasts: when five frames in a row fit together, as those of a recording or a server that starts
-again. Fewer are wild, and left out.
+its time by no more than its arrival explains, and sixteen frames. Any other frame is a jump, which is
+believed only when it lasts: when five frames in a row fit together, as those of a recording or a server that
+starts again. Fewer are wild, and left out.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from track.intake import LATEST_TIME
 from track.streams.frame_source import StreamedFrame
 
 WINDOW: Final = 8
-"""Frames that are held behind a gap, at most, and by which a number alone may go on."""
+"""Frames that are held behind a gap, at most."""
+REACH: Final = 16
+"""Frames by which a stream may go on at once, beside what the arrival explains."""
 LASTING: Final = 5
 """Frames in a row that a jump is believed from."""
 _WAIT: Final = 0.03  # [s] for which a frame is held behind a gap
@@ -39,7 +41,7 @@ _OLD: Final = 1.0  # [s]: a frame that is older by more belongs to a recording t
 _BURST: Final = 0.5  # [s] from the last frame, within which frames of the same recording may arrive late
 _GOES_ON: Final = 1.0  # [s] by which a jump that lasts may go on with the same recording
 _FIRST_SLACK: Final = 0.05  # [s]: tolerance of a frame's time while the interval is unknown
-_FIRST_WAIT: Final = 0.05  # [s] for which the first frame is held
+_FIRST_WAIT: Final = 0.1  # [s] for which the first frame is held
 _SLACK: Final = 0.001  # [s]: tolerance of time stamps beside half an interval
 _DRIFT: Final = 0.01  # by which two clocks may run at another pace
 _SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
@@ -299,7 +301,7 @@ class FrameOrder:
 
     def _reach(self, waited: float) -> float:
         """By how much a frame's time may go on that came so much later than another [s]."""
-        ahead = _FIRST_SLACK if self._interval is None else (WINDOW + 0.5) * self.interval + _SLACK
+        ahead = _FIRST_SLACK if self._interval is None else (REACH + 0.5) * self.interval + _SLACK
         return waited + ahead
 
     def _agrees(self, last: StreamedFrame, new: StreamedFrame) -> bool:

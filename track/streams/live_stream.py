@@ -89,7 +89,7 @@ class LiveStream(Iterator[StreamedFrame]):
         self._frames, self._silence, self._ended = frames, silence, ended
         self._ahead = 0.0  # [s] of this time over the stream's
         self._last: StreamedFrame | None = None  # on this clock
-        self._ready: deque[StreamedFrame] = deque()  # in order
+        self._ready: deque[tuple[StreamedFrame, float]] = deque()  # in order, and since when [s]
         self._lost = 0  # frames that were dropped before they were put in order
         self._forgiven = (-math.inf, 0.0)  # [s], when a lag was forgiven, and which
         self._end_at = math.inf  # [s], when the stream was ended from here
@@ -134,14 +134,14 @@ class LiveStream(Iterator[StreamedFrame]):
         while not self._closed:
             self._drop_old()
             if self._ready:
-                return self._continue(self._ready.popleft())
+                return self._continue(self._ready.popleft()[0])
             if self._over:
                 break
             if self._end_at == math.inf and self._ended():
                 self.end()
             self._wait(min(quiet, self.order.deadline, time.monotonic() + _STOP))
             self._line_up()
-            if time.monotonic() >= quiet and not self._ready:
+            if time.monotonic() >= quiet and not self._ready and self.order.deadline == math.inf:
                 return self._silent()
         error, self._error = self._error, None
         if error is not None:
@@ -155,7 +155,8 @@ class LiveStream(Iterator[StreamedFrame]):
         """
         now = time.monotonic()
         with self._changed:
-            oldest = min((frame.arrived for frame in (*self._ready, *self._arrived)), default=now)
+            waiting = [since for _, since in self._ready] + [frame.arrived for frame in self._arrived]
+        oldest = min(waiting, default=now)
         self._forgiven = (now, now - oldest)
 
     def end(self) -> None:
@@ -239,14 +240,14 @@ class LiveStream(Iterator[StreamedFrame]):
                 self._changed.notify_all()
             if frame is None:
                 break
-            self._ready.extend(self.order.expire(frame.arrived))
-            self._ready.extend(self.order.add(frame))
+            passed = (*self.order.expire(frame.arrived), *self.order.add(frame))
+            self._ready.extend((one, frame.arrived) for one in passed)
         now = time.monotonic()
         if over or now > self._end_at + _LEAVE:
-            self._ready.extend(self.order.end())
+            self._ready.extend((one, now) for one in self.order.end())
             self._over = True
         else:
-            self._ready.extend(self.order.expire(now))
+            self._ready.extend((one, now) for one in self.order.expire(now))
 
     def _drop_old(self) -> None:
         """Leave out what has waited for too long while newer frames came."""
@@ -258,11 +259,12 @@ class LiveStream(Iterator[StreamedFrame]):
         now = time.monotonic()
         since, lag = self._forgiven
         most = MOST_LAG + max(0.0, lag - _CATCHING_UP * (now - since) if lag else 0.0)
-        while len(self._ready) > 1 and now - self._ready[0].arrived > most and not self._over:
-            dropped = self._ready.popleft()
+        while len(self._ready) > 1 and now - self._ready[0][1] > most and not self._over:
+            dropped, _ = self._ready.popleft()
             self.dropped += 1
             if dropped.restarted:
-                self._ready[0] = dataclasses.replace(self._ready[0], restarted=True)
+                frame, waits_since = self._ready[0]
+                self._ready[0] = (dataclasses.replace(frame, restarted=True), waits_since)
 
     def _continue(self, frame: StreamedFrame) -> StreamedFrame:
         """A frame on this clock, with the points that are in range."""
