@@ -13,7 +13,6 @@ from jaxtyping import Float, Int
 from gloves.captures.capture import Capture
 from gloves.captures.plausibility import check_place, check_unit
 from gloves.optics.identities import number_runs
-from handsim.errors import CaptureError
 from track.intake import FARTHEST
 
 
@@ -76,11 +75,9 @@ def checked_frames(capture: Capture) -> list[StreamedFrame]:
 
     Raises:
         ArgumentError: The capture is not in meters.
-        CaptureError: There is no point in it, or most of its points are far from any room.
+        CaptureError: Most of its points are far from any room.
     """
     frames = list(capture_frames(capture))
-    if not any(len(frame.points) for frame in frames):
-        raise CaptureError(f"no point is in any of the {len(frames)} frames, expected the markers of hands")
     check_unit([frame.points for frame in frames])
     check_place(capture, FARTHEST)
     return frames
