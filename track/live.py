@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
 from time import monotonic
 from typing import Final, NamedTuple
@@ -40,10 +39,13 @@ _FRAMES: Final = {
     "doubled_frames": "doubled",
     "late_frames": "too late",
     "frames_with_wild_times": "with a wild time",
-    "dropped_frames": "dropped",
-    "missing_frames": "missing",
 }
-"""Counts of frames, in words."""
+"""Counts of all frames that came, in words."""
+_OF_THEM: Final = {
+    "dropped_frames": "of them dropped, as they were not kept up with",
+    "frames_after_end": "of them after the end",
+}
+"""Counts of some of them, in words."""
 
 
 class _Now:
@@ -108,12 +110,12 @@ def measured_setup(
         seconds: How long to wait [s], ten seconds at most.
     """
     if not setup.is_measured:
+        stream.forgive()
         return setup, stream
     first = _first_frames(stream, setup.fewest_points, seconds, status)
     setup = setup.measured([frame for frame in first if len(frame.points) >= setup.fewest_points])
     status.say(f"size of the hands: {setup.user}")
-    stream.forgive()
-    return setup, chain(first, stream)
+    return setup, _first_and_others(first, stream)
 
 
 def track_live(
@@ -175,7 +177,7 @@ def track_live(
                     if not asked and (doubt := _unit_doubt(stream)):
                         asked = True
                         status.say(doubt)
-                stream.end()
+                stream.end(until[0])
                 counts = stream.counts
                 status.show(f"writing {out}", now=True)
                 take, step = recorder.finish(
@@ -186,9 +188,18 @@ def track_live(
                 status.say(f"the recording is kept in {recorder.part}")
                 recorder.close()
                 raise
+        after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
+        counts["frames_after_end"] = max(0, after - recorder.num_frames)
         notes = (*_notes(counts, step, kept_up, stream.order.interval), *sinks.notes())
         doubt = _unit_doubt(stream)
         return LiveTake(take, recorder.num_frames, (*notes, doubt) if doubt else notes)
+
+
+def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterator[StreamedFrame]:
+    """All frames of a stream; those that came while the first ones were looked at are caught up with."""
+    yield from first
+    stream.forgive()
+    yield from stream
 
 
 def _first_frames(
@@ -215,14 +226,18 @@ def _first_frames(
 def _notes(counts: dict[str, int], step: int, now: _Now, interval: float) -> tuple[str, ...]:
     """What is to be told of a stream at its end; `interval` is from frame to frame [s]."""
     told = ", ".join(f"{counts[name]} {what}" for name, what in _FRAMES.items())
-    notes = [f"{counts['received_frames']} frames received: {told}"]
+    others = ", ".join(f"{counts[name]} {what}" for name, what in _OF_THEM.items() if counts[name])
+    others = f" ({others})" if others else ""
+    notes = [
+        f"{counts['received_frames']} frames received: {told}{others}; {counts['missing_frames']} missing"
+    ]
     if now.lags:
         median, most = 1e3 * np.median(now.lags), 1e3 * max(now.lags)
         notes.append(f"output {median:.0f} ms behind the arrival of frames (median), {most:.0f} ms at most")
     if counts["missing_at_end"]:
-        missing = counts["missing_at_end"]
-        quiet = f"no frame came in the last {missing * interval:.2f} s"
-        notes.append(f"{quiet}, in which {missing} could have been sent")
+        lacking = counts["missing_at_end"]
+        quiet = f"no frame came in the last {lacking * interval:.2f} s"
+        notes.append(f"{quiet}, in which {lacking} could have been sent")
     packets = [f"{counts[name]} {what}" for name, what in _PACKETS.items() if counts.get(name)]
     if packets:
         notes.append(f"packets left out: {', '.join(packets)}")

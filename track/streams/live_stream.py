@@ -106,7 +106,8 @@ class LiveStream(Iterator[StreamedFrame]):
     def counts(self) -> dict[str, int]:
         """What became of the frames so far, by name.
 
-        All that were received were in order, reordered, doubled, late, with wild times or dropped, or wait.
+        All that were received were in order, reordered, doubled, late or with wild times, or wait; those that
+        were dropped were in order or reordered.
         """
         order = self.order
         return {
@@ -159,10 +160,11 @@ class LiveStream(Iterator[StreamedFrame]):
         oldest = min(waiting, default=now)
         self._forgiven = (now, now - oldest)
 
-    def end(self) -> None:
-        """End the stream after what has arrived."""
-        if self._end_at == math.inf:
-            self._end_at = time.monotonic()
+    def end(self, at: float = math.inf) -> None:
+        """End the stream after what has arrived; `at` is the monotonic time of its end, if before now [s]."""
+        ended = self._end_at < math.inf
+        self._end_at = min(self._end_at, at, time.monotonic())
+        if not ended:
             self._frames.end()
 
     def close(self) -> None:

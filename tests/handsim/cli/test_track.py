@@ -287,7 +287,7 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeyp
     np.testing.assert_array_equal(take.numbers, np.arange(take.num_frames))
     assert (take.status[-1] != LOST).all()
     told = capsys.readouterr()
-    assert "right hand: tracked" in told.out and " 0 missing" in told.out
+    assert "right hand: tracked" in told.out and "; 0 missing" in told.out
     assert "frames received: " in told.out and " ms behind the arrival of frames" in told.out
     assert told.out.startswith("size of the hands: ") and take.settings["user"].startswith("auto, ")
     lines = told.err.splitlines()
