@@ -31,6 +31,8 @@ _CATCHING_UP: Final = 0.5  # [s] per second by which a lag that is forgiven has 
 _WAITING: Final = 256  # frames that may wait of a source that is faster than its times; it waits after that
 _MOST_WAITING: Final = 1 << 14  # frames that may wait at all
 _PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
+_FEWEST_PACE: Final = 5  # of them
+_SAME_PACE: Final = 1.0  # [s], the longest step of their times, beyond which it begins anew
 _FASTER: Final = 1.5  # times as fast as its frames' times, from which a source is not live
 _LOOP_GAP: Final = 0.01  # [s] between the last frame of a recording and its first, when it starts again
 _STOP: Final = 0.1  # [s] between two looks at whether the stream shall end
@@ -98,7 +100,7 @@ class LiveStream(Iterator[StreamedFrame]):
         self._changed = threading.Condition()
         self._arrived: deque[StreamedFrame] = deque()
         self._pace: deque[StreamedFrame] = deque(maxlen=_PACE_FRAMES)
-        self._read_all = False
+        self._faster = self._read_all = False
         self._thread = threading.Thread(target=self._read, name="live stream", daemon=True)
         self._thread.start()
 
@@ -206,7 +208,7 @@ class LiveStream(Iterator[StreamedFrame]):
                 self._changed.wait(_STOP)
             if math.isnan(frame.arrived):
                 frame = dataclasses.replace(frame, arrived=time.monotonic())
-            if self._pace and (frame.restarted or frame.time <= self._pace[-1].time):
+            if self._pace and not abs(frame.time - self._pace[-1].time) < _SAME_PACE:
                 self._pace.clear()
             self._pace.append(frame)
             self._arrived.append(frame)
@@ -218,10 +220,11 @@ class LiveStream(Iterator[StreamedFrame]):
 
     def _is_ahead(self) -> bool:
         """Whether frames come faster than their times go on, so that they are not live."""
-        if len(self._pace) < 2:
-            return False
-        first, last = self._pace[0], self._pace[-1]
-        return last.time - first.time > _FASTER * (last.arrived - first.arrived) + _LOOP_GAP
+        if len(self._pace) >= _FEWEST_PACE:  # after a restart, it is as before until then
+            first, last = self._pace[0], self._pace[-1]
+            span = last.arrived - first.arrived
+            self._faster = last.time - first.time > _FASTER * span + _LOOP_GAP
+        return self._faster
 
     def _wait(self, until: float) -> None:
         with self._changed:
