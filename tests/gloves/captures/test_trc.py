@@ -169,7 +169,7 @@ BAD = {
     "line 4 holds no names": trc(ROW, names="1\t0\t1\t2\t3"),
     "names and axes differ": trc(ROW, names="Frame#\tTime\ta\tb\tc"),
     "a word": trc(ROW, "1\t0\t1\t2\t3\t4\tfive\t6"),
-    "a decimal comma": trc(ROW, "1\t0\t1,5\t2\t3\t4\t5\t6"),
+    "a decimal comma": trc(ROW, "1\t0\t1,5\t2.5\t3\t4\t5\t6"),
     "a word for a frame number": trc("first" + ROW),
     "infinite": trc(ROW, ROW.replace("6", "inf")),
     "too many cells": trc(ROW, ROW + "\t\t7"),
