@@ -1,7 +1,7 @@
 """Parsing shared by the formats: lines, cells, units of length, and a table of numbers with holes.
 
-Every text is read as lines of UTF-8 whose cells are separated by tabs, whatever it was written as: `split_lines`
-reads UTF-16, `plain_lines` reads other separators and quotes, and `parse_table` reads decimal commas.
+Every text is read as lines of UTF-8 whose cells are separated by tabs, whatever it was written as:
+`split_lines` reads UTF-16, `plain_lines` other separators and quotes, and `parse_table` decimal commas.
 """
 
 from __future__ import annotations
@@ -141,8 +141,8 @@ def plain_lines(lines: list[bytes], separator: bytes, *, first: int = 1, wider: 
         wider: Whether rows may have more cells than the line above them.
 
     Raises:
-        CaptureError: A line has more cells than a marker file has, its quotes are damaged, or the numbers have
-            commas for both separators and decimals.
+        CaptureError: A line has more cells than a marker file has, its quotes are damaged, or commas are both
+            between cells and in numbers.
     """
     if separator == TAB and not lines[0].startswith(b'"'):
         return lines
@@ -187,8 +187,8 @@ def _check_decimals(lines: list[bytes], first: int, wider: bool) -> None:
         width = lines[index].rstrip(b" \t,").count(b",") + 1
         if width > expected:
             raise CaptureError(
-                f"line {first + index} has {width} cells where {expected} are expected: commas are both between "
-                "cells and in numbers; export it with decimal points, or with semicolons or tabs"
+                f"line {first + index} has {width} cells where {expected} are expected: commas are both "
+                "between cells and in numbers; export it with decimal points, or with semicolons or tabs"
             )
 
 
@@ -208,11 +208,12 @@ def parse_table(
 ) -> Float[np.ndarray, "T columns"]:
     """Numbers of a table, row by row; a blank or absent cell is NaN, a blank line is not a row.
 
-    Numbers have decimal points, or commas if no number of the table has a point. A row may lack cells at its end, because some writers leave out what was not seen, and may have blank
-    cells too many. Only the last line of a file can have been cut: it counts as cut if it has no line end and
-    fewer cells than `num_columns` or than the first row, which tells whether rows end in a separator, or if
-    its last number alone has fewer decimals. (A cut inside the last cell of a row whose numbers have as many
-    decimals as it happens leaves no trace and is not noticed.)
+    Numbers have decimal points, or commas if no number of the table has a point. A row may lack cells at its
+    end, because some writers leave out what was not seen, and may have blank cells too many. Only the last
+    line of a file can have been cut: it counts as cut if it has no line end and fewer cells than
+    `num_columns` or than the first row, which tells whether rows end in a separator, or if its last number
+    alone has fewer decimals. (A cut inside the last cell of a row whose numbers have as many decimals as it
+    happens leaves no trace and is not noticed.)
 
     Args:
         lines: All lines of the file, plain.
@@ -257,12 +258,12 @@ def _decimal_commas(rows: Iterable[bytes], text_columns: frozenset[int]) -> bool
     """Whether the numbers of a table have decimal commas: some have one, and none has a point."""
     found = False
     for row in rows:
+        cells = [row]
         if text_columns:
-            cells = row.split(TAB)
-            row = TAB.join(cell for column, cell in enumerate(cells) if column not in text_columns)
-        if b"." in row:
+            cells = [cell for column, cell in enumerate(row.split(TAB)) if column not in text_columns]
+        if any(b"." in cell for cell in cells):
             return False
-        found = found or b"," in row
+        found = found or any(b"," in cell for cell in cells)
     return found
 
 
@@ -316,8 +317,8 @@ def _parse_cells(cells: list[bytes], number: int, column_name: Callable[[int], s
         except ValueError:
             mixed = "," in text and "." not in text and text.count(",") == 1
             raise CaptureError(
-                f"line {number}, column {column + 1} ({column_name(column)}): '{shortened(text)}' is not a number"
-                + (", since others have decimal points" if mixed else "")
+                f"line {number}, column {column + 1} ({column_name(column)}): '{shortened(text)}' is not a "
+                f"number{', since others have decimal points' if mixed else ''}"
             ) from None
     return values
 

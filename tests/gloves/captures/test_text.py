@@ -28,7 +28,7 @@ PLAIN = {
 
 
 def rewritten(text: str, separator: str, *, quoted: bool = False, commas: bool = False) -> str:
-    """The file with other separators, quotes and decimals, each row as long as the longest, as from a table."""
+    """The file with other separators, quotes and decimals, and rows of one length, as from a table."""
     rows = list(csv.reader(text.splitlines(), delimiter="\t" if "\t" in text else ","))
     width = max(map(len, rows))
     out = io.StringIO()
