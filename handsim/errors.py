@@ -10,7 +10,8 @@ import difflib
 from collections.abc import Iterable
 from typing import Final
 
-_SENTENCE: Final = 500  # characters
+SENTENCE: Final = 500
+"""The most characters of a sentence."""
 _NAME: Final = 120  # characters of an unknown name that a sentence shows
 
 
@@ -19,18 +20,21 @@ def shortened(text: str, most: int = 40) -> str:
     if len(text) <= most:
         return text
     end = most // 3
-    return f"{text[: most - end]}...{text[-end:]}"
+    return f"{text[: most - end - 3]}...{text[-end:]}"
 
 
 class HandSimError(Exception):
     """Root of every error that handsim raises on purpose; its sentence has a bounded length."""
 
     def __str__(self) -> str:
-        return shortened(super().__str__(), _SENTENCE)
+        return shortened(super().__str__(), SENTENCE)
 
 
 class HandSimWarning(UserWarning):
     """Something in the data that is probably not what the user meant; the work goes on."""
+
+    def __str__(self) -> str:
+        return shortened(super().__str__(), SENTENCE)
 
 
 class ArgumentError(HandSimError):

@@ -24,7 +24,7 @@ from gloves.captures._text import (
     warn,
 )
 from gloves.captures.capture import Capture
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, shortened
 
 _BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
 _KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
@@ -60,7 +60,7 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
     }
     included = _first(stated, "DATA_INCLUDED") or "3D"
     if included != "3D":
-        raise CaptureError(f"DATA_INCLUDED is '{included[:40]}', expected '3D'; export the 3D data")
+        raise CaptureError(f"DATA_INCLUDED is '{shortened(included)}', expected '3D'; export the 3D data")
     if "MARKER_NAMES" not in stated:
         raise CaptureError("the header states no MARKER_NAMES")
     rate = positive_rate(_first(stated, "FREQUENCY"), name="FREQUENCY")

@@ -23,7 +23,7 @@ from gloves.captures._text import (
     warn,
 )
 from gloves.captures.capture import Capture
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, shortened
 
 _TITLE: Final = "Trajectories"
 _SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")
@@ -92,7 +92,7 @@ def _marker_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
         CaptureError: The row does not begin as one of axes does, or names none.
     """
     if axes[0].lower() not in _FIRST_CELLS:
-        raise CaptureError(f"line {number} begins with '{axes[0][:40]}', expected 'Frame'")
+        raise CaptureError(f"line {number} begins with '{shortened(axes[0])}', expected 'Frame'")
     columns = [index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES]
     if not columns:
         raise CaptureError(f"no markers: line {number} has no axes X, Y, Z")

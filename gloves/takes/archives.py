@@ -67,8 +67,8 @@ def read_archive(
         raise CaptureError(f"{path}: a {shortened(kind)}, expected a take")
     if schema != SCHEMA or kind != _KINDS[0]:
         raise CaptureError(
-            f"{path}: a {kind} of schema {shortened(str(schema))}, expected a take of schema {SCHEMA}; simulate or "
-            "track it again with this version of handsim"
+            f"{path}: a {kind} of schema {shortened(str(schema))}, expected a take of schema {SCHEMA}; "
+            "simulate or track it again with this version of handsim"
         )
     try:
         return unpack(header, arrays)
