@@ -95,6 +95,8 @@ def track(
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
     if labeled is not None:
         write_capture(labeled, labeled_points(tracked.take if tracked.is_whole else load_take(out)))
+    if shape is not None and glove is None:
+        print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
     _tell(out, tracked, float(np.median(times)))
 
 
