@@ -66,9 +66,9 @@ def doctor() -> int:
     Returns:
         0 when everything that the commands need is there, else 1.
     """
-    from rich.console import Console
+    from handsim.app.progress import named_steps
 
-    with Console(stderr=True).status("drawing a picture and looking for a GPU"):
+    with named_steps("drawing a picture and looking for a GPU"):
         findings = examine()
     _print_report(findings)
     return int(any(finding.needed and finding.remedy for finding in findings))

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import tyro
-from rich.console import Console
 
 from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import place_of
-from handsim.app.progress import print_above, progress_bar
+from handsim.app.progress import named_steps, print_above, progress_bar
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
@@ -56,6 +55,6 @@ def generate(
 def _report(config: DatasetConfig, out: Path) -> Path:
     """Write the page of plots."""
     # Not in make_dataset: a set is complete without its report, whose bytes depend on matplotlib.
-    with Console(stderr=True).status("drawing the report"):
+    with named_steps("drawing the report"):
         take = simulate_take("hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
         return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)

@@ -24,6 +24,7 @@ from gloves.layout import (
     starter_layout,
 )
 from handsim.app.messages import print_line
+from handsim.app.progress import named_steps
 from handsim.errors import ArgumentError, LayoutError
 from handsim.files.atomic import atomic_write
 from handsim.files.outputs import check_outputs
@@ -202,11 +203,11 @@ def score_glove(
     from train.glove_labeler import load_labeler
 
     rng = np.random.default_rng(seed)
-    with Console(stderr=True).status("simulating hands") as status:
+    with named_steps("simulating hands") as step:
         hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
-        status.update("learning the layout, about a minute the first time")
+        step("learning the layout, about a minute the first time")
         known = learned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
-        status.update("labeling")
+        step("labeling")
         score = score_layout(layout, hands, known, rng=rng)
     _tell(score)
     for number, sentence in enumerate(advice(score), 1):
@@ -288,12 +289,12 @@ def improve_glove(
     check_outputs([glove, rig], [out])
     from track.glove_advice.improvement import Improvement
 
-    with Console(stderr=True).status("putting the glove on") as status:
+    with named_steps("putting the glove on") as step:
         search = Improvement(layout, cameras, keep, rng=np.random.default_rng(seed))
         before = search.worth
         search.resize(count)
-        search.search(60.0 * minutes, lambda worth: status.update(_worth_line(worth)))
-        status.update("dropping one marker at a time, to compare")
+        search.search(60.0 * minutes, lambda worth: step(_worth_line(worth)))
+        step("dropping one marker at a time, to compare")
         fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
     found = search.layout
     save_layout(out, found)

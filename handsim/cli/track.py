@@ -9,13 +9,12 @@ from typing import Annotated, Final
 
 import numpy as np
 import tyro
-from rich.console import Console
 
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.takes.corrections import corrections_path
 from gloves.takes.take import SUFFIX, load_take
 from handsim.app.messages import print_line
-from handsim.app.progress import progress_bar
+from handsim.app.progress import named_steps, progress_bar
 from handsim.cli.options import chosen_hands
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs
@@ -90,7 +89,7 @@ def track(
         else:
             _check_no_corrections(out)
             setup = TrackerSetup.of(glove, chosen, chosen_size, labeler, body, TrackerConfig())
-            with Console(stderr=True).status("getting ready"):
+            with named_steps("getting ready"):
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
     if labeled is not None:

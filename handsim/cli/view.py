@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
-from handsim.app.progress import progress_bar
+from handsim.app.progress import named_steps, progress_bar
 from handsim.cli.options import chosen_hands
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
@@ -109,7 +108,7 @@ def _draw(name: str, content: Content, video: Path) -> None:
 def _view_live(url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None) -> None:
     """Track a stream and show it until a signal or the stream ends it."""
     cameras = None if rig is None else load_rig(rig)
-    with Console(stderr=True).status("getting ready"):
+    with named_steps("getting ready"):
         warm_up(setup.user, setup.labeler)
     with (
         interrupt_flag() as ended,
