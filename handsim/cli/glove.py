@@ -73,9 +73,9 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
         glove: A shipped name or the path of a .toml file.
     """
     layout = load_layout(glove)
-    table = Table(
-        "", "name", "bone", title=Text(f"{layout.name}: {layout.num_markers} markers"), title_justify="left"
-    )
+    table = Table(box=None, pad_edge=False)
+    for column in ("", "name", "bone"):
+        table.add_column(column, no_wrap=True)
     for column in ("along", "around [deg]", "across", "stalk [mm]"):
         table.add_column(Text(column), justify="right")
     for number, marker in enumerate(layout.markers):
@@ -84,6 +84,7 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
         height = f"{1e3 * marker.height:.1f}" if marker.height else ""
         along = f"{marker.along:.2f}"
         table.add_row(str(number), Text(marker.name), marker.bone, along, around, across, height)
+    print_line(f"{layout.name}: {layout.num_markers} markers")
     console = Console()
     console.print(table)
     console.print(
