@@ -108,7 +108,7 @@ class CameraRig:
         return {"name": self.name, "cameras": [one.record() for one in self.cameras]}
 
     def digest(self) -> str:
-        """Beginning of the SHA-256 of its record to nine decimals: whether a name still means the same rig."""
+        """Beginning of the SHA-256 of its record to nine decimals: whether a name still means this rig."""
         rounded = json.loads(json.dumps(self.record()), parse_float=lambda text: round(float(text), 9) + 0.0)
         return hashlib.sha256(json.dumps(rounded, sort_keys=True).encode()).hexdigest()[:16]
 

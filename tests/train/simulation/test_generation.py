@@ -255,7 +255,7 @@ def test_a_set_of_a_rig_that_a_release_changed_is_not_resumed(tmp_path):
     digest = settings.pop("rig_digest")
     for older in ({}, {"rig_digest": digest[::-1]}):
         (tmp_path / "set" / "config.json").write_text(json.dumps(settings | older))
-        with pytest.raises(DatasetError, match=r"begun with other settings \(rig_digest: .* there, .* here\)"):
+        with pytest.raises(DatasetError, match=r"other settings \(rig_digest: .* there, .* here\)"):
             make_dataset(CONFIG, tmp_path / "set", workers=1)
 
 
