@@ -17,7 +17,8 @@ from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
-from train.simulation.takes import SimulatedKind, simulate_take
+from train.simulation.room_settings import SimulatedKind
+from train.simulation.takes import simulate_take
 
 _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
 
