@@ -9,12 +9,13 @@ from typing import Annotated, Final
 
 import numpy as np
 import tyro
+from rich.console import Console
 
 from gloves.captures.formats import WRITABLE, check_suffix, write_capture
 from gloves.takes.corrections import corrections_path
 from gloves.takes.take import load_take
 from handsim.app.messages import print_line
-from handsim.app.progress import named_steps, progress_bar
+from handsim.app.progress import progress_bar
 from handsim.cli.options import check_take_file, chosen_hands
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs
@@ -88,7 +89,7 @@ def track(
             tracked = _track_file(capture, out, glove, chosen, chosen_size, labeler, body, sinks, on_frame)
         else:
             setup = TrackerSetup.of(glove, chosen, chosen_size, labeler, body, TrackerConfig())
-            with named_steps("getting ready"):
+            with Console(stderr=True).status("getting ready"):
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
     if labeled is not None:

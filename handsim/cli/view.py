@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import Console
 
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
-from handsim.app.progress import named_steps, progress_bar
+from handsim.app.progress import progress_bar
 from handsim.cli.options import check_take_file, chosen_hands
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
@@ -114,7 +115,7 @@ def _view_live(
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
     cameras = None if rig is None else load_rig(rig)
-    with named_steps("getting ready"):
+    with Console(stderr=True).status("getting ready"):
         warm_up(setup.user, setup.labeler)
     with (
         interrupt_flag() as ended,
