@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import warnings
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -28,9 +26,6 @@ MOST_PEOPLE: Final = 1_000_000
 _MOST_FRAMES: Final = 10_000_000
 _FARTHEST: Final = 50.0  # [m] of a wrist from the origin
 _BEYOND: Final = np.deg2rad(10.0)  # out of a joint's range that is told
-_DAMAGE: Final = (
-    ValueError, KeyError, TypeError, OverflowError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error
-)  # fmt: skip
 
 
 class OwnPoses(NamedTuple):
@@ -105,7 +100,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
         arrays = read_npz(path)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _DAMAGE as error:
+    except ValueError as error:
         raise CaptureError(f"{path}: not an .npz of plain arrays, or a damaged one") from error
     for name in arrays:
         if name not in KEYS:

@@ -19,7 +19,7 @@ from gloves.captures._c3d_parameters import Parameters
 from gloves.captures._text import Tell, meters_per, warn
 from gloves.captures.capture import Capture
 from gloves.captures.frame_times import StatedTimes, check_same_rate, timed_positions
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, shortened
 
 if TYPE_CHECKING:
     import ezc3d
@@ -67,7 +67,7 @@ def write_c3d(path: Path, capture: Capture) -> None:
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:
             raise CaptureError(
-                f"marker name '{name[:40]}...' is longer than the {_MOST_LABEL_BYTES} bytes of a label"
+                f"marker name '{shortened(name)}' is longer than the {_MOST_LABEL_BYTES} bytes of a label"
             )
     # ezc3d adds '.c3d' to any other ending, '.C3D' too.
     written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")

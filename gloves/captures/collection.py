@@ -35,12 +35,13 @@ def find_captures(paths: Sequence[Path]) -> list[Path]:
 
 
 def read_markers(files: Sequence[Path], names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
-    """The named markers of all frames of labeled captures [m], NaN where missing; hand by hand.
+    """The named markers of the frames of labeled captures that show some [m], NaN where missing; hand by hand.
 
     Raises:
         CaptureError: A file cannot be read or lacks a marker; the file is named.
     """
-    return np.concatenate([_markers_of(file, names) for file in files])
+    markers = np.concatenate([_markers_of(file, names) for file in files])
+    return markers[np.isfinite(markers).any(axis=(1, 2))]
 
 
 def _markers_of(file: Path, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
+from gloves.captures._text import cell_number
 from handsim.errors import CaptureError
 
 LOWEST_RATE: Final = 1.0
@@ -46,6 +47,8 @@ class StatedTimes:
     """Number of frames, as it is written."""
     count_name: str = ""
     """What the file calls it."""
+    count_is_reliable: bool = True
+    """Whether fewer frames mean that the file is cut; many programs and people shorten a TRC as it is."""
 
 
 def check_rate(rate: float, name: str = "the rate") -> None:
@@ -152,7 +155,7 @@ class _Ticks:
 def _stated_rate(text: str) -> float | None:
     """The rate that a header states [Hz]; None where that is no positive number."""
     try:
-        rate = float(text)
+        rate = cell_number(text)
     except ValueError:
         return None
     return rate if 0.0 < rate < np.inf else None
@@ -265,12 +268,12 @@ def _check_count(stated: StatedTimes, there: int, spanned: int, tell: Callable[[
     if not text.isdecimal():
         return
     count = int(text[:_MOST_DIGITS])
-    if count > spanned:
+    if count > spanned and stated.count_is_reliable:
         raise CaptureError(
             f"truncated: {stated.count_name} is {count}, and {spanned} frames are there; export the file "
             "again, or correct that number if they are all"
         )
-    if count < there:
+    if count < there or count > spanned:
         tell(f"{stated.count_name} is {count}, and {there} frames are there; all are read")
 
 

@@ -16,9 +16,11 @@ import numpy as np
 
 from gloves.captures._text import (
     Tell,
-    csv_cells,
+    header_cells,
     meters_per,
     parse_table,
+    plain_lines,
+    separator_behind,
     split_lines,
     warn,
 )
@@ -27,7 +29,7 @@ from gloves.captures.frame_times import StatedTimes, timed_positions
 from handsim.errors import CaptureError
 
 _MOST_HEADER_LINES: Final = 20
-MOTIVE_BEGIN: Final = b"Format Version,"
+MOTIVE_BEGIN: Final = b"Format Version"
 _COUNT: Final = "Total Exported Frames"
 _AXES: Final = ["X", "Y", "Z"]
 _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
@@ -37,7 +39,7 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
     Args:
-        data: The file.
+        data: The file; its cells are separated by commas, semicolons or tabs.
         tell: Called with a sentence where the file states no unit of length, or frames are missing.
 
     Raises:
@@ -45,9 +47,11 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
             with rate, times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
-    if not lines[0].startswith(MOTIVE_BEGIN):
+    separator = separator_behind([MOTIVE_BEGIN], lines[0])
+    if separator is None:
         raise CaptureError("not a Motive CSV export: line 1 does not begin with 'Format Version'")
-    rows = [csv_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
+    lines = plain_lines(lines, separator)
+    rows = [header_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
     stated = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
     if not stated.get("Length Units"):
@@ -65,7 +69,6 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         lines,
         start=end + 1,
         ended=ended,
-        delimiter=b",",
         num_columns=len(axes),
         column_name=lambda column: f"{names[column]} {axes[column]}".strip(),
         text_columns=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),

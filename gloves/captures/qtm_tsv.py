@@ -13,18 +13,21 @@ from typing import Final
 from gloves.captures._text import (
     MOST_CELLS,
     Tell,
+    cell_number,
     header_cells,
     meters_per,
     parse_table,
+    plain_lines,
+    separator_behind,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
 from gloves.captures.frame_times import StatedTimes, timed_positions
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, shortened
 
-_BEGINS: Final = (b"NO_OF_FRAMES\t", b"FILE_VERSION\t")
-_KEY: Final = re.compile(rb"[A-Z][A-Z0-9_]*(\t|$)")
+_BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
+_KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
 _LEADING: Final = ("frame", "time")
 _MOST_DIGITS: Final = 12  # of a count
 _UNIT: Final = "mm"  # the only one that QTM writes
@@ -41,21 +44,23 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         CaptureError: Not such an export, of other data, cut, or with a cell that is not a number.
     """
     lines, ended = split_lines(data)
-    if not lines[0].startswith(_BEGINS):
+    separator = separator_behind(_BEGINS, lines[0])
+    if separator is None:
         raise CaptureError(
             "not a Qualisys TSV export: line 1 does not begin with 'NO_OF_FRAMES' or 'FILE_VERSION'"
         )
+    lines = plain_lines(lines, separator, wider=True)
     start = next((index for index, line in enumerate(lines) if not _KEY.match(line)), len(lines))
     if start == len(lines) and not ended:
         raise CaptureError("the header is cut: no line of column names or numbers follows it")
     stated = {
         cells[0]: cells[1:]
         for number, line in enumerate(lines[:start], 1)
-        for cells in [header_cells(line, b"\t", number)]
+        for cells in [header_cells(line, number)]
     }
     included = _first(stated, "DATA_INCLUDED") or "3D"
     if included != "3D":
-        raise CaptureError(f"DATA_INCLUDED is '{included[:40]}', expected '3D'; export the 3D data")
+        raise CaptureError(f"DATA_INCLUDED is '{shortened(included)}', expected '3D'; export the 3D data")
     if "MARKER_NAMES" not in stated:
         raise CaptureError("the header states no MARKER_NAMES")
     names = _names(stated)
@@ -71,7 +76,6 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         lines,
         start=start,
         ended=ended,
-        delimiter=b"\t",
         num_columns=leading + 3 * len(names),
         column_name=column_name,
     )
@@ -119,11 +123,11 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
         start += 1
     if start == len(lines):
         raise CaptureError("no frames: nothing follows the header")
-    cells = header_cells(lines[start], b"\t", start + 1)
+    cells = header_cells(lines[start], start + 1)
     if cells[0].lower() == _LEADING[0]:
         return start + 1, 2 if cells[1:2] and cells[1].lower() == _LEADING[1] else 1
     try:
-        float(cells[0] or "nan")
+        cell_number(cells[0])
     except ValueError:  # names of columns, without frame and time
         return start + 1, 0
     while cells and not cells[-1]:

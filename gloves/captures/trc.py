@@ -12,11 +12,14 @@ from typing import Final
 import numpy as np
 
 from gloves.captures._text import (
+    TAB,
     Tell,
     check_width,
     header_cells,
     meters_per,
     parse_table,
+    plain_lines,
+    separator_behind,
     split_lines,
     warn,
 )
@@ -24,6 +27,7 @@ from gloves.captures.capture import Capture
 from gloves.captures.frame_times import StatedTimes, timed_positions
 from handsim.errors import CaptureError
 
+_BEGIN: Final = b"PathFileType"
 _HEADER_LINES: Final = 5
 _LEADING: Final = 2  # frame number and time
 _NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
@@ -43,7 +47,7 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a TRC file.
 
     Args:
-        data: The file. Cells are separated by tabs, or by commas where the first line is.
+        data: The file. Cells are separated by tabs, or by commas or semicolons where the first line is.
         tell: Called with a sentence for what is suspicious: missing frames, or a rate that only the column of
             times states.
 
@@ -52,22 +56,22 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
             times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
-    if not lines[0].lstrip().startswith(b"PathFileType"):
+    if not lines[0].lstrip(b' \t"').startswith(_BEGIN):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
+    lines = plain_lines(lines, separator_behind([_BEGIN], lines[0]) or TAB, wider=True)
     # A header line counts only with its line end: what precedes a cut may be incomplete.
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
         raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
-    delimiter = b"," if lines[0].lstrip().startswith(b"PathFileType,") else b"\t"
     keys, values, titles, axes = (
-        header_cells(line, delimiter, number) for number, line in enumerate(lines[1:_HEADER_LINES], 2)
+        header_cells(line, number) for number, line in enumerate(lines[1:_HEADER_LINES], 2)
     )
     stated = _stated(keys, values)
     if not stated.get("units"):
         raise CaptureError("the header (lines 2 and 3) states no Units")
     scale = meters_per(stated["units"])
     names = _marker_names(titles, sum(bool(cell) for cell in axes))
-    names += _unnamed(lines[_HEADER_LINES:], len(names), delimiter)
+    names += _unnamed(lines[_HEADER_LINES:], len(names))
 
     def column_name(column: int) -> str:
         if column < _LEADING:
@@ -79,7 +83,6 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
         lines,
         start=_HEADER_LINES,
         ended=ended,
-        delimiter=delimiter,
         num_columns=_LEADING + 3 * len(names),
         column_name=column_name,
     )
@@ -91,6 +94,7 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
         times=table[:, 1],
         count=stated.get("numframes", ""),
         count_name="NumFrames",
+        count_is_reliable=False,
     )
     return Capture(names, *timed_positions(positions, times, tell))
 
@@ -152,14 +156,14 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
     return names
 
 
-def _unnamed(rows: list[bytes], num_named: int, delimiter: bytes) -> tuple[str, ...]:
+def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
     """Names '*n' for the trajectories that rows hold behind those of line 4, as Cortex writes them.
 
     Raises:
         CaptureError: There is no trajectory at all, or a row has cells that are not three per trajectory.
     """
     expected = _LEADING + 3 * num_named
-    widths = [row.rstrip(b" \t" + delimiter).count(delimiter) + 1 for row in rows]
+    widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
     width = max(widths, default=0)
     extra = max(0, width - expected)
     check_width(width, _HEADER_LINES + 1 + (widths.index(width) if widths else 0))
@@ -168,6 +172,6 @@ def _unnamed(rows: list[bytes], num_named: int, delimiter: bytes) -> tuple[str, 
             f"line {_HEADER_LINES + 1 + widths.index(width)} has {width} cells, expected {expected}, or "
             "three more for each trajectory without a name"
         )
-    if not num_named and not extra and any(row.strip(b" \t" + delimiter) for row in rows):
+    if not num_named and not extra and any(row.strip(b" \t") for row in rows):
         raise CaptureError(_NO_MARKERS)
     return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from gloves.takes.columns import Column
 from handsim.errors import CaptureError
+from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write, make_folder_of
 
 SUFFIX: Final = ".part"
@@ -335,13 +336,12 @@ def _pack_array(array: NDArray[Any]) -> bytes:
 
 
 def _unpack_array(content: bytes) -> NDArray[Any]:
-    """An array of the .npy format, whose size is that of its bytes."""
+    """An array of the .npy format, whose size is that of its bytes; raises a ValueError if it is not."""
     buffer = io.BytesIO(content)
-    np.lib.format.read_magic(buffer)
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(buffer)
-    if dtype.hasobject or fortran:
-        raise ValueError("objects")
-    return np.frombuffer(content, dtype, offset=buffer.tell()).reshape(shape)
+    check_npy_header(buffer, len(content))
+    buffer.seek(0)
+    array: NDArray[Any] = np.lib.format.read_array(buffer, allow_pickle=False)
+    return array
 
 
 def _column(stored: Mapping[str, Any]) -> Column:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +23,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
+_COUNTS: Final = re.compile(r"[\d.,]+")
 EVERY: Final = 10.0
 """Time between two lines where there is no terminal [s]."""
 
@@ -45,6 +47,33 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
         else:
             with _lines(console, bar.tasks[0], unit):
                 yield bar, task
+
+
+@contextmanager
+def named_steps(first: str) -> Iterator[Callable[[str], None]]:
+    """Names steps whose length is not known, on standard error: on a terminal the running one, else all.
+
+    A step's name may hold counts; without a terminal it is a new line only now and then.
+
+    Args:
+        first: Name of the first step.
+    """
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with console.status(first) as status:
+            yield status.update
+        return
+    last, due = "", 0.0
+
+    def tell(step: str) -> None:
+        nonlocal last, due
+        name, now = _COUNTS.sub("", step), time.monotonic()
+        if name != last or now >= due:
+            last, due = name, now + EVERY
+            console.print(step, soft_wrap=True, markup=False, highlight=False)
+
+    tell(first)
+    yield tell
 
 
 def print_above(bar: Progress) -> Callable[[str], None]:

@@ -1,14 +1,35 @@
-"""Options that several commands share: whose hands are tracked."""
+"""Options that several commands share: whose hands are tracked, and into which file."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
 
+from gloves.takes.corrections import corrections_path
+from gloves.takes.take import SUFFIX
 from handsim.errors import ArgumentError
 from handsim.hand.topology import Side
 from track.setup import BOTH, AnyHands, Size
 from track.user import load_user
+
+
+def check_take_file(out: Path, *, live: bool) -> None:
+    """Refuse a file for a take that is named otherwise, or whose take a recording would replace.
+
+    Args:
+        out: The option --out.
+        live: Whether a stream is recorded; corrections would fit no other recording.
+
+    Raises:
+        ArgumentError: The name does not end as a take's, or somebody corrected the take there.
+    """
+    if out.suffix.lower() != ".npz" or out.name.endswith(SUFFIX):
+        raise ArgumentError(f"--out is {out}, expected a file name that ends in .npz and not in {SUFFIX}")
+    corrections = corrections_path(out)
+    if live and corrections.exists():
+        raise ArgumentError(
+            f"{corrections} corrects the take that --live would replace, expected another --out than {out}"
+        )
 
 
 def chosen_hands(

@@ -15,10 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from handsim.errors import HandSimError
+from handsim.errors import HandSimError, shortened
 from handsim.files.inputs import read_bytes
 
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
+_INTEGER_BITS: Final = 63
 _DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 
 
@@ -180,11 +181,23 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
         text = data.decode("utf-8")
         deep = _DOTTED.search(text)
         if deep is not None:
-            raise ValueError(f"the key {deep[0][:20]!r}... has too many parts")
-        return tomllib.loads(text)
+            raise tomllib.TOMLDecodeError(f"the key {shortened(deep[0])!r} has too many parts")
+        table = tomllib.loads(text)
+        if _has_long_integer(table):
+            raise OverflowError
+        return table
     except UnicodeDecodeError as cause:
         raise error(f"{path}: not a TOML file: it is not UTF-8 text") from cause
-    except ValueError as cause:
+    except tomllib.TOMLDecodeError as cause:
         raise error(f"{path}: not a TOML file: {cause}") from cause
+    except (ValueError, OverflowError) as cause:  # Python reads no more than some thousand digits
+        raise error(f"{path}: not a TOML file: an integer of more than 64 bits") from cause
     except RecursionError as cause:
         raise error(f"{path}: not a TOML file: brackets are nested too deep") from cause
+
+
+def _has_long_integer(value: object) -> bool:
+    """Whether an integer beyond the 64 bits of TOML is in a table, which Python would take."""
+    if isinstance(value, dict | list):
+        return any(map(_has_long_integer, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, int) and value.bit_length() > _INTEGER_BITS

@@ -84,7 +84,10 @@ class OnnxLabeler:
             content = path.read_bytes()
             if sign_model(content) != content:  # onnxruntime crashes on some damaged files
                 raise ValueError("the SHA-256 is another one")
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            # Without its fallback, which prints on standard output.
+            self._session = onnxruntime.InferenceSession(
+                content, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
             metadata = self._session.get_modelmeta().custom_metadata_map
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
             self.prior = _unpacked(metadata[_PRIOR]) if _PRIOR in metadata else None

@@ -11,6 +11,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import platformdirs
+
 from gloves.layout import list_layouts
 from handsim._plugins import is_plugin, list_plugins
 from handsim.errors import HandSimError, WeightsError, choices
@@ -24,6 +26,8 @@ from train.matching.pose_prior import PosePrior
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
+LEARNED: Final = ".safetensors"
+"""How the files in `learned_folder` end."""
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
 _ANY_LAYOUT: Final = "any_layout"  # weights of the network for any layout
@@ -33,6 +37,17 @@ _LENGTH: Final = 8  # bytes that hold the header's length
 _MOST_CARD: Final = 1 << 24  # bytes
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
+
+
+def learned_folder() -> Path:
+    """Where labelers of learned gloves are kept, see `train.any_layout`; `XDG_CACHE_HOME` moves it."""
+    return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
+
+
+def learned_gloves() -> tuple[Path, ...]:
+    """The files of the gloves that are kept, the most recently used first."""
+    files = learned_folder().glob(f"*{LEARNED}")
+    return tuple(sorted(files, key=lambda file: file.stat().st_mtime, reverse=True))
 
 
 def shipped_labelers() -> tuple[str, ...]:

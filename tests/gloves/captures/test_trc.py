@@ -180,7 +180,7 @@ BAD = {
     "line 4 holds no names": trc(ROW, names="1\t0\t1\t2\t3"),
     "names and axes differ": trc(ROW, names="Frame#\tTime\ta\tb\tc"),
     "a word": trc(ROW, "1\t0\t1\t2\t3\t4\tfive\t6"),
-    "a decimal comma": trc(ROW, "1\t0\t1,5\t2\t3\t4\t5\t6"),
+    "a decimal comma": trc(ROW, "1\t0\t1,5\t2.5\t3\t4\t5\t6"),
     "a word for a frame number": trc("first" + ROW),
     "infinite": trc(ROW, ROW.replace("6", "inf")),
     "too many cells": trc(ROW, ROW + "\t\t7"),
@@ -205,6 +205,7 @@ def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]],
 @pytest.mark.skipif(
     not SIG18.is_dir(), reason=f"the SIGGRAPH 2018 captures are not at {SIG18} (HANDSIM_SIG18)"
 )
+@pytest.mark.filterwarnings("ignore:.*frames are missing")
 def test_all_published_captures_read() -> None:
     paths = sorted(SIG18.rglob("*.trc"))
     assert len(paths) == 336
@@ -215,7 +216,8 @@ def test_all_published_captures_read() -> None:
         assert capture.names[0] == "ThumbCMC"
         assert capture.names[-1] == "BackHand3"
         assert capture.rate == 120.0
-        assert np.isfinite(capture.positions).all()
-        assert np.abs(capture.positions).max() < 3.0, "meters"
-        num_frames += capture.num_frames
+        there = np.isfinite(capture.positions).all(axis=(1, 2))
+        assert np.isnan(capture.positions[~there]).all()  # numbers of frames jump in some files
+        assert np.abs(capture.positions[there]).max() < 3.0, "meters"
+        num_frames += there.sum()
     assert num_frames == 61_941

@@ -82,7 +82,9 @@ def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     assert take.sides == ("right",) and take.settings["user"] == "user.json"
     assert np.nanmedian(take.rms) < 0.0005
     np.testing.assert_array_equal(take.hands[0].attachment.points, found.attachment.points)
-    assert "right hand: tracked" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert said.startswith(f"{folder / 'user.json'}: hands in the glove 'dense19'\n")
+    assert "right hand: tracked" in said
 
 
 def test_users_that_do_not_fit_are_told(user, capture, tmp_path, capsys):

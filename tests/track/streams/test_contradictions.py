@@ -71,8 +71,17 @@ def gaps(trc: Trc) -> None:
 
 
 def cut(trc: Trc) -> None:
+    path = trc.path.with_suffix(".csv")
+    write_capture(path, trc.read()[0])
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-40]))
+    with pytest.raises(CaptureError, match="truncated: Total Exported Frames is 120, and 80 frames are"):
+        read_capture(path)
+
+
+def shortened(trc: Trc) -> None:
     trc.kept[80:] = False
-    assert "truncated: NumFrames is 120, and 80 frames are there" in trc.refused()
+    capture, told = trc.read()
+    assert capture.num_frames == 80 and "NumFrames is 120, and 80 frames are there" in told[0]
 
 
 def more_than_stated(trc: Trc) -> None:
@@ -220,7 +229,8 @@ def not_kept_up_with() -> None:
 
 CASES: dict[str, Callable[[Trc], None] | Callable[[], None]] = {
     "a gap in the numbers of the frames, or in their times where numbers go on": gaps,
-    "fewer frames than the header states, beside such gaps": cut,
+    "fewer frames than the header of a .csv or .tsv states, beside such gaps": cut,
+    "fewer frames than the header of a .trc states": shortened,
     "more frames than the header states": more_than_stated,
     "a stated rate that is not that of the times": another_rate,
     "no stated rate, but evenly spaced times": no_rate,
