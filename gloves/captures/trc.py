@@ -91,8 +91,8 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
 def write_trc(path: Path, capture: Capture, *, title: str) -> None:
     """Write millimeters with five decimals; a marker that was not seen gets three blank cells.
 
-    A tab ends the rows, and the two header lines above them, as in the files of Cortex: OpenSim does not count
-    a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
+    A tab ends the rows, and the two header lines above them, as in the files of Cortex: OpenSim does not
+    count a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
 
     Args:
         path: Where to write.

@@ -126,7 +126,7 @@ def test_a_rate_that_only_the_times_state_is_told(rate: str) -> None:
 
 
 def test_what_we_write_ends_its_rows_and_their_header_in_a_tab(tmp_path: Path) -> None:
-    """OpenSim drops a blank cell at the very end of a row; tables of other programs count cells in all lines."""
+    """OpenSim drops a blank cell at the very end of a row; other programs count the cells of all lines."""
     positions = np.random.default_rng(5).normal(size=(3, 4, 3))
     positions[1, 3] = np.nan
     capture = Capture(("a", "b", "c d", "*4"), positions, 100.0)
