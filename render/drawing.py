@@ -166,7 +166,8 @@ class Drawing:
         studio = self._studio(self.take.hands, rng) if cast is None else None
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
-            person = 0 if cast is None else cast.person_in(frame, shard)
+            # A take has its own hands; their looks change with the shard.
+            person = shard if cast is None else cast.person_in(frame, shard)
             if cast is not None:
                 studio = self._studio_of(person)
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
@@ -185,7 +186,8 @@ class Drawing:
                 continue
             for camera in cameras:
                 fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
-                yield studio.photograph(moment, camera, fresh)
+                drawn = studio.photograph(moment, camera, fresh)
+                yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
 
     def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
         return open_studio(hands, self.config, bodies=self.take.bodies, rng=rng)

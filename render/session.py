@@ -66,7 +66,7 @@ def render_take(
             poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
         out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
             formats has a folder of its own in it.
-        formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
+        formats: Some of webdataset, coco, yolo, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         times: Time of each pose (T,) [s]; poses are no motion without them.
