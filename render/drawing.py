@@ -53,8 +53,9 @@ def draw(
     A frame's picture is the same whatever other frames are asked for.
 
     Args:
-        source: A take or its path; or poses (T, 27), joint angles (T, 20) with the wrist at the origin, or
-            poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
+        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
+            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
+            that is not there.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
             Without it, viewpoints are drawn as `RenderConfig.view` says.
