@@ -172,7 +172,7 @@ def test_inverse_kinematics_of_opensim_on_our_trc_finds_our_angles(fit, qpos, tm
     take.export("joints.trc")
     take.export("angles.mot")
     write_hand(tmp_path / "hand.osim", fit)
-    exec(PAGE.read_text("utf-8").split("```python")[1].split("```")[0], {})
+    exec(PAGE.read_text("utf-8").split("```py\n")[1].split("```")[0], {})
     found, exported = (opensim.TimeSeriesTable(f"{name}.mot") for name in ("found", "angles"))
     for name in coordinate_names(fit.side):
         pair = [np.array(table.getDependentColumn(name).to_numpy()) for table in (found, exported)]
