@@ -53,8 +53,9 @@ def draw(
     A frame's picture is the same whatever other frames are asked for.
 
     Args:
-        source: A take or its path; or poses (T, 27), joint angles (T, 20) with the wrist at the origin, or
-            poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
+        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
+            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
+            that is not there.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
             Without it, viewpoints are drawn as `RenderConfig.view` says.
@@ -166,7 +167,8 @@ class Drawing:
         studio = self._studio(self.take.hands, rng) if cast is None else None
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
-            person = 0 if cast is None else cast.person_in(frame, shard)
+            # A take has its own hands; their looks change with the shard.
+            person = shard if cast is None else cast.person_in(frame, shard)
             if cast is not None:
                 studio = self._studio_of(person)
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
@@ -185,7 +187,8 @@ class Drawing:
                 continue
             for camera in cameras:
                 fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
-                yield studio.photograph(moment, camera, fresh)
+                drawn = studio.photograph(moment, camera, fresh)
+                yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
 
     def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
         return open_studio(hands, self.config, bodies=self.take.bodies, rng=rng)

@@ -62,11 +62,12 @@ def render_take(
     """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
     Args:
-        source: A take or its path; or poses (T, 27), joint angles (T, 20) with the wrist at the origin, or
-            poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
+        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
+            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
+            that is not there.
         out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
             formats has a folder of its own in it.
-        formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
+        formats: Some of webdataset, coco, yolo, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         times: Time of each pose (T,) [s]; poses are no motion without them.

@@ -102,6 +102,9 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
 def write_trc(path: Path, capture: Capture, *, title: str) -> None:
     """Write millimeters with five decimals; a marker that was not seen gets three blank cells.
 
+    A tab ends the rows, and the two header lines above them, as in the files of Cortex: OpenSim does not
+    count a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
+
     Args:
         path: Where to write.
         capture: What to write.
@@ -117,10 +120,10 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
         f"PathFileType\t4\t(X/Y/Z)\t{title}",
         "\t".join(_KEYS),
         "\t".join(values),
-        "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", ""))]),
-        "\t\t" + "\t".join(f"X{number}\tY{number}\tZ{number}" for number in range(1, num_markers + 1)),
+        "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", "")), ""]),
+        "\t\t" + "".join(f"X{number}\tY{number}\tZ{number}\t" for number in range(1, num_markers + 1)),
     )
-    row_format = "%d\t%.6f" + "\t%.5f" * (3 * num_markers)
+    row_format = "%d\t%.6f\t" + "%.5f\t" * (3 * num_markers)
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(header) + "\n\n")
         for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):

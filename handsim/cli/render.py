@@ -21,6 +21,7 @@ from render.cameras.viewpoints import Placement, ViewConfig
 from render.config import RenderConfig
 from render.formats.merging import merge_renderings
 from render.painting.painter import PainterChoice
+from render.pose_file import CSV
 from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind
 from render.scenery.photographs import photo_files
 from render.sensors.depth_noise import SENSORS, DepthNoiseConfig
@@ -107,7 +108,7 @@ def render(
     *,
     out: Annotated[str, tyro.conf.arg(metavar="PATH")],
     poses: Path | None = None,
-    hands: tuple[Side, ...] = ("right",),
+    hands: tuple[Side, ...] | None = None,
     people: int | None = None,
     glove: str = "dense19",
     merge: tuple[Path, ...] = (),
@@ -122,16 +123,19 @@ def render(
     folder of several.
 
     Args:
-        take: A tracked take (.npz), or the truth of a simulated one (.truth.npz).
+        take: A tracked take (.npz), the truth of a simulated one (.truth.npz), or a .csv of handsim export.
         out: Folder for the pictures, their annotations and contact_sheet.png; or a folder of an object store,
             as s3://bucket/prefix (docs/object_stores.md).
-        poses: Poses of your own (.npz) instead of a take; docs/rendering.md has the arrays.
-        hands: Whose poses these are, in the file's order: right, left, or both.
+        poses: Poses of your own (.npz, or .csv as handsim export writes it) instead of a take;
+            docs/rendering.md has the arrays and columns.
+        hands: Whose poses an .npz has, in its order: right (when not given), left, or both. A .csv names its
+            hands, and all are drawn when not given.
         people: Number of people that they are distributed over; one for each shard when not given.
         glove: Their marker layout with --dress glove: a shipped name or the path of a .toml file.
         merge: Folders of other renderings to be copied into one, with keys and ids of their own.
         options: What to draw.
-        format: File formats: webdataset, coco, freihand, interhand, exr, png; several go into folders.
+        format: File formats: webdataset, coco, yolo, freihand, interhand, exr, png; several go into
+            folders.
         workers: Processes; all cores when not given.
         cluster: Where else to draw shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
@@ -145,8 +149,10 @@ def render(
         count = merge_renderings(merge, place)
         print_line(f"{out}: {count} shards of {len(merge)} renderings")
         return
+    if take is not None and take.suffix.lower() == CSV:
+        take, poses = None, take
     if poses is None:
-        if (hands, people, glove) != (("right",), None, "dense19"):
+        if (hands, people, glove) != (None, None, "dense19"):
             raise HandSimError("--hands, --people and --glove belong to --poses; a take has its own")
         source: Path | PoseFile = cast("Path", take)
     else:

@@ -21,6 +21,11 @@ KEYPOINT_NAMES: Final[tuple[str, ...]] = (
     *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
 )
 NUM_KEYPOINTS: Final = len(KEYPOINT_NAMES)
+KEYPOINT_BONES: Final[tuple[int, ...]] = (
+    PALM,
+    *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1])),
+)
+"""Index in `BONES` of the bone that carries each keypoint: the one that begins there, or of a tip ends."""
 KEYPOINT_DIGITS: Final[tuple[int, ...]] = (-1, *np.repeat(np.arange(len(DIGITS)), 4).tolist())
 """Digit of each keypoint, -1 for the wrist."""
 SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
@@ -64,8 +69,7 @@ def keypoint_flesh(model: HandModel) -> Float[np.ndarray, "21"]:
     """
     qpos = join_qpos(np.zeros((1, NUM_JOINTS)))
     keypoints, skin = hand_keypoints(model, qpos)[0], model.skin(qpos)[0]
-    bones = [PALM, *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1]))]
-    rotations = model.forward_kinematics(qpos)[0, bones, :3, :3]
+    rotations = model.forward_kinematics(qpos)[0, list(KEYPOINT_BONES), :3, :3]
     local = np.einsum("kvi,kij->kvj", skin - keypoints[:, None], rotations)
     height = np.abs(local[..., 2])
     own = (np.linalg.norm(local[..., :2], axis=-1) < _ACROSS) & (height < _ALONG)

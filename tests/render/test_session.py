@@ -165,7 +165,7 @@ def test_a_rendering_goes_on_where_it_stopped_and_comes_out_the_same(path, tmp_p
     assert (whole / SHEET).is_file()
     told = []
     render_take(path, parted, ["coco", "png"], PLAIN, workers=1)
-    victim = next((parted / "png").glob("shard-00001"))
+    victim = next((parted / "png" / "images").glob("shard-00001"))
     for file in victim.iterdir():
         file.unlink()
     victim.rmdir()
@@ -219,7 +219,7 @@ def test_no_driver_is_one_sentence_where_opengl_is_wanted(path, tmp_path):
 
 def test_depth_on_disk_is_in_meters(path, tmp_path):
     render_take(path, tmp_path / "out", ["png"], dataclasses.replace(PLAIN, passes=("depth",)), workers=1)
-    depth = read_depth(next((tmp_path / "out").rglob("*depth*.png")))
+    depth = read_depth(next((tmp_path / "out").rglob("depth/*/*.png")))
     assert 0.2 < depth.min() < 1.0 < np.median(depth) < 6.0
 
 

@@ -36,9 +36,6 @@ _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three sta
 _FAR: Final = 0.012  # [m] from the length that the labels were found with
 _PRECISION: Final = 0.001  # [m] of length
 _USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, ANSUR II
-    0.187,
-    0.012,
-)  # [m] of adults, men and women, ANSUR II; children are farther off
 _BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
 _MARKER_SPREAD: Final = 0.002  # [m] per axis of glued markers around their places
 _INDEPENDENT: Final = 4.0  # frames' worth of evidence: what glue and flesh do repeats from frame to frame

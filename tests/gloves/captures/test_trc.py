@@ -136,13 +136,31 @@ def test_a_rate_that_only_the_times_state_is_told(rate: str) -> None:
     assert told == [sentence]
 
 
-def test_what_we_write_has_as_many_cells_in_every_row(tmp_path: Path) -> None:
-    """Tables of other programs count cells, and a tab behind the last one makes a column without a name."""
+def test_what_we_write_ends_its_rows_and_their_header_in_a_tab(tmp_path: Path) -> None:
+    """OpenSim drops a blank cell at the very end of a row; other programs count the cells of all lines."""
     positions = np.random.default_rng(5).normal(size=(3, 4, 3))
     positions[1, 3] = np.nan
-    write_capture(tmp_path / "take.trc", Capture(("a", "b", "c d", "*4"), positions, 100.0))
+    capture = Capture(("a", "b", "c d", "*4"), positions, 100.0)
+    write_capture(tmp_path / "take.trc", capture)
     lines = (tmp_path / "take.trc").read_text().split("\n")
-    assert [len(line.split("\t")) for line in lines] == [4, 8, 8, 14, 14, 1, 14, 14, 14, 1]
+    assert [len(line.split("\t")) for line in lines] == [4, 8, 8, 15, 15, 1, 15, 15, 15, 1]
+    for line in (*lines[3:5], *lines[6:9]):
+        # What a reader sees that drops one blank cell at the end of a line, as OpenSim does.
+        assert line.endswith("\t")
+        assert len(line.removesuffix("\t").split("\t")) == 2 + 3 * 4
+    np.testing.assert_allclose(read_capture(tmp_path / "take.trc").positions, positions, atol=1e-8)
+
+
+def test_opensim_reads_a_row_whose_last_marker_is_missing(tmp_path: Path) -> None:
+    opensim = pytest.importorskip("opensim")
+    positions = np.random.default_rng(6).normal(size=(4, 3, 3))
+    positions[1, 2] = positions[2] = positions[3, 0] = np.nan
+    write_capture(tmp_path / "take.trc", Capture(("a", "b", "c"), positions, 100.0))
+    table = opensim.TimeSeriesTableVec3(str(tmp_path / "take.trc"))
+    assert table.getColumnLabels() == ("a", "b", "c")
+    rows = [table.getRowAtIndex(row) for row in range(table.getNumRows())]
+    read = np.array([[[row[column][axis] for axis in range(3)] for column in range(3)] for row in rows])
+    np.testing.assert_allclose(read * 1e-3, positions, atol=1e-8)
 
 
 def test_every_cut_is_told_or_harmless(tmp_path: Path) -> None:
