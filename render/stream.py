@@ -206,7 +206,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         there = {n: pose for n, pose in poses.items() if pose is not None}
         keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
         camera = self._placed(sitting.studio, moment, keypoints, list(there.values()), rng)
-        chosen = sample_choices(self.config, sitting.studio.skin, rng)
+        chosen = sample_choices(self.config, sitting.studio.skin, rng, camera.size)
         fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
         frame = sitting.studio.photograph(moment, camera, fresh)
         truth = dict(zip(there, frame.hands, strict=True))

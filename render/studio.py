@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
+from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
@@ -26,7 +27,7 @@ from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
 from render.painting.shading import GAMMA
 from render.painting.shadows import light_behind
-from render.scenery.backgrounds import Background, draw_background
+from render.scenery.backgrounds import Background, kept_background
 from render.scenery.enclosures import Enclosure, draw_surroundings
 from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
@@ -321,9 +322,18 @@ class Studio:
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
     """Distance of a camera from the nearest vertex [m]."""
-    center = camera.T_world_camera[:3, 3]
-    distances = (np.linalg.norm(one.triangles.vertices - center, axis=1).min() for one in drawn)
-    return float(min(distances, default=np.inf))
+    x, y, z = camera.T_world_camera[:3, 3].tolist()
+    return min((_distance(one.triangles.vertices, x, y, z) for one in drawn), default=np.inf)
+
+
+@kernel
+def _distance(vertices: NDArray[Any], x: float, y: float, z: float) -> float:
+    """Distance [m] of the nearest of some vertices (V, 3) from a place."""
+    least = np.inf
+    for vertex in range(len(vertices)):
+        dx, dy, dz = vertices[vertex, 0] - x, vertices[vertex, 1] - y, vertices[vertex, 2] - z
+        least = min(least, dx * dx + dy * dy + dz * dz)
+    return float(np.sqrt(least))
 
 
 def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
@@ -338,6 +348,6 @@ def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
 @functools.lru_cache(maxsize=2)
 def _background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """SRGB from 0 to 255."""
-    display = cv2.pow(draw_background(background, size), 1.0 / GAMMA)
+    display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
     drawn: NDArray[np.float32] = np.multiply(display, np.float32(255.0), out=display)
     return drawn

@@ -114,6 +114,11 @@ class Viewpoints:
         """Number of cameras."""
         return len(self._poses)
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the first camera's pictures [px]."""
+        return self._cameras[0].size
+
     def positions(self) -> Float[np.ndarray, "P 3"]:
         """All positions of the cameras, and of the hands' centers, over the whole take [m]."""
         return np.concatenate([self._centers, *(path[:, :3, 3] for path in self._poses)])

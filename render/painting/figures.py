@@ -85,6 +85,13 @@ class Drawn:
     uv: Float32[np.ndarray, "V 2"] | None
     material: Callable[[], Material]
     """Returns the same material every time; only called for colors, because textures take time."""
+    coarse_faces: Int[np.ndarray, "G 3"] | None = None
+    """Triangles of the same vertices that cast its shadow; None: all of its own."""
+
+    @property
+    def casting(self) -> Int[np.ndarray, "G 3"]:
+        """Triangles that cast its shadow."""
+        return self.triangles.faces if self.coarse_faces is None else self.coarse_faces
 
 
 def sample_people(
@@ -141,7 +148,7 @@ class HandFigure:
             np.full(count, 1 + number, dtype=np.uint8),
             np.zeros(count, dtype=np.uint8),
         )
-        drawn = [Drawn(triangles, shade_colors(skin.shade), skin.uv, self._material)]
+        drawn = [Drawn(triangles, shade_colors(skin.shade), skin.uv, self._material, skin.coarse_faces)]
         if self.look.glove is not None:
             drawn.append(self._drawn_markers(qpos, number))
         return drawn

@@ -16,10 +16,10 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from render.sensors.random_images import normal_numbers
+from handsim.kernels.kernel import kernel
+from render.sensors.random_images import quantiles, random_words
 
 _LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
-_BAND: Final = 32  # rows done at a time, so that they stay in the processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,18 +93,61 @@ def expose(
     """
     if linear.ndim != 3 or linear.shape[2] != 3:
         raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
-    height, width = linear.shape[:2]
-    balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
-    rgb = np.empty((height, 3 * width), np.uint8)
-    for first in range(0, height, _BAND):
-        rows = slice(first, min(first + _BAND, height))
-        light = linear[rows].reshape(-1, 3 * width) * _gain(rows, (height, width), exposure)
-        if exposure.white_electrons > 0.0:
-            light += _noise(light, exposure, rng=rng)
-        light *= balance
-        rgb[rows] = encoded(light)
-    rgb = rgb.reshape(linear.shape)
+    rgb = np.empty(linear.shape, np.uint8)
+    white = exposure.white_electrons
+    words = random_words(linear.shape, rng=rng) if white > 0.0 else np.zeros((0, 0, 0), np.uint16)
+    shot = np.float32(1.0 / white if white > 0.0 else 0.0)
+    dark = np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0)
+    gain, lost = np.float32(2.0**exposure.stops), np.float32(exposure.vignetting)
+    balance = np.array(exposure.balance, dtype=np.float32)
+    light = np.ascontiguousarray(linear, dtype=np.float32)
+    _expose(light, gain, lost, words, quantiles(), shot, dark, balance, _curve(), rgb)
     return rgb if exposure.jpeg_quality is None else _through_jpeg(rgb, exposure.jpeg_quality)
+
+
+@kernel
+def _expose(
+    linear: NDArray[np.float32],
+    gain: np.float32,
+    lost: np.float32,
+    words: NDArray[np.uint16],
+    normal: NDArray[np.float32],
+    shot: np.float32,
+    dark: np.float32,
+    balance: NDArray[np.float32],
+    curve: NDArray[np.uint8],
+    rgb: NDArray[np.uint8],
+) -> None:
+    """Write what a sensor makes of light.
+
+    Args:
+        linear: The light (H, W, 3).
+        gain: Factor on it in the middle of the picture.
+        lost: Share that is missing in the corners; it grows with the squared distance from the middle.
+        words: Random numbers (H, W, 3), empty for no noise.
+        normal: `quantiles` (65536,).
+        shot: One over the electrons of white.
+        dark: Variance of the noise in the dark, 1 for white.
+        balance: Factors on the colors (3,).
+        curve: `_curve` (65536,).
+        rgb: Written (H, W, 3).
+    """
+    height, width = linear.shape[:2]
+    corner = 0.25 * (height * height + width * width)
+    top = np.float32(_LEVELS - 1)
+    for row in range(height):
+        down = (row + 0.5 - 0.5 * height) ** 2
+        for column in range(width):
+            away = (down + (column + 0.5 - 0.5 * width) ** 2) / corner
+            factor = gain * (np.float32(1.0) - lost * np.float32(away))
+            for channel in range(3):
+                light = linear[row, column, channel] * factor
+                if len(words):
+                    variance = max(light * shot, np.float32(0.0)) + dark
+                    light += np.sqrt(variance) * normal[words[row, column, channel]]
+                level = light * balance[channel] * top + np.float32(0.5)
+                level = min(max(level, np.float32(0.0)), top)
+                rgb[row, column, channel] = curve[int(level)]
 
 
 def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
@@ -114,34 +157,6 @@ def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]
     np.clip(scaled, 0.0, _LEVELS - 1, out=scaled)
     rgb: NDArray[np.uint8] = _curve().take(scaled.astype(np.uint16), mode="clip")
     return rgb
-
-
-def _gain(rows: slice, shape: tuple[int, int], exposure: Exposure) -> NDArray[np.float32]:
-    """Factor of each pixel, repeated for the channels; falls with the squared distance from the center."""
-    gain = 2.0**exposure.stops
-    if exposure.vignetting == 0.0:
-        return np.full((1, 1), gain, np.float32)
-    down, right = (
-        (np.arange(length) + 0.5 - 0.5 * length) ** 2 / (0.25 * (shape[0] ** 2 + shape[1] ** 2))
-        for length in shape
-    )
-    lost = np.repeat(right, 3).astype(np.float32) + down[rows, None].astype(np.float32)  # 1 in the corners
-    lost *= np.float32(-gain * exposure.vignetting)
-    lost += np.float32(gain)
-    return lost
-
-
-def _noise(
-    light: NDArray[np.float32], exposure: Exposure, *, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Electrons' noise, 1 for as many as white has."""
-    white = exposure.white_electrons
-    noise = light * np.float32(1.0 / white)
-    np.maximum(noise, 0.0, out=noise)
-    noise += np.float32((exposure.read_noise / white) ** 2)
-    np.sqrt(noise, out=noise)
-    noise *= normal_numbers(light.shape, rng=rng)
-    return noise
 
 
 def _through_jpeg(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
