@@ -16,7 +16,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_number, check_span, check_type, shown_value
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.keypoints import NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.records import pack_hand
@@ -188,15 +188,26 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
     def _posed(self, rng: np.random.Generator) -> Subject:
         """A person's poses."""
         side: Side = SIDES[rng.integers(2)] if self._side == "either" else self._side
-        shape = sample_shape(side=side, rng=rng)
-        model: Model | tuple[Model, Model] = HandModel(shape) if self._model is None else self._model
-        if self._poses is not None:
-            qpos = self._poses[rng.integers(len(self._poses), size=self._sitting)]
-        else:
-            qpos = sample_poses(models_of(model, 1)[0], self._sitting, self._sampler, rng=rng)
+        while True:
+            shape = sample_shape(side=side, rng=rng)
+            model: Model | tuple[Model, Model] = HandModel(shape) if self._model is None else self._model
+            try:
+                qpos = self._drawn_poses(model, rng)
+                break
+            except PoseError:  # a hand whose fingers are too thick for its breadth
+                if self._model is not None:
+                    raise
         if qpos.ndim == 3 and self._model is None:
             model = (HandModel(shape.with_side("right")), HandModel(shape.with_side("left")))
         return subject_of_poses(qpos, model=model, glove=self._glove)
+
+    def _drawn_poses(
+        self, model: Model | tuple[Model, Model], rng: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """Poses for all pictures of a person."""
+        if self._poses is not None:
+            return self._poses[rng.integers(len(self._poses), size=self._sitting)]
+        return sample_poses(models_of(model, 1)[0], self._sitting, self._sampler, rng=rng)
 
     def _picture(self, number: int, sitting: _Sitting, rank: int) -> dict[str, torch.Tensor]:
         rng = SpawnKey.STREAM.rng(self.seed, _PICTURE, number)

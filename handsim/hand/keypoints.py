@@ -66,9 +66,9 @@ def keypoint_flesh(model: HandModel) -> Float[np.ndarray, "21"]:
     keypoints, skin = hand_keypoints(model, qpos)[0], model.skin(qpos)[0]
     bones = [PALM, *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1]))]
     rotations = model.forward_kinematics(qpos)[0, bones, :3, :3]
-    local = np.einsum("kvi,kij->kvj", skin - keypoints[:, None], rotations)
+    local = (skin - keypoints[:, None]) @ rotations
     height = np.abs(local[..., 2])
-    own = (np.linalg.norm(local[..., :2], axis=-1) < _ACROSS) & (height < _ALONG)
+    own = (local[..., 0] ** 2 + local[..., 1] ** 2 < _ACROSS**2) & (height < _ALONG)
     flesh: NDArray[np.float64] = np.where(own, height, 0.0).max(axis=1)
     flesh[4::4] = flesh[3::4]
     return flesh
