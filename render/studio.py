@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -34,6 +34,9 @@ from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectanc
 from render.sensors.exposure import Exposure, expose, linear_of
 from render.sensors.shutter import Shutter, combine, shutter_times
 from render.skin.look import SkinLook
+
+_AROUND: Final = 8
+"""Pixels around a surface that a depth sensor's windows look at, and more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,11 +168,8 @@ class Studio:
         seen = truth
         if choices.enclosure is not None:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
-        if noisy and seen.depth is not None:
-            light, sensor = self._infrared(seen, rgb, present), choices.depth_noise
-            noisy_depth = apply_depth_noise(
-                seen.depth, seen.normals, sensor, camera=camera, reflectance=light, rng=rng
-            )
+        if noisy:
+            noisy_depth = self._noisy_depth(seen, rgb, present, camera, choices.depth_noise, rng)
         hands = tuple(
             hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth)
             for index, number in enumerate(present)
@@ -243,6 +243,43 @@ class Studio:
             warp_normals(camera, normals) if normals else None,
             *ids,
         )
+
+    def _noisy_depth(
+        self,
+        truth: Pictures,
+        rgb: NDArray[np.uint8] | None,
+        present: Sequence[int],
+        camera: Camera,
+        sensor: DepthNoise | None,
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "H W"]:
+        """Depth as the sensor has it; only the part of the picture that has depth takes time."""
+        assert truth.depth is not None
+        noisy = np.zeros_like(truth.depth)
+        left, top, width, height = cv2.boundingRect((truth.depth > 0.0).view(np.uint8))
+        if width == 0:
+            return noisy
+        right, bottom = (
+            min(end + _AROUND, side)
+            for end, side in zip((left + width, top + height), camera.size, strict=True)
+        )
+        left, top = max(0, left - _AROUND), max(0, top - _AROUND)
+        part = np.s_[top:bottom, left:right]
+        cut = {name: getattr(truth, name) for name in ("depth", "normals", "instances")}
+        inner = dataclasses.replace(
+            truth, **{name: None if picture is None else picture[part] for name, picture in cut.items()}
+        )
+        assert inner.depth is not None
+        light = self._infrared(inner, None if rgb is None else rgb[part], present)
+        noisy[part] = apply_depth_noise(
+            inner.depth,
+            inner.normals,
+            sensor,
+            camera=camera.part(left, top, right - left, bottom - top),
+            reflectance=light,
+            rng=rng,
+        )
+        return noisy
 
     def _infrared(
         self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from handsim.errors import ArgumentError
 from handsim.kernels.kernel import kernel
 from render.sensors.random_images import quantiles, random_words
 
+_ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
 _LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
 
 
@@ -93,16 +94,35 @@ def expose(
     """
     if linear.ndim != 3 or linear.shape[2] != 3:
         raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
-    rgb = np.empty(linear.shape, np.uint8)
+    height, width = linear.shape[:2]
+    rgb = np.empty((height, 3 * width), np.uint8)
     white = exposure.white_electrons
-    words = random_words(linear.shape, rng=rng) if white > 0.0 else np.zeros((0, 0, 0), np.uint16)
-    shot = np.float32(1.0 / white if white > 0.0 else 0.0)
-    dark = np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0)
-    gain, lost = np.float32(2.0**exposure.stops), np.float32(exposure.vignetting)
-    balance = np.array(exposure.balance, dtype=np.float32)
-    light = np.ascontiguousarray(linear, dtype=np.float32)
-    _expose(light, gain, lost, words, quantiles(), shot, dark, balance, _curve(), rgb)
+    words = random_words(linear.shape if white > 0.0 else (0, 0, 0), rng=rng)
+    away = np.repeat((np.arange(width) + 0.5 - 0.5 * width) ** 2, 3).astype(np.float32)
+    numbers = _Sensor(
+        np.float32(2.0**exposure.stops),
+        np.float32(exposure.vignetting),
+        np.float32(1.0 / white if white > 0.0 else 0.0),
+        np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0),
+    )
+    balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
+    light = np.ascontiguousarray(linear, dtype=np.float32).reshape(height, 3 * width)
+    _expose(light, *numbers, words.reshape(-1, 3 * width), quantiles(), away, balance, _root_curve(), rgb)
+    rgb = rgb.reshape(linear.shape)
     return rgb if exposure.jpeg_quality is None else _through_jpeg(rgb, exposure.jpeg_quality)
+
+
+class _Sensor(NamedTuple):
+    """Numbers of a picture's exposure."""
+
+    gain: np.float32
+    """Factor on the light in the middle of the picture."""
+    lost: np.float32
+    """Share that is missing in the corners; it grows with the squared distance from the middle."""
+    shot: np.float32
+    """One over the electrons of white; 0 for no noise."""
+    dark: np.float32
+    """Variance of the noise in the dark, 1 for white."""
 
 
 @kernel
@@ -110,44 +130,51 @@ def _expose(
     linear: NDArray[np.float32],
     gain: np.float32,
     lost: np.float32,
-    words: NDArray[np.uint16],
-    normal: NDArray[np.float32],
     shot: np.float32,
     dark: np.float32,
+    words: NDArray[np.uint16],
+    normal: NDArray[np.float32],
+    away: NDArray[np.float32],
     balance: NDArray[np.float32],
     curve: NDArray[np.uint8],
     rgb: NDArray[np.uint8],
 ) -> None:
-    """Write what a sensor makes of light.
+    """Write what a sensor makes of light, row by row, in loops that are compiled into vector instructions.
 
     Args:
-        linear: The light (H, W, 3).
-        gain: Factor on it in the middle of the picture.
-        lost: Share that is missing in the corners; it grows with the squared distance from the middle.
-        words: Random numbers (H, W, 3), empty for no noise.
+        linear: The light (H, 3 W).
+        gain: See `_Sensor`, as the next three.
+        lost: See `gain`.
+        shot: See `gain`.
+        dark: See `gain`.
+        words: Random numbers (H, 3 W), empty for no noise.
         normal: `quantiles` (65536,).
-        shot: One over the electrons of white.
-        dark: Variance of the noise in the dark, 1 for white.
-        balance: Factors on the colors (3,).
-        curve: `_curve` (65536,).
-        rgb: Written (H, W, 3).
+        away: Squared distance of a row's values from the middle column (3 W,) [px^2].
+        balance: Factor on each of them (3 W,).
+        curve: `_root_curve` (4096,).
+        rgb: Written (H, 3 W).
     """
-    height, width = linear.shape[:2]
-    corner = 0.25 * (height * height + width * width)
-    top = np.float32(_LEVELS - 1)
+    height, width = linear.shape
+    corner = np.float32(1.0 / (0.25 * (height * height + width * width / 9.0)))
+    zero, one, half, top = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(_ROOTS - 1)
+    light, noise = np.empty(width, np.float32), np.zeros(width, np.float32)
+    level = np.empty(width, np.int32)
     for row in range(height):
-        down = (row + 0.5 - 0.5 * height) ** 2
-        for column in range(width):
-            away = (down + (column + 0.5 - 0.5 * width) ** 2) / corner
-            factor = gain * (np.float32(1.0) - lost * np.float32(away))
-            for channel in range(3):
-                light = linear[row, column, channel] * factor
-                if len(words):
-                    variance = max(light * shot, np.float32(0.0)) + dark
-                    light += np.sqrt(variance) * normal[words[row, column, channel]]
-                level = light * balance[channel] * top + np.float32(0.5)
-                level = min(max(level, np.float32(0.0)), top)
-                rgb[row, column, channel] = curve[int(level)]
+        down = np.float32((row + 0.5 - 0.5 * height) ** 2)
+        for n in range(width):
+            light[n] = linear[row, n] * (gain * (one - lost * (down + away[n]) * corner))
+        if len(words):
+            for n in range(width):
+                noise[n] = normal[words[row, n]]
+            for n in range(width):
+                signal = light[n] if light[n] > zero else zero
+                light[n] += noise[n] * np.sqrt(signal * shot + dark)
+        for n in range(width):
+            value = light[n] * balance[n]
+            value = value if value > zero else zero
+            level[n] = int(np.sqrt(value if value < one else one) * top + half)
+        for n in range(width):
+            rgb[row, n] = curve[level[n]]
 
 
 def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
@@ -171,6 +198,13 @@ def _decoded() -> NDArray[np.float32]:
     """Light of the 256 sRGB values (IEC 61966-2-1)."""
     value = np.arange(256) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+@functools.cache
+def _root_curve() -> NDArray[np.uint8]:
+    """The sRGB values of light in even steps of its root: sixteen or more to each."""
+    values: NDArray[np.uint8] = encoded(((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32))
+    return values
 
 
 @functools.cache
