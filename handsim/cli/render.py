@@ -34,7 +34,7 @@ _NO_SENSOR: Final = "none"
 _AUTO_SENSOR: Final = "auto"
 _DEFAULT: Final = RenderConfig()
 _VIEW: Final = ViewConfig()
-_AS_IN_VIEW: Final = ("placement", "camera", "views", "distance", "rig", "cameras")
+_AS_IN_VIEW: Final = ("placement", "camera", "views", "share", "distance", "rig", "cameras")
 _AS_IN_CONFIG: Final = ("passes", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
 
 
@@ -43,14 +43,19 @@ class RenderOptions:
     """`RenderConfig` as the options of the command name it."""
 
     placement: Placement = _VIEW.placement
-    """Position of the cameras. still: in front of the hands. orbit: around them. head: at the user's eyes.
-    anywhere: at another position in every frame. rig: at the cameras of a rig."""
+    """Position of the cameras. still: in front of the hands, following them only where they leave the
+    picture. orbit: around them. head: at the user's eyes. anywhere: at another position in every frame.
+    rig: at the cameras of a rig, turned to the hands, with lenses as long as it takes."""
     camera: str = _VIEW.camera
     """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
     views: int = _VIEW.views
     """Number of cameras; a rig has its own number."""
-    distance: tuple[float, float] = _VIEW.distance
-    """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
+    share: float = _VIEW.share
+    """Share of the picture's height that a hand's longer side has, or a little more; less where all hands
+    of a frame do not fit into the picture otherwise."""
+    distance: tuple[float, float] | None = _VIEW.distance
+    """Instead of the share, nearest and farthest distance from the center of the hands [m], drawn
+    uniformly."""
     rig: str = _VIEW.rig
     """Rig for the placement rig: a shipped name or the path of a .toml file."""
     cameras: str | None = None
@@ -70,8 +75,8 @@ class RenderOptions:
     vary: Literal["shard", "frame"] = _DEFAULT.vary
     """Whether light and background change with every shard or with every frame."""
     depth_sensor: tuple[str, ...] = (_AUTO_SENSOR,)
-    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only, or auto: d435 for
-    the placement head and for --cameras, where hands may be too near for a kinect2; that elsewhere."""
+    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only, or auto: d435,
+    and kinect2, which needs half a meter, for the placement rig and from --distance 0.6 on."""
     color_sensor: bool = True
     """Whether noisy colors are written beside the perfect ones."""
     motion_blur: bool = False
