@@ -42,6 +42,8 @@ _NEARLY_ALL: Final = 0.97  # of the frames: what a lens of one length shows whol
 _PLACES: Final = 8  # in front of the hands that are tried
 _ASIDE: Final = np.deg2rad(50.0)  # farther from the front, at most
 _HIDDEN: Final = 10.0  # what a view from behind an arm counts as, times the distance of the share
+_ARM: Final = 0.5  # [m] of a forearm that views keep clear of
+_ARM_DISTANCE: Final = 0.2  # [m] between its middle and a camera, at least
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # between a view and a forearm, at least
 
 
@@ -303,12 +305,17 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
 
 
 def _behind_arms(qpos: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each frame's position (T, 3) [m] is behind a forearm, from where little but the arm is seen."""
+    """Whether each frame's position (T, 3) [m] is behind a forearm, where little but it is seen, or beside one.
+
+    NaN, where there is no hand, never is.
+    """
     away = np.nan_to_num(positions)[:, None] - qpos[..., :3]
     along = quaternion_matrix(qpos[..., 3:7])[..., 0]
-    cosines = -(away * along).sum(axis=-1) / np.linalg.norm(away, axis=-1)
-    behind: NDArray[np.bool_] = (cosines > np.cos(_ARM_CLEARANCE)).any(axis=1)
-    return behind  # NaN, where there is no hand, never is
+    back = -(away * along).sum(axis=-1)
+    behind = back > np.cos(_ARM_CLEARANCE) * np.linalg.norm(away, axis=-1)
+    beside = np.linalg.norm(away + np.clip(back, 0.0, _ARM)[..., None] * along, axis=-1) < _ARM_DISTANCE
+    hidden: NDArray[np.bool_] = (behind | beside).any(axis=1)
+    return hidden
 
 
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
