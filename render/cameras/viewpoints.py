@@ -305,7 +305,7 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
 
 
 def _behind_arms(qpos: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each frame's position (T, 3) [m] is behind a forearm, where little but it is seen, or beside one.
+    """Whether each frame's position (T, 3) [m] is behind a forearm, where little else is seen, or beside one.
 
     NaN, where there is no hand, never is.
     """

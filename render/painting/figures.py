@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody
-from handsim.hand.keypoints import keypoint_flesh
+from handsim.hand.keypoints import keypoint_thickness
 from handsim.hand.skin.surface import vertex_normals
 from render.frames import PARTS_A_HAND
 from render.painting.materials import (
@@ -126,10 +126,10 @@ class HandFigure:
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
-        self.flesh: Float[np.ndarray, "21"] = keypoint_flesh(fit.model)
-        """Depth of each keypoint under the back or the palm, whichever is more, markers included [m]."""
+        self.thickness: Float[np.ndarray, "21"] = keypoint_thickness(fit.model.shape)
+        """Of the hand at each keypoint, markers included [m]."""
         if look.glove is not None:
-            self.flesh = self.flesh + fit.layout.heights.max() + fit.layout.radius
+            self.thickness = self.thickness + fit.layout.heights.max() + fit.layout.radius
 
     def drawn(self, qpos: Float[np.ndarray, "27"], number: int) -> list[Drawn]:
         """Skin, and markers where a glove is worn.
