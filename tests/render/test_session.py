@@ -150,9 +150,8 @@ def test_a_rendering_without_any_frame_is_told(path, tmp_path):
 def test_depth_sensors_see_hands_of_all_tones_alike(path):
     seen = []
     for tone in ("very light", "dark"):
-        config = dataclasses.replace(
-            PLAIN, tones=TONES[tone], depth_sensor=DepthNoiseConfig(("azure_kinect",))
-        )
+        sensor, view = DepthNoiseConfig(("azure_kinect",)), ViewConfig(distance=(0.6, 0.8))
+        config = dataclasses.replace(PLAIN, tones=TONES[tone], depth_sensor=sensor, view=view)
         frame = drawn(path, config)[0]
         hands = (frame.ideal.instances == 1) | (frame.ideal.instances == 2)
         seen.append((frame.noisy.depth[hands] > 0.0).mean())
