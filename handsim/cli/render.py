@@ -26,7 +26,7 @@ from render.scenery.photographs import photo_files
 from render.sensors.depth_noise import SENSORS, DepthNoiseConfig
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
-from render.session import SHEET, left_out_frames, render_take
+from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
 from render.skin.look import ALL_TONES, TONES, named_tones
 from render.subject import PoseFile
 
@@ -161,17 +161,24 @@ def render(
     start = time.perf_counter()
     if options.photos is not None:
         _print_left_out(options.photos)
+    told: list[tuple[int, int]] = []
     with (
         progress_bar("images") as (bar, task),
         chosen_workers(cluster, workers, print_above(bar)) as chosen,
     ):
+
+        def show(done: int, total: int) -> None:
+            told.append((done, total))
+            doing = "drawing" if done < total else "writing the annotations and the contact sheet"
+            bar.update(task, completed=done, total=total, description=doing)
+
         count = render_take(
             source,
             place,
             format,
             config,
             workers=chosen,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=show,
         )
     seconds = time.perf_counter() - start
     lost = left_out_frames(place)
@@ -180,7 +187,13 @@ def render(
             f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a "
             "hand or an object"
         )
-    print_line(f"{out}: {count} images in {seconds:.0f} s")
+    cut = cut_off_pictures(place)
+    if cut:
+        print_line(f"{out}: images that lack a hand of their frame: {len(cut)} (the first: {cut[0]})")
+    if told and told[0][0] == told[0][1]:
+        print_line(f"{out}: complete already, with all of its {count} images")
+    else:
+        print_line(f"{out}: {count} images in {seconds:.0f} s, {count / seconds:.1f} a second")
     if {"rgb", "depth"} & set(config.passes):
         print_line(f"{place}/{SHEET}: some of them at one glance")
 
