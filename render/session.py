@@ -302,6 +302,7 @@ def _render_shard(
                     cut.append(frame.key)
                 yield frame
                 drawn.write(b".")
+        (out / _DRAWN.format(shard)).unlink(missing_ok=True)
         if cut:
             save_json(out / _CUT_OFF.format(f"{shard:05d}"), {"pictures": cut})
 

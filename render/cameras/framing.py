@@ -51,7 +51,8 @@ class Framing:
 
     def middle(self) -> Float[np.ndarray, "3"]:
         """Middle of all places where the hands are [m]."""
-        return 0.5 * (self.centers.min(axis=0) + self.centers.max(axis=0))
+        middle: NDArray[np.float64] = 0.5 * (self.centers.min(axis=0) + self.centers.max(axis=0))
+        return middle
 
     def followed(self) -> Float[np.ndarray, "T 3"]:
         """The centers as a person with a camera follows them [m]: without what is quicker than a second."""

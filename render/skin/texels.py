@@ -239,16 +239,19 @@ def _digit_lines() -> tuple[_DigitLines, ...]:
     texels, lines = skin_texels(), []
     for digit in texels.digits:
         back = texels.back[digit.texels]
-        parts = (
-            digit.along,
-            np.sin(3.0 * digit.angle),
-            np.cos(3.0 * digit.angle),
-            0.0015 * np.cos(digit.angle),
-            (1.0 - back) * digit.share,
-            back * digit.share * smooth(np.cos(digit.angle), -0.1, 0.6),
+        on_back = back * digit.share * smooth(np.cos(digit.angle), -0.1, 0.6)
+        lines.append(
+            _DigitLines(
+                digit.texels,
+                along=digit.along.astype(np.float32),
+                sine=np.sin(3.0 * digit.angle).astype(np.float32),
+                cosine=np.cos(3.0 * digit.angle).astype(np.float32),
+                arch=(0.0015 * np.cos(digit.angle)).astype(np.float32),
+                pad=((1.0 - back) * digit.share).astype(np.float32),
+                back=on_back.astype(np.float32),
+                joints=np.cumsum(digit.lengths)[:2],
+            )
         )
-        singles = (part.astype(np.float32) for part in parts)
-        lines.append(_DigitLines(digit.texels, *singles, np.cumsum(digit.lengths)[:2]))
     return tuple(lines)
 
 

@@ -77,7 +77,7 @@ def skin_texture(look: SkinLook, forearm: Forearm | None = None, *, side: Side =
 @functools.lru_cache(maxsize=2)  # both hands of a person share it
 def _painted(
     look: SkinLook, forearm: Forearm | None
-) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], NDArray[np.float64]]:
+) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"], NDArray[np.float32]]:
     """Color, roughness and height of the relief."""
     texels, rng = skin_texels(), np.random.default_rng(look.seed)
     # Pigment fades over the sides of fingers and hand, unevenly; relief ends sooner.

@@ -9,6 +9,7 @@ import resource
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -145,6 +146,16 @@ def test_a_rendering_without_any_frame_is_told(path, tmp_path):
     models = tuple(hand.model for hand in take.hands)
     with pytest.raises(HandSimError, match="no pictures: in all 2 frames a camera would be inside a hand"):
         render_take(take.qpos[24:26], tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
+
+
+def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):
+    config = dataclasses.replace(
+        PLAIN, view=ViewConfig("anywhere"), every=1, frames_per_shard=64, vary="frame"
+    )
+    render_take(path, tmp_path / "out", ["png"], config, workers=1)
+    for frame in draw(path, config=config, frames=[0, 7, 30]):
+        written = cv2.imread(str(next((tmp_path / "out").rglob(f"{frame.key}.png"))))
+        np.testing.assert_array_equal(written[..., ::-1], frame.rgb)
 
 
 def test_pictures_that_lack_a_hand_are_told(path, tmp_path):
