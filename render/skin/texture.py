@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,6 +19,11 @@ from render.skin.texels import REFERENCE, line_depth, skin_texels
 
 if TYPE_CHECKING:
     from handsim.hand.topology import Side
+
+
+_CREASE: Final = (-0.006, 0.02)  # [m] behind the wrist, where the palm's skin ends
+_UNEVEN: Final = np.float32(0.03)  # [m] of that border, where the border of pigment has 1
+_INNER_ARM: Final = 0.88  # pigment of the inner forearm, where the back of the hand has 1
 
 
 class SkinTexture(NamedTuple):
@@ -83,6 +88,9 @@ def _painted(
     # Pigment fades over the sides of fingers and hand, unevenly; relief ends sooner.
     edge = 0.10 * noise(texels.positions, (0.02, 0.006), rng=rng)
     pigment = smooth(texels.facing.astype(np.float32) + edge, -0.8, 0.55)
+    # A palm's skin ends at the wrist's crease: the inner forearm is nearly as dark as the outer.
+    behind = smooth(edge * _UNEVEN - texels.positions[:, 0].astype(np.float32), *_CREASE)
+    pigment = np.maximum(pigment, np.float32(_INNER_ARM) * behind)
     # The palm of a dark hand is not redder or yellower than other palms: chroma depends on the pigment.
     bare = np.array([look.palm_lightness, 15.0, 16.0])
     whole = np.array([look.lightness, look.redness, look.yellowness])
