@@ -85,21 +85,6 @@ def check_width(num_cells: int, number: int) -> None:
         raise CaptureError(f"damaged: line {number} has {num_cells} cells, expected at most {MOST_CELLS}")
 
 
-def positive_rate(text: str, *, name: str) -> float:
-    """The frame rate [Hz] that a header states.
-
-    Raises:
-        CaptureError: It is not a positive number.
-    """
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = math.nan
-    if not 0.0 < rate < math.inf:
-        raise CaptureError(f"{name} is '{text.strip()}', expected a positive number of frames per second")
-    return rate
-
-
 def split_lines(data: bytes) -> tuple[list[bytes], bool]:
     """Lines of a file with any kind of line ends, and whether the last one has its line end."""
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")

@@ -16,8 +16,9 @@ import numpy as np
 
 from gloves.captures._c3d_frames import BLOCK, MOST_FRAMES, Header, read_points
 from gloves.captures._c3d_parameters import Parameters
-from gloves.captures._text import Tell, meters_per, positive_rate, warn
+from gloves.captures._text import Tell, meters_per, warn
 from gloves.captures.capture import Capture
+from gloves.captures.frame_times import StatedTimes, check_same_rate, timed_positions
 from handsim.errors import CaptureError
 
 if TYPE_CHECKING:
@@ -42,15 +43,15 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     header = Header.parse(data, parameters.processor)
     points = read_points(data, parameters, header, tell)
     rate = parameters.number("POINT", "RATE", default=header.rate)
+    check_same_rate("POINT:RATE", rate, "the header's rate", header.rate)
     units = next(iter(parameters.strings("POINT", "UNITS")), "")
     if not units:
         tell("the file states no POINT:UNITS, read as millimeters, which most programs write")
     missing = points[..., 3] < 0.0
     positions = points[..., :3] * meters_per(units or "mm")
     positions[missing] = np.nan
-    return Capture(
-        _labels(parameters, points.shape[1]), positions, positive_rate(repr(rate), name="POINT:RATE")
-    )
+    timed = timed_positions(positions, StatedTimes(repr(rate), "POINT:RATE"), tell)
+    return Capture(_labels(parameters, points.shape[1]), *timed)
 
 
 def write_c3d(path: Path, capture: Capture) -> None:

@@ -12,7 +12,7 @@ from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import Capture
 from gloves.captures.markers import unlabeled_frames
 from gloves.captures.motive_csv import MOTIVE_BEGIN, read_motive_csv, write_motive_csv
-from gloves.captures.plausibility import unit_fault, zeros_as_missing
+from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault, zeros_as_missing
 from gloves.captures.qtm_tsv import read_qtm_tsv
 from gloves.captures.trc import read_trc, write_trc
 from gloves.captures.vicon_csv import read_vicon_csv, vicon_sections
@@ -89,7 +89,10 @@ def _checked(path: Path, capture: Capture) -> Capture:
             HandSimWarning,
             stacklevel=3,
         )
-    fault = unit_fault(unlabeled_frames(capture))
+    clouds = unlabeled_frames(capture)
+    if all_at_origin(clouds):
+        raise CaptureError(f"{path}: {AT_ORIGIN}, expected positions of markers")
+    fault = unit_fault(clouds)
     if fault is not None:
         raise CaptureError(
             f"{path}: by the unit of length that the file states, {fault.found}; correct that unit, probably "

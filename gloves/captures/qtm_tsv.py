@@ -16,11 +16,11 @@ from gloves.captures._text import (
     header_cells,
     meters_per,
     parse_table,
-    positive_rate,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
+from gloves.captures.frame_times import StatedTimes, timed_positions
 from handsim.errors import CaptureError
 
 _BEGINS: Final = (b"NO_OF_FRAMES\t", b"FILE_VERSION\t")
@@ -35,7 +35,7 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
 
     Args:
         data: The file.
-        tell: Called with a sentence where there are more frames than stated.
+        tell: Called with a sentence where frames are missing, or there are more than stated.
 
     Raises:
         CaptureError: Not such an export, of other data, cut, or with a cell that is not a number.
@@ -58,7 +58,6 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         raise CaptureError(f"DATA_INCLUDED is '{included[:40]}', expected '3D'; export the 3D data")
     if "MARKER_NAMES" not in stated:
         raise CaptureError("the header states no MARKER_NAMES")
-    rate = positive_rate(_first(stated, "FREQUENCY"), name="FREQUENCY")
     names = _names(stated)
     start, leading = _begin_of_rows(lines, start, 3 * len(names))
 
@@ -76,9 +75,16 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         num_columns=leading + 3 * len(names),
         column_name=column_name,
     )
-    _check_count(_first(stated, "NO_OF_FRAMES"), len(table), tell)
-    positions = table[:, leading:].reshape(len(table), len(names), 3)
-    return Capture(names, positions * meters_per(_UNIT), rate)
+    positions = table[:, leading:].reshape(len(table), len(names), 3) * meters_per(_UNIT)
+    times = StatedTimes(
+        _first(stated, "FREQUENCY"),
+        "FREQUENCY",
+        numbers=table[:, 0] if leading > 0 else None,
+        times=table[:, 1] if leading > 1 else None,
+        count=_first(stated, "NO_OF_FRAMES"),
+        count_name="NO_OF_FRAMES",
+    )
+    return Capture(names, *timed_positions(positions, times, tell))
 
 
 def _first(stated: dict[str, list[str]], key: str) -> str:
@@ -128,12 +134,3 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
             f"line {start + 1} has {len(cells)} cells, expected {width}, or {width + 2} with frame and time"
         )
     return start, leading
-
-
-def _check_count(stated: str, found: int, tell: Tell) -> None:
-    """Whether there are as many frames as the header states."""
-    count = int(stated[:_MOST_DIGITS]) if stated.isdecimal() else found
-    if count > found:
-        raise CaptureError(f"truncated: NO_OF_FRAMES is {count}, and {found} frames are there")
-    if count < found:
-        tell(f"NO_OF_FRAMES is {count}, and {found} frames are there; all are read")

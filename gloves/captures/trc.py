@@ -1,8 +1,7 @@
 """TRC, the tab-separated text of marker trajectories.
 
 Five header lines (file type, keys, their values, marker names, axes), then one line per frame: number, time,
-and three cells per marker. Frame counts and frame numbers are often wrong in practice, so only names, units,
-rate and the rows themselves are used. Rows may hold more trajectories than line 4 names.
+and three cells per marker. Rows may hold more trajectories than line 4 names.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from gloves.captures._text import (
     Tell,
@@ -19,16 +17,15 @@ from gloves.captures._text import (
     header_cells,
     meters_per,
     parse_table,
-    positive_rate,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
+from gloves.captures.frame_times import StatedTimes, timed_positions
 from handsim.errors import CaptureError
 
 _HEADER_LINES: Final = 5
 _LEADING: Final = 2  # frame number and time
-_UNEVEN: Final = 0.1  # of the step between two frames, by which times may differ that were rounded
 _NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
 _KEYS: Final = (
     "DataRate",
@@ -47,10 +44,12 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
 
     Args:
         data: The file. Cells are separated by tabs, or by commas where the first line is.
-        tell: Called with a sentence for what is suspicious: a rate that only the column of times states.
+        tell: Called with a sentence for what is suspicious: missing frames, or a rate that only the column of
+            times states.
 
     Raises:
-        CaptureError: Not a TRC, header or last row cut, unknown units, or a cell that is not a number.
+        CaptureError: Not a TRC, header or last row cut, unknown units, a cell that is not a number, or rate,
+            times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
     if not lines[0].lstrip().startswith(b"PathFileType"):
@@ -84,8 +83,16 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
         num_columns=_LEADING + 3 * len(names),
         column_name=column_name,
     )
-    rate = _rate(stated.get("datarate", ""), table[:, 1], tell)
-    return Capture(names, table[:, _LEADING:].reshape(len(table), len(names), 3) * scale, rate)
+    positions = table[:, _LEADING:].reshape(len(table), len(names), 3) * scale
+    times = StatedTimes(
+        stated.get("datarate", ""),
+        "DataRate",
+        numbers=table[:, 0],
+        times=table[:, 1],
+        count=stated.get("numframes", ""),
+        count_name="NumFrames",
+    )
+    return Capture(names, *timed_positions(positions, times, tell))
 
 
 def write_trc(path: Path, capture: Capture, *, title: str) -> None:
@@ -164,16 +171,3 @@ def _unnamed(rows: list[bytes], num_named: int, delimiter: bytes) -> tuple[str, 
     if not num_named and not extra and any(row.strip(b" \t" + delimiter) for row in rows):
         raise CaptureError(_NO_MARKERS)
     return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))
-
-
-def _rate(text: str, times: Float[np.ndarray, "T"], tell: Tell) -> float:
-    """The frame rate [Hz] that the header states, or else the one of evenly spaced times [s]."""
-    try:
-        return positive_rate(text, name="DataRate")
-    except CaptureError:
-        steps = np.diff(times)
-        if len(steps) < 2 or not (steps > 0.0).all() or np.ptp(steps) > _UNEVEN * steps.mean():
-            raise
-    rate = float(1.0 / steps.mean())
-    tell(f"DataRate is '{text}', expected a positive number; by the column of times it is {rate:.6g} Hz")
-    return rate

@@ -17,11 +17,11 @@ from gloves.captures._text import (
     csv_cells,
     meters_per,
     parse_table,
-    positive_rate,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
+from gloves.captures.frame_times import StatedTimes, timed_positions
 from handsim.errors import CaptureError
 
 _TITLE: Final = "Trajectories"
@@ -49,7 +49,7 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
 
     Args:
         data: The file; its cells are separated by commas or semicolons.
-        tell: Called with a sentence where no unit of length is stated.
+        tell: Called with a sentence where no unit of length is stated, or frames are missing.
 
     Raises:
         CaptureError: Not such an export, without trajectories, cut, or with a cell that is not a number.
@@ -67,7 +67,6 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
         raise CaptureError("the header is cut: expected rate, names and axes behind the line 'Trajectories'")
     delimiter = ";" if lines[at + 3].count(b";") > lines[at + 3].count(b",") else ","
     rates, names, axes = (csv_cells(lines[row], row + 1, delimiter) for row in range(at + 1, at + 4))
-    rate = positive_rate(rates[0], name="the rate of the trajectories")
     columns = _marker_columns(axes, at + 4)
     start, scales = _scales(lines[:end], at + 4, delimiter, columns, tell)
     names += [""] * (len(axes) - len(names))
@@ -81,7 +80,8 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     )
     positions = table[:, columns[:, None] + np.arange(3)] * scales[:, None]
     labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns.tolist(), 1))
-    return Capture(labels, positions, rate)
+    times = StatedTimes(rates[0], "the rate of the trajectories", numbers=table[:, 0])
+    return Capture(labels, *timed_positions(positions, times, tell))
 
 
 def _marker_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:

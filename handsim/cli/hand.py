@@ -58,6 +58,8 @@ def hand(
     chosen, words = _chosen_hand(size, side, shape, take, glove)
     model = chosen.model if isinstance(chosen, GloveFit) else chosen
     write_hand(out, chosen, actuators=actuators)
+    if mesh is not None:
+        write_skin(mesh, model)
     markers = chosen.layout.num_markers if isinstance(chosen, GloveFit) else 0
     extras = {
         ".xml": f"{markers} marker sites" + f", {NUM_JOINTS} servos" * actuators,
@@ -66,7 +68,6 @@ def hand(
     }
     print_line(f"{out}: {model.shape.side} hand {words}, {extras[suffix]}")
     if mesh is not None:
-        write_skin(mesh, model)
         surface = model.surface
         counts = f"{len(surface.vertices)} vertices, {len(surface.faces)} triangles"
         print_line(f"{mesh}: its skin, {counts}")

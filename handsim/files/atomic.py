@@ -33,7 +33,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     removed first.
 
     Args:
-        path: Where the finished file shall be; an existing file there is replaced.
+        path: Where the finished file shall be; an existing file there is replaced, of a link the file that
+            it points to.
 
     Yields:
         The path to write to.
@@ -59,12 +60,12 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
     Raises:
         OSError: As `atomic_write`.
     """
-    finals = [Path(path) for path in paths]
+    finals = [Path(os.path.realpath(path)) if os.path.islink(path) else Path(path) for path in paths]
     for final in finals:
         # Renaming onto a device (/dev/null) would replace it; a folder would be noticed only after the work.
         if final.exists() and not final.is_file():
             raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
-        final.parent.mkdir(parents=True, exist_ok=True)
+        make_folder_of(final)
         remove_abandoned(final)
     temporaries = [temporary_beside(final) for final in finals]
     modes = [_usual_mode(*pair) for pair in zip(temporaries, finals, strict=True)]
@@ -84,6 +85,18 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         if isinstance(error, OSError) and str(error.filename) in names:  # nobody knows the temporary name
             error.filename = names[str(error.filename)]
         raise
+
+
+def make_folder_of(path: Path) -> None:
+    """Make the folders that are missing on the way to a file.
+
+    Raises:
+        OSError: One cannot be made, or there is a file in its place.
+    """
+    for folder in path.parents:
+        if folder.exists() and not folder.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, f"{folder} is a file, not a folder", str(folder))
+    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def temporary_beside(path: Path) -> Path:

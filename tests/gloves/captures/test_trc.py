@@ -23,9 +23,9 @@ def trc(
     rate: str = "120",
     end: str = "\n",
 ) -> bytes:
-    """A file of two markers; the header's frame count is wrong on purpose."""
+    """A file of two markers; the header's marker count is wrong on purpose."""
     keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
-    values = f"{rate}\t120\t999\t7\t{units}"
+    values = f"{rate}\t120\t{len(rows)}\t7\t{units}"
     return ("\n".join(["PathFileType\t4\t(X/Y/Z)\tx.trc", keys, values, names, axes, *rows]) + end).encode()
 
 
@@ -43,13 +43,24 @@ def test_units(unit: str, meters: float) -> None:
     assert (capture.names, capture.rate) == (("a", "b"), 120.0)
 
 
-def test_header_counts_and_frame_numbers_do_not_matter() -> None:
-    capture = read_trc(trc(ROW, ROW.replace("0\t0\t", "17\t0.1\t", 1), ROW.replace("0\t0\t", "3\t\t", 1)))
-    np.testing.assert_allclose(capture.positions, np.repeat(POINTS, 3, axis=0) * 1e-3)
+def row(number: int, cells: str = ROW) -> str:
+    """A row of some frame at 120 Hz."""
+    return f"{number}\t{number / 120:.6f}\t" + cells.split("\t", 2)[2]
+
+
+@pytest.mark.parametrize("columns", ["17\t", "\t", "\t17.5"])
+def test_numbers_and_times_may_be_absent(columns: str) -> None:
+    rows = (
+        [ROW.replace("0\t0\t", columns + "\t", 1)] * 3
+        if columns == "\t"
+        else [columns + "\t" + ROW.split("\t", 2)[2], ROW.replace("0\t0\t", "\t\t", 1)]
+    )
+    positions = read_trc(trc(*rows)).positions
+    np.testing.assert_allclose(positions, np.repeat(POINTS, len(rows), axis=0) * 1e-3)
 
 
 @pytest.mark.parametrize(
-    "row",
+    "cells",
     [
         "0\t0\t1\t2\t3\t\t\t",
         "0\t0\t1\t2\t3\t\t\t\t",
@@ -59,8 +70,8 @@ def test_header_counts_and_frame_numbers_do_not_matter() -> None:
         "0\t0\t1\t2\t3\t4\t5",
     ],
 )
-def test_missing_cells(row: str) -> None:
-    positions = read_trc(trc(row, ROW)).positions
+def test_missing_cells(cells: str) -> None:
+    positions = read_trc(trc(cells, row(1))).positions
     np.testing.assert_allclose(positions[0, 0], [1e-3, 2e-3, 3e-3])
     assert np.isnan(positions[0, 1]).all()
     np.testing.assert_allclose(positions[1], POINTS[0] * 1e-3)
@@ -82,7 +93,7 @@ def test_missing_cells(row: str) -> None:
         lambda data: data.replace(b"\ta\t\t\tb\t\t\t", b"\ta\t\t\tb"),
         lambda data: data.replace(b"\ta\t\t\tb\t\t\t", b"\ta\t\tb"),
         lambda data: data.replace(b"#\tTime\ta", b"#\t\tTime\t\ta").replace(b"\t\t\tb", b"\t\tb"),
-        lambda data: data.replace(b"120\t120\t999\t7\tmm", b" 120.0\t\t120.0\t\t 999\t\t7\t\t mm"),
+        lambda data: data.replace(b"120\t120\t1\t7\tmm", b" 120.0\t\t120.0\t\t 1\t\t7\t\t mm"),
         lambda data: data.replace(b"PathFileType\t4\t", b"PathFileType  4\t"),
         lambda data: data.replace(b"\t", b","),
         lambda data: data.replace(b"\n0\t", b"\n\t\t\t\t\t\t\t\n0\t", 1).replace(b"\t", b","),
@@ -101,7 +112,7 @@ def test_blank_name_in_the_middle() -> None:
 @pytest.mark.parametrize("delimiter", [b"\t", b","])
 def test_trajectories_without_a_name_follow_those_with_one(delimiter: bytes) -> None:
     """Cortex writes them into rows of any length; line 4 and the header's count do not know of them."""
-    rows = (ROW + "\t7\t8\t9\t\t\t\t10\t11\t12\t", ROW, ROW + "\t1\t2\t3")
+    rows = (ROW + "\t7\t8\t9\t\t\t\t10\t11\t12\t", row(1), row(2) + "\t1\t2\t3")
     capture = read_trc(trc(*rows).replace(b"\t", delimiter))
     assert capture.names == ("a", "b", "*3", "*4", "*5")
     np.testing.assert_allclose(capture.positions[:, :2], np.repeat(POINTS, 3, axis=0) * 1e-3)
