@@ -193,7 +193,9 @@ def stream(frames: int) -> Figures:
     start = time.process_time()
     plain_pyrender(one, True, (CROP, CROP))
     floor = 1e3 * (time.process_time() - start) / frames
-    print(f"\n{CROP} x {CROP} of one hand: {rate_of:.1f} a second by {cores} workers, {each:.1f} ms of a core")
+    print(
+        f"\n{CROP} x {CROP} of one hand: {rate_of:.1f} a second by {cores} workers, {each:.1f} ms of a core"
+    )
     print(f"  plain pyrender's colors: {floor:.1f} ms of a core; ratio {each / floor:.2f}")
     print(f"  resident memory: {megabytes[0]:.0f} MB at first, {megabytes[-1]:.0f} MB at last")
     return {
