@@ -1,11 +1,14 @@
 """Speed of rendering, accuracy of depth, and memory.
 
-    MUJOCO_GL=egl python -m benchmarks.rendering [speed accuracy memory] [--frames 200 --images 20000]
+    MUJOCO_GL=egl python -m benchmarks.rendering [speed stream accuracy memory] [--frames 200 --images 20000]
 
 speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
     colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
     loop that a user would write with pyrender (the same meshes, plain material, one light) and MuJoCo's own
     renderer (the hand's capsules, no skin), each for depth and for colors.
+stream: 256 x 256 pictures of one hand from `PictureStream` (colors, depth, ids, keypoints, sensors) through a
+    DataLoader with a worker per core, their memory, and what a picture takes of a core; beside it the floor:
+    what plain pyrender takes of a core for the same size, colors alone.
 accuracy: depth and ids against embree through trimesh on the same triangles.
 memory: resident memory over many pictures.
 
@@ -45,7 +48,8 @@ from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from train.simulation.takes import simulate_take
 
-SECTIONS: Final = ("speed", "accuracy", "memory")
+SECTIONS: Final = ("speed", "stream", "accuracy", "memory")
+CROP, BATCH = 256, 16  # of the stream's pictures [px], and in a batch
 ROUNDS: Final = 3
 PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None, painter="compiled")
 DEPTH: Final = dataclasses.replace(PLAIN, passes=("depth",))
@@ -99,11 +103,11 @@ def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> flo
     return (len(steady) - 1) * frames / (steady[-1] - steady[0])
 
 
-def plain_pyrender(take: Take, color: bool) -> None:
+def plain_pyrender(take: Take, color: bool, size: tuple[int, int] = (640, 480)) -> None:
     """What a user would write: one scene per frame, skinned meshes, one light."""
     pyrender = load_pyrender()
     view = Viewpoints(PLAIN.view, take, rng=np.random.default_rng(0))
-    renderer = offscreen_renderer(640, 480)
+    renderer = offscreen_renderer(*size)
     for frame in range(take.num_frames):
         scene, camera = pyrender.Scene(), view.cameras(frame)[0]
         for number, hand in enumerate(take.hands):
@@ -111,7 +115,9 @@ def plain_pyrender(take: Take, color: bool) -> None:
             mesh = trimesh.Trimesh(skin, hand.model.surface.faces, process=False)
             scene.add(pyrender.Mesh.from_trimesh(mesh))
         pose = camera.T_world_camera @ OPENGL_FROM_OPENCV
-        scene.add(pyrender.IntrinsicsCamera(600.0, 600.0, 320.0, 240.0), pose=pose)
+        scale = size[1] / 480
+        lens = pyrender.IntrinsicsCamera(600.0 * scale, 600.0 * scale, size[0] / 2, size[1] / 2)
+        scene.add(lens, pose=pose)
         scene.add(pyrender.DirectionalLight(intensity=3.0), pose=pose)
         renderer.render(scene, flags=pyrender.RenderFlags.NONE if color else pyrender.RenderFlags.DEPTH_ONLY)
 
@@ -157,6 +163,61 @@ def speed(frames: int) -> Figures:
     return figures
 
 
+def stream(frames: int) -> Figures:
+    """Pictures for training loops, and the floor."""
+    from torch.utils.data import DataLoader
+
+    from render import PictureStream
+
+    cores = os.cpu_count() or 1
+    config = RenderConfig(passes=("rgb", "depth", "ids"))
+    source = PictureStream(config=config, crop=CROP, batch=BATCH, seed=0)
+    alone = iter(source)
+    for _ in range(4 * BATCH):  # kernels are loaded, and the first people drawn
+        next(alone)
+    start = time.process_time()
+    for _ in range(frames):
+        next(alone)
+    each = 1e3 * (time.process_time() - start) / frames
+    batches = iter(DataLoader(source, batch_size=BATCH, num_workers=cores))
+    for _ in range(4 * cores):
+        next(batches)
+    megabytes, start = [], time.perf_counter()
+    for number in range(-(-4 * frames // BATCH)):
+        next(batches)
+        if number % max(1, frames // BATCH) == 0:
+            megabytes.append(sum(_megabytes(process) for process in ("self", *_children())))
+    rate_of = (number + 1) * BATCH / (time.perf_counter() - start)
+    one = simulate_take(kind="single-hand", num_frames=frames, hands=("right",))
+    plain_pyrender(one, True, (CROP, CROP))
+    start = time.process_time()
+    plain_pyrender(one, True, (CROP, CROP))
+    floor = 1e3 * (time.process_time() - start) / frames
+    print(
+        f"\n{CROP} x {CROP} of one hand: {rate_of:.1f} a second by {cores} workers, {each:.1f} ms of a core"
+    )
+    print(f"  plain pyrender's colors: {floor:.1f} ms of a core; ratio {each / floor:.2f}")
+    print(f"  resident memory: {megabytes[0]:.0f} MB at first, {megabytes[-1]:.0f} MB at last")
+    return {
+        "stream": (f"pictures of a stream a second, {cores} workers", rate_of),
+        "each": ("a picture of a stream [ms of a core]", each),
+        "floor": ("the same size by plain pyrender, colors alone [ms of a core]", floor),
+        "ratio": ("their ratio", each / floor),
+        "memory": ("resident memory of all processes, first | last [MB]", (megabytes[0], megabytes[-1])),
+    }
+
+
+def _children() -> list[str]:
+    me = os.getpid()
+    return Path(f"/proc/{me}/task/{me}/children").read_text().split()
+
+
+def _megabytes(process: str) -> float:
+    """Resident memory."""
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
 def accuracy(frames: int) -> Figures:
     from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -199,12 +260,10 @@ def bare_studio(take: Take) -> Studio:
 def memory(images: int) -> Figures:
     frames, megabytes = 200, list[float]()
     print(f"\nresident memory over {images} pictures (colors, depth, ids)")
-    page = os.sysconf("SC_PAGE_SIZE")
     for shard in range(images // frames):
         draw(COLORS, frames, shard)
         if shard % max(1, images // frames // 8) == 0:
-            pages = int(Path("/proc/self/statm").read_text().split()[1])
-            megabytes.append(pages * page / 2**20)
+            megabytes.append(_megabytes("self"))
             print(f"  {(shard + 1) * frames:6d}: {megabytes[-1]:.1f} MB", flush=True)
     few = min(1, len(megabytes) - 1)
     return {
@@ -224,7 +283,7 @@ def main() -> None:
         parser.error("--save keeps the figures of one section")
     print(describe())
     for name in options.section or SECTIONS:
-        section = {"speed": speed, "accuracy": accuracy}.get(name, memory)
+        section = {"speed": speed, "stream": stream, "accuracy": accuracy}.get(name, memory)
         figures = section(options.images if name == "memory" else options.frames)
         save_figures(options.save, figures)
 

@@ -25,6 +25,7 @@ def is_plugin(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
 
 
+@functools.cache
 def list_plugins(group: str) -> tuple[str, ...]:
     """Names of the entry points of a group, as installed packages registered them."""
     return tuple(sorted({point.name for point in metadata.entry_points(group=group)}))

@@ -163,6 +163,7 @@ class Drawing:
         """
         config, cast = self.config, self.subject.cast
         around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
+        size = self.viewpoints.size
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         studio = self._studio(self.take.hands, rng) if cast is None else None
         kept: dict[int, FrameChoices] = {}
@@ -175,10 +176,10 @@ class Drawing:
             assert studio is not None
             own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
             if config.vary == "frame":
-                chosen = sample_choices(config, studio.skin, own, around)
+                chosen = sample_choices(config, studio.skin, own, size, around)
             else:
                 if person not in kept:
-                    kept[person] = sample_choices(config, studio.skin, rng, around)
+                    kept[person] = sample_choices(config, studio.skin, rng, size, around)
                 chosen = kept[person]
             moment = Moment(self.take, frame, None if cast is None else cast.person)
             cameras = self.viewpoints.cameras(frame)
@@ -225,10 +226,19 @@ def sample_choices(
     config: RenderConfig,
     skin: SkinLook | None,
     rng: np.random.Generator,
+    size: tuple[int, int],
     around: Float[np.ndarray, "N 3"] | None = None,
 ) -> FrameChoices:
-    """Random choices of a picture; a background that several cameras share is around these positions [m]."""
-    background, lighting = sample_surroundings(config.background, skin, rng=rng)
+    """Random choices of a picture.
+
+    Args:
+        config: What to choose from.
+        skin: See `sample_surroundings`.
+        rng: Source of the choices.
+        size: Of the picture [px].
+        around: Positions that a background of several cameras is around [m].
+    """
+    background, lighting = sample_surroundings(config.background, skin, size, rng=rng)
     sensor = config.chosen_depth_sensor
     return FrameChoices(
         lighting=lighting,

@@ -26,6 +26,7 @@ from rich.text import Text
 _COUNTS: Final = re.compile(r"[\d.,]+")
 EVERY: Final = 10.0
 """Time between two lines where there is no terminal [s]."""
+_PERIOD: Final = 600.0  # [s] that speeds and the time left are means over
 
 
 @contextmanager
@@ -40,7 +41,13 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(
+        *columns,
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        speed_estimate_period=_PERIOD,
+    ) as bar:
         task = bar.add_task("", total=1)
         if console.is_terminal:
             yield bar, task
@@ -111,12 +118,18 @@ def _line(task: Task, unit: str, seconds: float) -> str:
         done = f"working on {unit}"
     else:
         done = f"{task.completed:,.0f} of {total:,.0f} {unit}"
-    clock = f"{seconds // 3600:.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
-    return ", ".join(part for part in (done, task.description, speed, clock) if part)
+    clock = _clock(seconds)
+    rest = task.time_remaining
+    left = f"{_clock(rest)} left" if rest else ""
+    return ", ".join(part for part in (done, task.description, speed, clock, left) if part)
+
+
+def _clock(seconds: float) -> str:
+    return f"{seconds // 3600:.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
 
 
 class _Speed(ProgressColumn):
-    """Recent speed in units per second; blank until there is something to measure."""
+    """Mean speed in units per second; blank until there is something to measure."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
