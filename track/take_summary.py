@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 
+from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
 from gloves.takes.take import LOST, STATUSES, Take
 from handsim.hand.topology import Side
 
@@ -39,9 +40,17 @@ def summarize(take: Take) -> list[str]:
 
 def suspicions(take: Take) -> list[str]:
     """What is probably not as the user meant it, as one sentence each with its remedy."""
-    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
     there = np.isfinite(take.points[..., 0])
-    unlabeled = float((take.labels[there] < 0).mean()) if there.any() else 0.0
+    if not there.any():
+        return [f"no point is in any of the {take.num_frames} frames; does the camera system see markers?"]
+    clouds = [points[seen] for points, seen in zip(take.points, there, strict=True)]
+    if all_at_origin(clouds):
+        return [AT_ORIGIN]
+    fault = unit_fault(clouds, only_wide=True)
+    if fault is not None:
+        return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
+    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
+    unlabeled = float((take.labels[there] < 0).mean())
     if unlabeled > _MOST_UNLABELED:
         found.append(
             f"{100 * unlabeled:.1f} % of the points are not markers of what was tracked; name the glove worn "

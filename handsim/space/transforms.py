@@ -94,6 +94,12 @@ def euler_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     return angles
 
 
+def body_fixed_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Angles (T, 3) [rad] about x, y and z of the body, in turn, that make these rotations: Rx Ry Rz."""
+    # Rx Ry Rz is the inverse of Rz Ry Rx with the opposite angles.
+    return -euler_angles(np.swapaxes(rotations, -1, -2))[:, ::-1]
+
+
 def random_quaternions(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:
     """Uniform random rotations as wxyz quaternions (count, 4)."""
     raw: NDArray[np.float64] = rng.standard_normal((count, 4))

@@ -63,3 +63,15 @@ def test_the_command_tells_of_a_wrong_glove(truth, tmp_path, capsys):
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     assert told and all(line.startswith("handsim track: warning: ") for line in told)
     assert any(" of the points are not markers of what was tracked; name the glove" in line for line in told)
+
+
+def test_points_that_are_none_are_told_alone(tracked):
+    nothing = np.full(tracked.points.shape, np.nan)
+    sentences = {
+        "no point is in any of the 40 frames": nothing,
+        "all points are at the origin": 0.0 * tracked.points,
+    }
+    sentences["the points of a frame span"] = 1e3 * tracked.points
+    for sentence, points in sentences.items():
+        (told,) = suspicions(dataclasses.replace(tracked, points=points))
+        assert told.startswith(sentence) and "--glove" not in told
