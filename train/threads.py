@@ -121,7 +121,7 @@ class TrainingThreads:
                 self._try_other(step)
 
     def _try_other(self, step: float) -> None:
-        """Choose the other number if it is clearly faster than the chosen one, whose steps take `step` [s]."""
+        """Choose the other number if it is clearly faster than the chosen one, whose steps take `step`."""
         start = self._now()
         other = 1 if self.count > 1 else self._most
         self._time(other)  # the first may start threads
