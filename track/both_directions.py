@@ -141,7 +141,8 @@ def _decide(one: _Tracked, other: _Tracked, witness: Int[np.ndarray, "N"]) -> Fr
 def _is_lost(tracked: _Tracked, labels: Int[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
     """Which points have the label of a hand that is lost."""
     lost = np.isnan(tracked.markers).all(axis=(1, 2))
-    return (labels >= 0) & lost[np.maximum(labels, 0) // tracked.markers.shape[1]]
+    of_lost: Bool[np.ndarray, "N"] = lost[np.maximum(labels, 0) // tracked.markers.shape[1]]
+    return of_lost & (labels >= 0)
 
 
 def _without_doubles(labels: Int[np.ndarray, "N"], confidence: Float[np.ndarray, "N"]) -> NDArray[np.int64]:
