@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from track.association.initialization import MOST_POINTS
@@ -124,14 +124,25 @@ def _cloud(
 def _decide(one: _Tracked, other: _Tracked, witness: Int[np.ndarray, "N"]) -> FrameLabels:
     """The label that two of three witnesses give each point, else that of the more confident direction.
 
-    A direction without a label has no confidence, so that a label that nobody denies stays.
+    A direction without a label has no confidence, so that a label that nobody denies stays; and one that has
+    lost a hand denies none of its labels.
     """
     sure, other_sure = (np.where(way.labels >= 0, way.confidence, 0.0) for way in (one, other))
     same = one.labels == other.labels
+    first_stays = _is_lost(other, one.labels) & (other.labels < 0)
+    second_stays = _is_lost(one, other.labels) & (one.labels < 0)
     second = (witness == other.labels) | ((witness != one.labels) & (other_sure > sure))
+    second = (second & ~first_stays) | second_stays
     labels = np.where(second, other.labels, one.labels)
     confidence = np.where(same, one.confidence, _MAJORITY * np.where(second, other_sure, sure))
     return FrameLabels(_without_doubles(labels, confidence), confidence)
+
+
+def _is_lost(tracked: _Tracked, labels: Int[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+    """Which points have the label of a hand that is lost."""
+    lost = np.isnan(tracked.markers).all(axis=(1, 2))
+    of_lost: Bool[np.ndarray, "N"] = lost[np.maximum(labels, 0) // tracked.markers.shape[1]]
+    return of_lost & (labels >= 0)
 
 
 def _without_doubles(labels: Int[np.ndarray, "N"], confidence: Float[np.ndarray, "N"]) -> NDArray[np.int64]:

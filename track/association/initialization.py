@@ -37,7 +37,11 @@ FEWEST_POINTS: Final = 4
 """Least number of labeled points of a hand; a pose needs as many."""
 SPARE_POINTS: Final = 6
 """Points beyond a hand's markers from which on a group may be two hands that touch."""
-_CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
+CUTS: Final = 12
+"""Directions along which a group is cut, even over half a sphere."""
+CUTS_PER_FRAME: Final = 3
+"""Directions tried in a frame of a capture in motion: a hand among others is found within four frames."""
+_STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
 _MOST_FITS: Final = 8  # labeled clouds that are fitted, the most confident first
 _FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
 _OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
@@ -79,6 +83,7 @@ class HandInitializer:
         states: The user's hands.
         labeler: Labels the points of a cloud of one hand; does not know left from right.
         config: Largest RMS distance of a pose, and the density of strays.
+        cuts: Directions along which a group is cut in one call; the next ones follow in the next call.
     """
 
     def __init__(
@@ -86,16 +91,20 @@ class HandInitializer:
         states: Sequence[HandState],
         labeler: Labeler,
         config: TrackerConfig = TrackerConfig(),  # noqa: B008
+        *,
+        cuts: int = CUTS_PER_FRAME,
     ) -> None:
+        self._cuts, self._first_cut = cuts, 0
         self._states = states
         self._labeler = labeler
         self._config = config
-        self._link_distance = max(_LINK_DISTANCE, _link_distance(states[0].hand))  # hands are mirror images
+        links = [_link_distance(one.hand) for one in states[:1]]  # the other hand is its mirror image
+        self._link_distance = max([_LINK_DISTANCE, *links])
         self._prior = resting_prior()
         self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
-        spread = np.arange(_CUTS) + 0.5
-        height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
+        spread = np.arange(CUTS) + 0.5
+        height, azimuth = 1.0 - spread / CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
@@ -107,6 +116,7 @@ class HandInitializer:
             hands: Indices of the hands that are looked for.
         """
         initialized: list[InitializedHand] = []
+        self._first_cut += self._cuts
         for group in self._groups(points, hands):
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
@@ -182,7 +192,8 @@ class HandInitializer:
         clouds = [group]
         if len(group) > markers + SPARE_POINTS:
             half = len(group) // 2
-            for direction in self._directions:
+            for number in range(self._cuts):
+                direction = self._directions[_STRIDE * (self._first_cut + number) % CUTS]
                 order = group[np.argsort(points[group] @ direction)]
                 clouds += [order[:half], order[half:]]
         return clouds

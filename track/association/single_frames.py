@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from track.association.hand_state import HandState
-from track.association.initialization import FEWEST_POINTS, SPARE_POINTS, HandInitializer, InitializedHand
+from track.association.initialization import (
+    CUTS,
+    FEWEST_POINTS,
+    SPARE_POINTS,
+    HandInitializer,
+    InitializedHand,
+)
 from train.labelers.protocol import MAX_POINTS, Labeler
 
 _NEAR: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
@@ -47,7 +53,7 @@ def label_alone(
         labeler: Labeler of their glove.
         told: Called with the number of frames that are done.
     """
-    finder = HandInitializer([HandState(hand) for hand in hands], labeler)
+    finder = HandInitializer([HandState(hand) for hand in hands], labeler, cuts=CUTS)
     found = []
     for points in frames:
         found.append(finder.initialize(points, range(len(hands))))
