@@ -70,11 +70,12 @@ def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]
     return quaternions
 
 
-def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
-    """Rotation Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
+def euler_matrix(angles: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
+    """Rotations Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
+    yaw, pitch, roll = np.moveaxis(np.asarray(angles), -1, 0)
     x, y, z = np.eye(3)
     matrix: NDArray[np.float64] = (
-        axis_angle_matrix(z, angles[0]) @ axis_angle_matrix(y, angles[1]) @ axis_angle_matrix(x, angles[2])
+        axis_angle_matrix(z, yaw) @ axis_angle_matrix(y, pitch) @ axis_angle_matrix(x, roll)
     )
     return matrix
 
