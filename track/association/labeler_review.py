@@ -75,18 +75,22 @@ class LabelerReview:
     def review(
         self, frame: FrameState, tracks: Sequence[HandTrack]
     ) -> tuple[FrameState, tuple[HandTrack, ...]]:
-        """Review the hand whose review is due for the longest time, if one is due; the others wait a frame.
+        """Review the hands that have new points near them; in a frame without, one that waited long enough.
 
-        So a frame has one question to the labeler at most, and takes no longer for two hands.
+        So a usual frame has one question to the labeler at most, and takes no longer for two hands.
         """
         near = [self._near(frame, track, frame.markers(track.hand)) for track in tracks]
-        due = [row for row, track in enumerate(tracks) if self._is_due(track.hand, frame, near[row])]
-        if not due:
-            return frame, tuple(tracks)
-        row = min(due, key=lambda one: self._last[tracks[one].hand])
-        self._plan_next(tracks[row].hand, frame, near[row])
-        frame, track = self._review(frame, tracks[row], near[row])
-        return frame, (*tracks[:row], track, *tracks[row + 1 :])
+        chosen = [
+            row for row, track in enumerate(tracks) if self._has_new_points(track.hand, frame, near[row])
+        ]
+        waited = [row for row, track in enumerate(tracks) if self._has_waited(track.hand, frame.time)]
+        if not chosen and waited:
+            chosen = [min(waited, key=lambda row: self._last[tracks[row].hand])]
+        reviewed = list(tracks)
+        for row in chosen:
+            self._plan_next(tracks[row].hand, frame, near[row])
+            frame, reviewed[row] = self._review(frame, tracks[row], near[row])
+        return frame, tuple(reviewed)
 
     def _review(
         self, frame: FrameState, track: HandTrack, near: NDArray[np.bool_]
@@ -153,10 +157,13 @@ class LabelerReview:
             near[near] = (np.linalg.norm(offsets, axis=-1) < _RADIUS).any(axis=1)
         return near
 
-    def _is_due(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
-        """Whether a review is due: for points that it was not about, or after a while."""
-        new = not self._open[index].issuperset(frame.ids[near].tolist())
-        return new or frame.time >= self._last[index] + self._wait[index]
+    def _has_new_points(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
+        """Whether points are near a hand that its last review was not about."""
+        return not self._open[index].issuperset(frame.ids[near].tolist())
+
+    def _has_waited(self, index: int, time: float) -> bool:
+        """Whether a hand's next review is due at a time [s]."""
+        return bool(time >= self._last[index] + self._wait[index])
 
     def _plan_next(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> None:
         """Plan the review after this one."""
