@@ -7,7 +7,6 @@ likelihood of the points: as markers of the fitted hand, or as strays where they
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -72,31 +71,12 @@ class LabelerReview:
         """Note that a hand was initialized at a time [s]: its labels are reviewed soon."""
         self._wait[index], self._last[index] = _FIRST_WAIT, time
 
-    def review(
-        self, frame: FrameState, tracks: Sequence[HandTrack]
-    ) -> tuple[FrameState, tuple[HandTrack, ...]]:
-        """Review the hands that have new points near them; in a frame without, one that waited long enough.
-
-        So a usual frame has one question to the labeler at most, and takes no longer for two hands.
-        """
-        near = [self._near(frame, track, frame.markers(track.hand)) for track in tracks]
-        chosen = [
-            row for row, track in enumerate(tracks) if self._has_new_points(track.hand, frame, near[row])
-        ]
-        waited = [row for row, track in enumerate(tracks) if self._has_waited(track.hand, frame.time)]
-        if not chosen and waited:
-            chosen = [min(waited, key=lambda row: self._last[tracks[row].hand])]
-        reviewed = list(tracks)
-        for row in chosen:
-            self._plan_next(tracks[row].hand, frame, near[row])
-            frame, reviewed[row] = self._review(frame, tracks[row], near[row])
-        return frame, tuple(reviewed)
-
-    def _review(
-        self, frame: FrameState, track: HandTrack, near: NDArray[np.bool_]
-    ) -> tuple[FrameState, HandTrack]:
-        """Compare a hand's labels with the labeler's, and take over the likelier ones."""
+    def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
+        """Compare a hand's labels with the labeler's if that is due, and take over the likelier ones."""
         markers = frame.markers(track.hand)
+        near = self._near(frame, track, markers)
+        if not self._is_due(track.hand, frame, near):
+            return frame, track
         cloud = np.flatnonzero((markers >= 0) | near)
         if len(cloud) > MOST_POINTS:
             return frame, track
@@ -157,21 +137,16 @@ class LabelerReview:
             near[near] = (np.linalg.norm(offsets, axis=-1) < _RADIUS).any(axis=1)
         return near
 
-    def _has_new_points(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
-        """Whether points are near a hand that its last review was not about."""
-        return not self._open[index].issuperset(frame.ids[near].tolist())
-
-    def _has_waited(self, index: int, time: float) -> bool:
-        """Whether a hand's next review is due at a time [s]."""
-        return bool(time >= self._last[index] + self._wait[index])
-
-    def _plan_next(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> None:
-        """Plan the review after this one."""
+    def _is_due(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
+        """Whether a review is due; the next one is planned then."""
         points = frozenset(frame.ids[near].tolist())
         new = bool(points - self._open[index])
+        if not new and frame.time < self._last[index] + self._wait[index]:
+            return False
         self._open[index], self._last[index] = points, frame.time
         longer = min(_WAIT_FACTOR * self._wait[index], self._config.longest_review_wait)
         self._wait[index] = _FIRST_WAIT if new else longer
+        return True
 
     def _gain(self, frame: FrameState, track: HandTrack, proposal: _Proposal) -> float:
         """Log-odds by which proposed labels are likelier than those of the frame."""
