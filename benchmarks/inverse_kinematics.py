@@ -1,45 +1,37 @@
-"""How quickly a hand's pose is found from labeled markers: ours, MuJoCo's Jacobian, SciPy, mink.
+"""Solvers of a hand's pose from labeled markers, which `benchmarks.speed` times: ours and others'.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.inverse_kinematics [--frames 300 --noise 0.3 --hands 10 --seed 0]
-
-A random 120 Hz motion is followed on one core, every frame from the pose that the same solver found for the
-one before. For the comparison each marker of dense19 is bound to one bone, because a site of MuJoCo is; all
-stop where a step brings the markers less than a micron nearer, and the residual is printed. Then what only
-ours does: markers bound as the skin is, eight starts at once, and cold starts on many hands. mink is left out
-where it is not installed.
+A random 120 Hz motion is followed, every frame from the pose that the same solver found for the one before.
+For the comparison each marker of dense19 is bound to one bone, because a site of MuJoCo is; all stop where a
+step brings the markers less than a micron nearer. mink is left out where it is not installed.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import importlib.util
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 
 import mujoco
 import numpy as np
 from scipy.optimize import least_squares
 
-from benchmarks.record import describe
 from gloves.attachment import Attachment, attach_markers
 from gloves.fit import GloveFit
 from gloves.layout import load_layout
-from handsim.errors import PoseError
 from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.shape import sample_shape
-from handsim.hand.topology import SIDES
 from handsim.kernels.integration import move
 from handsim.space.transforms import random_quaternions
 from poses.motion.motions import sample_motion
-from poses.shapes.validity import resting_angles, sample_valid_angles
+from poses.shapes.validity import sample_valid_angles
 from track.kinematics.pose_solver import PoseSolver
 
 Solver = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, int]]
 SMALL = 1e-12  # [m^2] by which the summed squares may still fall when a solver stops
 MOST = 50
+NOISE = 3e-4  # of markers [m]
 
 
 def ours(model: HandModel, glove: Attachment) -> Solver:
@@ -157,115 +149,88 @@ def mink_tasks(model: HandModel, glove: Attachment) -> Solver:
 
 
 def follow(
-    name: str, solve: Solver, model: HandModel, glove: Attachment, qpos: np.ndarray, targets: np.ndarray
-) -> None:
-    """Print how a solver follows a motion."""
+    solve: Solver, model: HandModel, glove: Attachment, qpos: np.ndarray, targets: np.ndarray
+) -> tuple[list[float], float]:
+    """How a solver follows a motion, each frame from the pose before: times [s], median RMS distance [m]."""
     solve(targets[0], qpos[0])
-    poses, times, counts = [qpos[0]], [], []
+    poses, times = [qpos[0]], []
     for target in targets[1:]:
         begun = time.perf_counter()
-        pose, count = solve(target, poses[-1])
-        times.append(1e3 * (time.perf_counter() - begun))
+        pose, _ = solve(target, poses[-1])
+        times.append(time.perf_counter() - begun)
         poses.append(pose)
-        counts.append(count)
-    found = np.array(poses[1:])
-    bones, true = model.forward_kinematics(found), model.forward_kinematics(qpos[1:])
-    rms = 1e3 * np.sqrt(((glove.centers(model, bones) - targets[1:]) ** 2).sum(axis=-1).mean(axis=1))
-    joints = 1e3 * np.linalg.norm((bones - true)[..., :3, 3], axis=-1).mean()
-    angles = np.rad2deg(np.abs(found - qpos[1:])[:, 7:]).mean()
-    print(
-        f"{name:32} {np.median(times):7.3f} {np.percentile(times, 99):7.3f} ms {np.mean(counts):5.1f} steps, "
-        f"RMS {np.median(rms):.6f} mm, worst {rms.max():.6f}, joints {joints:.5f} mm, angles {angles:.5f} deg"
+    bones = model.forward_kinematics(np.array(poses[1:]))
+    squares = ((glove.centers(model, bones) - targets[1:]) ** 2).sum(axis=-1)
+    return times, float(np.median(np.sqrt(squares.mean(axis=1))))
+
+
+def from_nothing(model: HandModel, glove: Attachment, count: int, rng: np.random.Generator) -> list[float]:
+    """Times to find random valid poses anywhere [s]."""
+    qpos = join_qpos(
+        sample_valid_angles(model, count, rng=rng),
+        position=rng.normal(size=(count, 3)),
+        quaternion=random_quaternions(count, rng=rng),
     )
+    targets = glove.centers(model, model.forward_kinematics(qpos))
+    targets += NOISE * rng.standard_normal(targets.shape)
+    solver = PoseSolver(GloveFit(model, glove))
+    return _times(lambda frame: solver.solve(targets[frame : frame + 1]), count)
 
 
-def somebody(rng: np.random.Generator, number: int) -> HandModel:
-    while True:
-        model = HandModel(sample_shape(side=SIDES[number % 2], rng=rng))
-        try:
-            resting_angles(model)
-        except PoseError:
-            continue
-        return model
-
-
-def tell_cold_starts(layout: str, hands: int, noise: float, rng: np.random.Generator) -> None:
-    """Print how often a random valid pose is found from nowhere, and how long that takes."""
-    excess, times = [], []
-    for number in range(hands):
-        model = somebody(rng, number)
-        glove, count = attach_markers(load_layout(layout), model), 400
-        qpos = join_qpos(
-            sample_valid_angles(model, count, rng=rng),
-            position=rng.normal(size=(count, 3)),
-            quaternion=random_quaternions(count, rng=rng),
-        )
-        targets = glove.centers(model, model.forward_kinematics(qpos))
-        targets += noise * rng.standard_normal(targets.shape)
-        solver = PoseSolver(GloveFit(model, glove))
-        best = solver.solve(targets, qpos).rms
-        for frame in range(count):
-            begun = time.perf_counter()
-            fit = solver.solve(targets[frame : frame + 1])
-            times.append(1e3 * (time.perf_counter() - begun))
-            excess.append(fit.rms[0] - best[frame])
-    found = np.array(excess) <= 1e-4
-    within = (np.array(excess) <= 1e-3).mean()
-    print(
-        f"cold, {layout}, noise {1e3 * noise:g} mm: "
-        f"{np.median(times):.3f} ms, p99 {np.percentile(times, 99):.3f}; of {len(found)} poses "
-        f"{found.mean():.2%} within 0.1 mm RMS of the fit from the truth, "
-        f"{within:.2%} within 1 mm"
-    )
-
-
-def tell_starts(model: HandModel, glove: Attachment, qpos: np.ndarray, rng: np.random.Generator) -> None:
-    """Print how long eight starts of one frame take together."""
+def from_eight_starts(
+    model: HandModel, glove: Attachment, qpos: np.ndarray, rng: np.random.Generator
+) -> list[float]:
+    """Times of eight starts of one frame together, 2 degrees and 3 cm off [s]."""
     targets = np.repeat(glove.centers(model, model.forward_kinematics(qpos)), 8, axis=0)
-    solver, times = PoseSolver(GloveFit(model, glove)), []
     starts = move(np.repeat(qpos, 8, axis=0), 0.03 * rng.standard_normal((len(targets), 26)))
-    for frame in range(0, len(targets), 8):
+    solver = PoseSolver(GloveFit(model, glove))
+    eight = [slice(8 * frame, 8 * frame + 8) for frame in range(len(qpos))]
+    return _times(lambda frame: solver.solve(targets[eight[frame]], starts[eight[frame]]), len(qpos))
+
+
+def _times(job: Callable[[int], object], count: int) -> list[float]:
+    """Times of a job for each number below a count [s], the first left out."""
+    times = []
+    for number in range(count):
         begun = time.perf_counter()
-        solver.solve(targets[frame : frame + 8], starts[frame : frame + 8])
-        times.append(1e3 * (time.perf_counter() - begun))
-    print(f"eight starts 2 degrees and 3 cm off at once: {np.median(times):.3f} ms, "
-          f"p99 {np.percentile(times, 99):.3f} ms")  # fmt: skip
+        job(number)
+        times.append(time.perf_counter() - begun)
+    return times[1:]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=300)
-    parser.add_argument("--noise", type=float, default=0.3, help="standard deviation [mm]")
-    parser.add_argument("--hands", type=int, default=10)
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    contestants = {"ours": ours, "LM, MuJoCo's Jacobian, numpy": mujoco_marquardt}
-    contestants["scipy least_squares, lm"] = scipy_marquardt
+def times(seeds: Sequence[int], frames: int) -> Iterator[tuple[str, str, list[float]]]:
+    """A key, what it is, and times [s]: motions that each solver follows, one a seed, and ours alone."""
+    contestants: dict[str, tuple[str, Callable[[HandModel, Attachment], Solver]]] = {
+        "ours": ("our solver", ours),
+        "numpy": ("the same steps, MuJoCo's Jacobian, numpy", mujoco_marquardt),
+        "scipy": ("scipy least_squares, lm", scipy_marquardt),
+    }
     if importlib.util.find_spec("mink"):
-        contestants["mink, daqp"] = mink_tasks
-        print(describe("mujoco", "numba", "scipy", "mink", "daqp"))
+        contestants["mink"] = ("mink, daqp", mink_tasks)
     else:
-        print(describe("mujoco", "numba", "scipy"), "\nmink is not installed and left out", sep="")
-    rng = np.random.default_rng(arguments.seed)
+        print("  mink is not installed and left out")
     model = HandModel.named("M")
-    qpos = sample_motion(model, arguments.frames / 120.0, rng=rng).qpos
     skin = attach_markers(load_layout("dense19"), model)
-    bones, weights = skin.bone_indices.copy(), np.zeros_like(skin.bone_weights)
+    weights = np.zeros_like(skin.bone_weights)
     weights[np.arange(len(weights)), skin.bone_weights.argmax(axis=1)] = 1.0
-    bound = dataclasses.replace(skin, bone_indices=bones, bone_weights=weights)
-    for noise in (0.0, 1e-3 * arguments.noise):
-        shaken = noise * rng.standard_normal((len(qpos), *skin.points.shape))
-        print(f"a motion of {len(qpos)} frames, noise {1e3 * noise:g} mm; p50, p99")
-        for name, contestant in contestants.items():
-            targets = bound.centers(model, model.forward_kinematics(qpos)) + shaken
-            follow(name, contestant(model, bound), model, bound, qpos, targets)
-        targets = skin.centers(model, model.forward_kinematics(qpos)) + shaken
-        follow("ours, markers bound as skin is", ours(model, skin), model, skin, qpos, targets)
-    tell_starts(model, skin, qpos, rng)
-    for layout in ("dense19", "sparse13"):
-        for noise in (0.0, 1e-3 * arguments.noise):
-            tell_cold_starts(layout, arguments.hands, noise, rng)
-
-
-if __name__ == "__main__":
-    main()
+    bound = dataclasses.replace(skin, bone_weights=weights)
+    found: dict[str, tuple[str, list[float]]] = {}
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        qpos = sample_motion(model, frames / 120.0, rng=rng).qpos
+        noise = NOISE * rng.standard_normal((len(qpos), *skin.points.shape))
+        jobs = [(key, what, solver, bound) for key, (what, solver) in contestants.items()]
+        for key, what, solver, glove in [
+            *jobs,
+            ("ours_skin", "our solver, markers bound as skin is", ours, skin),
+        ]:
+            targets = glove.centers(model, model.forward_kinematics(qpos)) + noise
+            took, rms = follow(solver(model, glove), model, glove, qpos, targets)
+            told = f"a pose from the frame before, {what}, {1e3 * rms:.4f} mm RMS"
+            found.setdefault(f"solver_{key}", (told, []))[1].extend(took)
+        eight = from_eight_starts(model, skin, qpos, rng)
+        found.setdefault("solver_eight", ("a pose, our solver, eight starts", []))[1].extend(eight)
+        cold = from_nothing(model, skin, frames, rng)
+        found.setdefault("solver_cold", ("a pose from nothing, our solver", []))[1].extend(cold)
+    for key, (what, seconds) in found.items():
+        yield key, what, seconds

@@ -1,18 +1,15 @@
-"""Speed of rendering, accuracy of depth, and memory.
+"""Accuracy of drawn depth, and memory; and the pictures that `benchmarks.speed` times.
 
-    MUJOCO_GL=egl python -m benchmarks.rendering [speed stream accuracy memory] [--frames 200 --images 20000]
+    python -m benchmarks.rendering [accuracy memory stream] [--frames 200 --images 20000]
 
-speed: 640 x 480 pictures of two hands from a simulated take, in one process and in one per core: depth alone;
-    colors, depth, ids and keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the
-    loop that a user would write with pyrender (the same meshes, plain material, one light) and MuJoCo's own
-    renderer (the hand's capsules, no skin), each for depth and for colors.
-stream: 256 x 256 pictures of one hand from `PictureStream` (colors, depth, ids, keypoints, sensors) through a
-    DataLoader with a worker per core, their memory, and what a picture takes of a core; beside it the floor:
-    what plain pyrender takes of a core for the same size, colors alone.
 accuracy: depth and ids against embree through trimesh on the same triangles.
 memory: resident memory over many pictures.
+stream: resident memory of a `DataLoader` of the stream, with a worker a core, over as many as --frames.
 
-Speeds are medians over rounds of the machine's clock: run it where nothing else runs.
+What is timed are 640 x 480 pictures of two hands from a simulated take: depth alone; colors, depth, ids and
+keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the loop that a user would write
+with pyrender (the same meshes, plain material, one light) and MuJoCo's own renderer (the hand's capsules, no
+skin), each for depth and for colors.
 """
 
 from __future__ import annotations
@@ -21,7 +18,6 @@ import argparse
 import dataclasses
 import functools
 import os
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,6 +26,7 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
+from torch.utils.data import DataLoader
 
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.takes.take import Take
@@ -44,20 +41,21 @@ from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
 from render.skin.look import ALL_TONES
+from render.stream import PictureStream
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from train.simulation.takes import simulate_take
 
-SECTIONS: Final = ("speed", "stream", "accuracy", "memory")
+SECTIONS: Final = ("accuracy", "memory", "stream")
 CROP, BATCH = 256, 16  # of the stream's pictures [px], and in a batch
 ROUNDS: Final = 3
 PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None, painter="compiled")
 DEPTH: Final = dataclasses.replace(PLAIN, passes=("depth",))
 COLORS: Final = dataclasses.replace(PLAIN, passes=("rgb", "depth", "ids"))
 KINDS: Final = {
-    "depth": DEPTH,
-    "colors, depth, ids, keypoints": COLORS,
-    "- painted by OpenGL": dataclasses.replace(COLORS, painter="opengl"),
+    "depth": ("depth", DEPTH),
+    "colors": ("colors, depth, ids, keypoints", COLORS),
+    "opengl": ("the same painted by OpenGL", dataclasses.replace(COLORS, painter="opengl")),
 }
 
 
@@ -139,72 +137,39 @@ def mujoco_loop(take: Take, color: bool) -> None:
             renderer.render()
 
 
-def speed(frames: int) -> Figures:
-    take, cores = a_take(frames), os.cpu_count() or 1
-    print(f"\nimages per second, 640 x 480, two hands, {frames} frames; one process / {cores} processes")
-    figures: Figures = {}
-    with tempfile.TemporaryDirectory() as folder:
-        jobs = {name: functools.partial(draw, config, frames) for name, config in KINDS.items()}
-        jobs["- written as WebDataset"] = functools.partial(draw_and_write, COLORS, Path(folder), frames)
-        for name, job in jobs.items():
-            rates = rate(lambda job=job: job(0), frames), rate_in_processes(job, cores, frames)
-            print(f"  {name:32s} {rates[0]:8.1f} {rates[1]:8.1f}")
-            key = name.strip("- ").split()[-1 if name.startswith("- painted") else 0].strip(",").lower()
-            figures[key] = (f"pictures per second, one process | {cores}: {name}", rates)
-    loops: dict[str, list[float]] = {"pyrender": [], "mujoco": []}
-    for color, name in ((False, "depth"), (True, "colors")):
-        loops["pyrender"].append(rate(lambda c=color: plain_pyrender(take, c), frames))
-        print(f"  plain pyrender loop, {name:11s} {loops['pyrender'][-1]:8.1f}")
-        loops["mujoco"].append(rate(lambda c=color: mujoco_loop(take, c), frames))
-        print(f"  MuJoCo's renderer, {name:13s} {loops['mujoco'][-1]:8.1f}")
-    what = {"pyrender": "a plain pyrender loop", "mujoco": "MuJoCo's renderer, capsules without skin"}
-    for key, rates_of in loops.items():
-        figures[key] = (f"pictures per second, one process, {what[key]}: depth | colors", rates_of)
-    return figures
+def jobs(frames: int, folder: Path) -> dict[str, tuple[str, Callable[[int], int]]]:
+    """What is drawn, with its name in words; a job draws one shard, in `folder` if it writes it."""
+    drawn: dict[str, tuple[str, Callable[[int], int]]] = {
+        key: (name, functools.partial(draw, config, frames)) for key, (name, config) in KINDS.items()
+    }
+    writing = functools.partial(draw_and_write, COLORS, folder, frames)
+    return drawn | {"written": ("the same written as WebDataset", writing)}
 
 
-def stream(frames: int) -> Figures:
-    """Pictures for training loops, and the floor."""
-    from torch.utils.data import DataLoader
-
-    from render import PictureStream
-
-    cores = os.cpu_count() or 1
+def a_stream() -> PictureStream:
+    """Pictures of one hand for training loops: colors, depth, ids, keypoints, sensors."""
     config = RenderConfig(passes=("rgb", "depth", "ids"))
-    source = PictureStream(config=config, crop=CROP, batch=BATCH, seed=0)
-    alone = iter(source)
-    for _ in range(4 * BATCH):  # kernels are loaded, and the first people drawn
-        next(alone)
-    start = time.process_time()
-    for _ in range(frames):
-        next(alone)
-    each = 1e3 * (time.process_time() - start) / frames
-    batches = iter(DataLoader(source, batch_size=BATCH, num_workers=cores))
+    return PictureStream(config=config, crop=CROP, batch=BATCH, seed=0)
+
+
+def stream_batches() -> Iterator[object]:
+    """Batches of the stream from a worker a core, once all have drawn some."""
+    cores = os.cpu_count() or 1
+    batches = iter(DataLoader(a_stream(), batch_size=BATCH, num_workers=cores))
     for _ in range(4 * cores):
         next(batches)
-    megabytes, start = [], time.perf_counter()
-    for number in range(-(-4 * frames // BATCH)):
+    return batches
+
+
+def stream_memory(images: int) -> Figures:
+    batches, megabytes = stream_batches(), list[float]()
+    for number in range(-(-images // BATCH)):
         next(batches)
-        if number % max(1, frames // BATCH) == 0:
+        if number % max(1, images // BATCH // 4) == 0:
             megabytes.append(sum(_megabytes(process) for process in ("self", *_children())))
-    rate_of = (number + 1) * BATCH / (time.perf_counter() - start)
-    one = simulate_take(kind="single-hand", num_frames=frames, hands=("right",))
-    plain_pyrender(one, True, (CROP, CROP))
-    start = time.process_time()
-    plain_pyrender(one, True, (CROP, CROP))
-    floor = 1e3 * (time.process_time() - start) / frames
-    print(
-        f"\n{CROP} x {CROP} of one hand: {rate_of:.1f} a second by {cores} workers, {each:.1f} ms of a core"
-    )
-    print(f"  plain pyrender's colors: {floor:.1f} ms of a core; ratio {each / floor:.2f}")
-    print(f"  resident memory: {megabytes[0]:.0f} MB at first, {megabytes[-1]:.0f} MB at last")
-    return {
-        "stream": (f"pictures of a stream a second, {cores} workers", rate_of),
-        "each": ("a picture of a stream [ms of a core]", each),
-        "floor": ("the same size by plain pyrender, colors alone [ms of a core]", floor),
-        "ratio": ("their ratio", each / floor),
-        "memory": ("resident memory of all processes, first | last [MB]", (megabytes[0], megabytes[-1])),
-    }
+    print(f"\nresident memory of a stream: {megabytes[0]:.0f} MB at first, {megabytes[-1]:.0f} MB at last")
+    what = "resident memory of all processes of a stream, first | last [MB]"
+    return {"memory": (what, (megabytes[0], megabytes[-1]))}
 
 
 def _children() -> list[str]:
@@ -283,7 +248,7 @@ def main() -> None:
         parser.error("--save keeps the figures of one section")
     print(describe())
     for name in options.section or SECTIONS:
-        section = {"speed": speed, "stream": stream, "accuracy": accuracy}.get(name, memory)
+        section = {"accuracy": accuracy, "stream": stream_memory}.get(name, memory)
         figures = section(options.images if name == "memory" else options.frames)
         save_figures(options.save, figures)
 

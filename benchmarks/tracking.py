@@ -1,6 +1,6 @@
 """The tracker on the twins: calibrated as users are, among ghosts, from nothing, for an hour.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.tracking [calibrated drums starts speed memory]
+    OMP_NUM_THREADS=1 python -m benchmarks.tracking [calibrated drums starts memory]
         [--kinds hand-hand ... --seeds 0 1 --frames N --starts 200 --recoveries 100 --hour 432000]
 
 calibrated: the people of a twin make a calibration capture in their gloves, simulated like the twin; `handsim
@@ -10,8 +10,6 @@ drums: the twins with twenty ghosts a frame near the hands (`drum_takes`), from 
     one, and without.
 starts: a tracker begins at a random frame, or has a second of darkness behind it; how many frames pass until
     every point and pose of a frame is right. "Within 3" is the third frame at the latest.
-speed: time of a frame with two calibrated hands, once kernels are loaded, and of frames in which both hands
-    are looked for.
 memory: a take forwards and backwards, again and again with new IDs, 432000 frames being an hour of motion.
 
 All sections when none is named. Twins have the paper's number of frames unless told otherwise; the points of
@@ -55,8 +53,6 @@ from train.simulation.takes import simulate_take
 
 TRIALS = {"start": (initialization_times, 3), "recovery": (recovery_times, 5)}
 """What is tried, and the frames within which all should be right."""
-WARM_UP = 30  # frames
-FINDINGS = 25  # frames in which hands are looked for
 EVERY = 36000  # frames between two looks at the memory: five minutes
 HANDS = {
     "true": true_users,
@@ -201,33 +197,6 @@ def tell_waits(name: str, waits: np.ndarray, within: int) -> None:
     )
 
 
-def speed(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
-    rows = []
-    print(
-        "\ntime of a frame [ms]: p50, p90, p99; and of one in which both hands are looked for: median, worst"
-    )
-    for name, take in takes.items():
-        users = true_users(take)
-        times = 1e3 * follow(take, users).seconds[WARM_UP:]
-        finding = []
-        for frame in np.linspace(0, take.num_frames - 1, FINDINGS).astype(int):
-            tracker, seen = Tracker(users, labeler()), seen_frame(take, frame)
-            began = time.perf_counter()
-            tracker.step(seen.points, seen.ids, 0.0)
-            finding.append(1e3 * (time.perf_counter() - began))
-        shown = " ".join(f"{np.quantile(times, share):6.2f}" for share in (0.5, 0.9, 0.99))
-        print(f"  {name:20s} {shown}   {np.median(finding):6.1f} {max(finding):6.1f}", flush=True)
-        rows.append([*np.quantile(times, [0.5, 0.99]), np.median(finding), max(finding)])
-    least, most = np.min(rows, axis=0), np.max(rows, axis=0)
-    took, of = "time of a frame with two true hands [ms]", f"least and most of {len(takes)} captures"
-    return {
-        "median": (f"median {took}, {of}", [least[0], most[0]]),
-        "p99": (f"99th percentile of the {took}, {of}", [least[1], most[1]]),
-        "initialization": (f"median {took} in which both are initialized, {of}", [least[2], most[2]]),
-        "worst": (f"longest {took} in which both are initialized", most[3]),
-    }
-
-
 def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
     sizes = []
     name, take = next(iter(takes.items()))
@@ -257,7 +226,7 @@ def memory(takes: dict[str, Take], arguments: argparse.Namespace) -> Figures:
     }
 
 
-SECTIONS = {"calibrated": calibrated, "drums": drums, "starts": starts, "speed": speed, "memory": memory}
+SECTIONS = {"calibrated": calibrated, "drums": drums, "starts": starts, "memory": memory}
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -140,13 +141,13 @@ def vary_layout(
     """
 
     def moved(marker: MarkerPlace) -> MarkerPlace:
-        slip, roll, side = np.clip(rng.standard_normal(3), -2.0, 2.0)
+        slip, roll, side = np.clip(rng.standard_normal(3), -2.0, 2.0).tolist()
         palm = marker.bone == BONE_NAMES[PALM]
         return dataclasses.replace(
             marker,
-            along=float(np.clip(marker.along + (0.5 if palm else 1.0) * along * slip, -0.3, 1.3)),
-            around=float(np.clip(marker.around + (0.0 if palm else around) * roll, -np.pi, np.pi)),
-            across=float(marker.across + 0.5 * along * side) if palm else 0.0,
+            along=min(max(marker.along + (0.5 if palm else 1.0) * along * slip, -0.3), 1.3),
+            around=min(max(marker.around + (0.0 if palm else around) * roll, -math.pi), math.pi),
+            across=marker.across + 0.5 * along * side if palm else 0.0,
         )
 
     return dataclasses.replace(layout, markers=tuple(moved(marker) for marker in layout.markers))

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-import mujoco
 import numpy as np
-import trimesh
 
 from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout
@@ -62,6 +60,8 @@ def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = Fals
             temporary.write_text(hand_osim(model, sites), "utf-8")
             return
         spec = build_spec(model.skeleton, model.capsules, sites=sites, actuators=actuators)
+        import mujoco
+
         spec.compile()  # fills in what the XML writer asks for
         temporary.write_text(spec.to_xml(), "utf-8")
         mujoco.MjModel.from_xml_path(str(temporary))  # before it takes its name
@@ -77,6 +77,8 @@ def write_skin(path: Path, model: HandModel) -> None:
     Raises:
         OSError: The file cannot be written.
     """
+    import trimesh
+
     surface = model.surface
     skin = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     with atomic_write(path) as temporary:

@@ -11,7 +11,6 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.distance import cdist
 
 from gloves.fit import GloveFit, attach
 from gloves.takes.take import INITIALIZED, TRACKED, Take
@@ -27,10 +26,10 @@ from track.calibration.user_calibration import (
     calibrate_hands,
 )
 from track.capture_tracking import track_capture
-from track.config import TrackerConfig
+from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.kinematics.pose_solver import PoseSolver
-from track.setup import BOTH, AnyHands, Size, TrackerSetup, found_user
+from track.setup import AnyHands, TrackerSetup, found_user
 from track.streams.frame_source import checked_frames
 from track.user import User
 from train.labelers.protocol import Labeler
@@ -187,6 +186,8 @@ def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
 
 def _leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
     """Whether too many missing markers had an unlabeled point nearby."""
+    from scipy.spatial.distance import cdist
+
     left, total = 0, 0
     for one in done:
         side = one.hand.side

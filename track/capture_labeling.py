@@ -24,8 +24,9 @@ from track.association.point_linking import change_of_distances
 from track.association.single_frames import label_alone
 from track.both_directions import label_both_ways
 from track.calibration.hand_size import sample_frames
+from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
-from track.setup import BOTH, USUAL_SIZE, found_user
+from track.setup import USUAL_SIZE, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.user import nominal_user
 from train.glove_labeler import load_labeler

@@ -17,11 +17,11 @@ from gloves.takes.take import Take, label_names
 from handsim.errors import CaptureError, HandSimWarning
 from track.bodies.body_file import AnyBody
 from track.calibration.hand_size import sample_frames
-from track.config import TrackerConfig
+from track.config import BOTH, Size, TrackerConfig
 from track.corrected_take import correct_take
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.recorder import TakeRecorder
-from track.setup import BOTH, AnyHands, Size, TrackerSetup
+from track.setup import AnyHands, TrackerSetup
 from track.sinks.addresses import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracked_frame import TrackedFrame

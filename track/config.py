@@ -8,9 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Final, Literal
 
 from handsim._checks import check_number
 from handsim.errors import ArgumentError
+from handsim.hand.topology import Side
+
+Size = Literal["auto", "XS", "S", "M", "L", "XL"]
+"""Size of hands; auto is measured."""
+BOTH: Final[tuple[Side, ...]] = ("right", "left")
 
 
 @dataclass(frozen=True)

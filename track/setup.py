@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Self, get_args
+from typing import Any, Final, Self, get_args
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from handsim.hand.topology import NUM_QPOS, SIDES, Side
 from track.bodies.body_file import AnyBody, load_bodies
 from track.bodies.rigid_body import RigidTemplate
 from track.calibration.hand_size import fit_size, sample_frames
-from track.config import TrackerConfig
+from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
@@ -27,10 +27,8 @@ from track.user import User, checked_sides, load_user, nominal_user
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
-Size = Literal["auto", "XS", "S", "M", "L", "XL"]
 AnyHands = User | Sequence[GloveFit] | Sequence[Side] | str | Path
 """A user, hands in their gloves, or the path of a user's file; or sides, whose hands are to be measured."""
-BOTH: Final[tuple[Side, ...]] = ("right", "left")
 USUAL_GLOVE: Final = "dense19"
 USUAL_SIZE: Final = "M"
 """The size of hands that could not be measured."""

@@ -5,6 +5,7 @@ shipped or trained one, `evaluate_labeler` counts its errors. `simulate_take` si
 truth.
 """
 
+import os
 from typing import TYPE_CHECKING
 
 from handsim import __version__  # the first import: it warns about a package of the same name
@@ -63,3 +64,7 @@ __all__ = [
     "simulate_take",
     "train_labeler",
 ]
+
+# Threads of torch that wait for one another sleep instead of spinning, which makes training many times slower
+# beside another busy process. It holds for a torch that is loaded from here on.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

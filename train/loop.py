@@ -154,8 +154,8 @@ def _do_steps(
     state, config = run.state, run.state.config
     saved = time.monotonic()
     while run.is_unfinished(tell):
-        chosen.renew()
-        loss = run.step()
+        with chosen.timed_step():
+            loss = run.step()
         if progress is not None and state.fabric.is_global_zero:
             progress(min(state.done, config.samples), config.samples, loss)
         if time.monotonic() - saved > save_every:

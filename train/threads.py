@@ -15,7 +15,8 @@ from typing import Final
 from handsim.errors import ArgumentError
 
 _MOST: Final = 1024
-_STEPS: Final = 2  # of each number of threads that are measured, after one to warm up
+_STEPS: Final = 2  # of each number of threads, the faster of which counts, after one to warm up
+_SLOWER: Final = 1.5  # times of steps, over the usual one, from which on the other number is tried
 _GAIN: Final = 1.15  # by which more threads must be faster to be worth the cores of others
 _labeling: ContextVar[int] = ContextVar("labeling", default=1)
 
@@ -63,14 +64,20 @@ def torch_threads(count: int) -> Iterator[None]:
 class TrainingThreads:
     """The number of threads that training uses: a given one, or the faster of one and all.
 
+    The steps of the training tell how long they take with the chosen number. Now and then, and as soon as
+    they take longer than they did, the other number is tried.
+
     Args:
         given: A number, which then holds.
         step: Does what a training step does and changes nothing.
         now: Returns the time [s].
     """
 
-    AGAIN: Final = 300.0
-    """Time between two measurements [s]: others may begin or end their work."""
+    AGAIN: Final = 60.0
+    """Least time between two trials [s]: others may begin or end their work."""
+    SHARE: Final = 20.0
+    """Least time between two trials, in times of the trial before; a quarter of it where steps have become
+    slower."""
 
     def __init__(
         self, given: int | None, step: Callable[[], None], *, now: Callable[[], float] = time.perf_counter
@@ -81,12 +88,16 @@ class TrainingThreads:
         self.count = given or 1
         self._step, self._now = step, now
         self._most = torch.get_num_threads()  # what the cores and OMP_NUM_THREADS allow
-        self._measured = -float("inf")
         self._fixed = given is not None or self._most == 1
+        self._steps: list[
+            float
+        ] = []  # times of the steps since the number changed; the first may start threads
+        self._usual = 0.0  # time of a step with this number when it was chosen; none is known yet
+        self._due = self._soonest = -float("inf")
 
     @contextmanager
     def in_use(self) -> Iterator[None]:
-        """Within the block torch and labelers use the chosen number, which `renew` may change."""
+        """Within the block torch and labelers use the chosen number, which steps may change."""
         before = _labeling.get()
         with torch_threads(self.count):
             try:
@@ -94,27 +105,38 @@ class TrainingThreads:
             finally:
                 _labeling.set(before)
 
-    def renew(self) -> None:
-        """Choose anew, within `in_use`, if the last choice was long ago."""
+    @contextmanager
+    def timed_step(self) -> Iterator[None]:
+        """Around each step, within `in_use`: use the chosen number, and learn from how long it takes."""
         import torch
 
-        if not self._fixed and self._now() - self._measured > self.AGAIN:
-            self.count = self._choose()
-            self._measured = self._now()
         torch.set_num_threads(self.count)
         _labeling.set(self.count)
+        start = self._now()
+        yield
+        self._steps = [*self._steps[-_STEPS:], self._now() - start]
+        if not self._fixed and len(self._steps) > _STEPS:
+            step = min(self._steps[1:])
+            if self._now() >= (self._soonest if step > _SLOWER * self._usual else self._due):
+                self._try_other(step)
 
-    def _choose(self) -> int:
-        """One thread, unless all of them are clearly faster."""
-        self._time(1)
-        alone = min(self._time(1) for _ in range(_STEPS))
-        for _ in range(1 + _STEPS):  # the first may start threads
-            together = self._time(self._most)
-            if together * _GAIN < alone:
-                return self._most
-            if together > 2.0 * alone:  # a busy machine: no more of these slow steps
-                return 1
-        return 1
+    def _try_other(self, step: float) -> None:
+        """Choose the other number if it is clearly faster than the chosen one, whose steps take `step`."""
+        start = self._now()
+        other = 1 if self.count > 1 else self._most
+        self._time(other)  # the first may start threads
+        tried = self._time(other)
+        for _ in range(_STEPS - 1):
+            if tried < 2.0 * step:  # else a busy machine: no more of these slow steps
+                tried = min(tried, self._time(other))
+        alone, together = (step, tried) if self.count == 1 else (tried, step)
+        best = self._most if together * _GAIN < alone else 1
+        self._usual = together if best > 1 else alone
+        if best != self.count:
+            self.count, self._steps = best, []
+        spent = self._now() - start
+        self._due = self._now() + max(self.AGAIN, self.SHARE * spent)
+        self._soonest = self._now() + 0.25 * self.SHARE * spent
 
     def _time(self, threads: int) -> float:
         import torch

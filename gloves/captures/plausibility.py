@@ -9,10 +9,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
+from handsim.kernels.kernel import kernel
 
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
@@ -72,7 +73,21 @@ def unit_fault(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
 
 def _spacing(cloud: Float[np.ndarray, "N 3"]) -> float:
     """Median distance of a point from its nearest neighbor [m]."""
-    return float(np.median(cKDTree(cloud).query(cloud, k=2)[0][:, 1]))
+    return float(np.median(np.sqrt(_nearest_squared(np.ascontiguousarray(cloud, dtype=np.float64)))))
+
+
+@kernel
+def _nearest_squared(cloud: Float[np.ndarray, "N 3"]) -> NDArray[np.float64]:
+    """Squared distance (N,) of each point from the nearest other one [m^2]."""
+    nearest = np.full(len(cloud), np.inf)
+    for i in range(len(cloud)):
+        for j in range(i):
+            squared = 0.0
+            for axis in range(3):
+                squared += (cloud[i, axis] - cloud[j, axis]) ** 2
+            nearest[i] = min(nearest[i], squared)
+            nearest[j] = min(nearest[j], squared)
+    return nearest
 
 
 def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:

@@ -39,8 +39,8 @@ from handsim.hand.model import HandModel
 from handsim.hand.motion import HandMotion, between_poses, bridge_gaps, is_steady, times_at
 from handsim.hand.records import HAND_DTYPE, pack_hand, unpack_hand
 from handsim.hand.topology import Side
-from handsim.motion_files.motion import UpAxis
 from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.transforms import UpAxis
 
 SUFFIX: Final = ".truth.npz"
 """How the names of simulated takes end that lie beside their captures."""

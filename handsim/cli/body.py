@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
-from gloves.captures.formats import read_capture
-from gloves.takes.take import SUFFIX, load_take
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.space.objects import named_object
-from track.bodies.body_file import SUFFIX as TOML
-from track.bodies.body_file import save_body
-from track.bodies.rigid_body import RigidTemplate
-from track.calibration.body_learning import learn_body
+
+if TYPE_CHECKING:
+    from track.bodies.rigid_body import RigidTemplate
 
 
 def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
@@ -30,6 +27,12 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
             .truth.npz of a simulated capture, for its object.
         out: The body's file, .toml.
     """
+    from gloves.captures.formats import read_capture
+    from gloves.takes.take import SUFFIX
+    from track.bodies.body_file import SUFFIX as TOML
+    from track.bodies.body_file import save_body
+    from track.calibration.body_learning import learn_body
+
     if out.suffix.lower() != TOML:
         raise ArgumentError(f"--out is {out}, expected a file name that ends in {TOML}")
     check_outputs([source], [out])
@@ -41,6 +44,9 @@ def body(source: Annotated[Path, tyro.conf.Positional], *, out: Path) -> None:
 
 def _take_body(truth: Path) -> RigidTemplate:
     """The object of a simulated take."""
+    from gloves.takes.take import load_take
+    from track.bodies.rigid_body import RigidTemplate
+
     bodies = load_take(truth).bodies
     if not bodies:
         raise ArgumentError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -13,9 +13,10 @@ from handsim.app.progress import progress_bar
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from track import capture_calibration
-from track.calibration.user_calibration import Calibration
-from track.setup import BOTH, Size
+from track.config import BOTH, Size
+
+if TYPE_CHECKING:
+    from track.calibration.user_calibration import Calibration
 
 
 def calibrate(
@@ -42,6 +43,8 @@ def calibrate(
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
     """
+    from track import capture_calibration
+
     if out.suffix.lower() != ".json":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .json")
     check_outputs((capture, glove, labeler), [out])

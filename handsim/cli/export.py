@@ -8,14 +8,10 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from gloves.takes.formats import MOTION_FORMATS, motion_format
-from gloves.takes.growing import SUFFIX as GROWING
-from gloves.takes.take import load_take
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError, CaptureError
 from handsim.files.outputs import check_outputs
-from handsim.motion_files.motion import UpAxis
-from track.user import load_user
+from handsim.space.transforms import UpAxis
 
 
 def export(
@@ -33,6 +29,9 @@ def export(
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default.
     """
+    from gloves.takes.growing import SUFFIX as GROWING
+    from track.user import load_user
+
     if source.lower().endswith((".npz", f".npz{GROWING}")):
         _export_take(Path(source), out, fps, up)
     elif source.lower().endswith(".json"):
@@ -45,6 +44,9 @@ def export(
 
 
 def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None:
+    from gloves.takes.formats import motion_format
+    from gloves.takes.take import load_take
+
     form = motion_format(out)
     check_outputs([source], [out])
     take = load_take(source)
@@ -64,6 +66,7 @@ def _export_take(source: Path, out: Path, fps: float | None, up: UpAxis) -> None
 
 
 def _export_labeler(source: str, out: Path) -> None:
+    from gloves.takes.formats import MOTION_FORMATS
     from train.labelers.onnx_labeler import export_onnx
     from train.labelers.storage import load_network
 

@@ -29,10 +29,10 @@ from handsim.errors import ArgumentError, LayoutError
 from handsim.files.atomic import atomic_write
 from handsim.files.outputs import check_outputs
 from handsim.hand.shape import SIZES
-from handsim.space.cameras import CameraRig, load_rig
 
 if TYPE_CHECKING:
     from gloves.fit import GloveFit
+    from handsim.space.cameras import CameraRig
     from track.glove_advice.layout_score import LayoutScore
     from track.glove_advice.layout_worth import Worth
     from track.glove_advice.observed_hands import ObservedHand
@@ -190,6 +190,8 @@ def score_glove(
             layout when not given.
         seed: Seed of people, poses and cameras' losses.
     """
+    from handsim.space.cameras import load_rig
+
     layout, cameras = load_layout(glove), load_rig(rig)
     page = Path(glove).with_suffix(".html") if out is None else out
     if page.suffix.lower() != ".html":
@@ -279,6 +281,8 @@ def improve_glove(
         minutes: How long to move markers.
         seed: Seed of people, poses and tries.
     """
+    from handsim.space.cameras import load_rig
+
     layout, cameras = load_layout(glove), load_rig(rig)
     count = layout.num_markers if markers is None else markers
     if not FEWEST_MARKERS <= count <= MOST_MARKERS:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-from gloves.fit import GloveFit, nominal_fit
-from gloves.hand_files import ENDINGS, MESH_ENDINGS, WITH_MARKERS, write_hand, write_skin
 from gloves.layout import load_layout
-from gloves.takes.take import load_take
 from handsim.app.messages import print_line
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
-from handsim.hand.model import HandModel
 from handsim.hand.topology import NUM_JOINTS, Side
-from track.user import User, load_user
+
+if TYPE_CHECKING:
+    from gloves.fit import GloveFit
+    from handsim.hand.model import HandModel
 
 Size = Literal["XS", "S", "M", "L", "XL"]
 _USUAL_SIZE: Final = "M"
@@ -45,6 +44,9 @@ def hand(
             or a .toml file. Hands of a file have their own markers.
         actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
     """
+    from gloves.fit import GloveFit
+    from gloves.hand_files import ENDINGS, MESH_ENDINGS, WITH_MARKERS, write_hand, write_skin
+
     suffix = out.suffix.lower()
     if suffix not in ENDINGS:
         raise ArgumentError(f"--out is {out}, expected a file name that ends in {', '.join(ENDINGS)}")
@@ -85,6 +87,11 @@ def _chosen_hand(
     size: Size | None, side: Side | None, shape: Path | None, take: Path | None, glove: str | None
 ) -> tuple[HandModel | GloveFit, str]:
     """The hand that the options name, in its glove if it has one, and where it is from in words."""
+    from gloves.fit import nominal_fit
+    from gloves.takes.take import load_take
+    from handsim.hand.model import HandModel
+    from track.user import User, load_user
+
     given = {"--size": size, "--shape": shape, "--take": take}
     named = [f"{option} {value}" for option, value in given.items() if value is not None]
     if len(named) > 1:

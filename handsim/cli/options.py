@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from gloves.takes.corrections import corrections_path
-from gloves.takes.take import SUFFIX
 from handsim.errors import ArgumentError
 from handsim.hand.topology import Side
-from track.setup import BOTH, AnyHands, Size
-from track.user import load_user
+from track.config import BOTH, Size
+
+if TYPE_CHECKING:
+    from track.setup import AnyHands
 
 
 def check_take_file(out: Path, *, live: bool) -> None:
@@ -23,6 +24,9 @@ def check_take_file(out: Path, *, live: bool) -> None:
     Raises:
         ArgumentError: The name does not end as a take's, or somebody corrected the take there.
     """
+    from gloves.takes.corrections import corrections_path
+    from gloves.takes.take import SUFFIX
+
     if out.suffix.lower() != ".npz" or out.name.endswith(SUFFIX):
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .npz and not in {SUFFIX}")
     corrections = corrections_path(out)
@@ -46,6 +50,8 @@ def chosen_hands(
         UserError: The file cannot be read.
         ArgumentError: Size and file are both given, or the file has no such hand.
     """
+    from track.user import load_user
+
     if shape is None:
         return BOTH if hands is None else hands, size or "auto"
     if size is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
@@ -12,8 +12,11 @@ import tyro
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
 from handsim.errors import ArgumentError
+from track.network_address import LOOPBACK
 from track.streams.natnet import COMMAND_PORT
-from track.streams.natnet_server import LOOPBACK, ReplayServer
+
+if TYPE_CHECKING:
+    from track.streams.natnet_server import ReplayServer
 
 _LOOK: Final = 0.1  # [s] between two looks at whether it shall end
 _MOST_PORT: Final = 65535
@@ -39,6 +42,8 @@ def replay(
         host: Address of this machine to listen at; other machines do not reach the default.
         port: Port to listen at; 0 takes a free one.
     """
+    from track.streams.natnet_server import ReplayServer
+
     if rate is not None and not 0.0 < rate < np.inf:
         raise ArgumentError(f"--rate is {rate:g}, expected a positive number")
     if not 0 <= port <= _MOST_PORT:

@@ -5,30 +5,25 @@ from __future__ import annotations
 import warnings
 from collections import deque
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 import tyro
 from rich.console import Console
 
-from gloves.captures.formats import WRITABLE, check_suffix, write_capture
-from gloves.takes.corrections import corrections_path
-from gloves.takes.take import load_take
 from handsim.app.messages import print_line
 from handsim.app.progress import progress_bar
-from handsim.cli.options import check_take_file, chosen_hands
 from handsim.errors import ArgumentError, HandSimWarning
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from track.capture_labeling import labeled_points
-from track.capture_tracking import OnFrame, track_capture
-from track.config import TrackerConfig
-from track.live import LiveTake, track_live
-from track.setup import AnyHands, Size, TrackerSetup, warm_up
-from track.sinks.addresses import SinkGroup, open_sinks
-from track.streams.frame_source import StreamedFrame
-from track.take_summary import summarize, suspicions
+from track.config import Size, TrackerConfig
 from track.tracked_frame import TrackedFrame
+
+if TYPE_CHECKING:
+    from track.capture_tracking import OnFrame
+    from track.live import LiveTake
+    from track.setup import AnyHands
+    from track.sinks.addresses import SinkGroup
 
 _TIMED: Final = 100_000  # frames whose computing time is kept
 
@@ -76,6 +71,15 @@ def track(
         labeled: File for the labeled points, .trc, .c3d or Motive .csv; markers are called right:ThumbTip and
             so on, other points Unlabeled1, Unlabeled2, ...
     """
+    from gloves.captures.formats import write_capture
+    from gloves.takes.take import load_take
+    from handsim.cli.options import chosen_hands
+    from track.capture_labeling import labeled_points
+    from track.live import track_live
+    from track.setup import TrackerSetup, warm_up
+    from track.sinks.addresses import open_sinks
+    from track.streams.frame_source import StreamedFrame
+
     _check_options(capture, live, seconds, out, labeled)
     check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
     chosen, chosen_size = chosen_hands(shape, hands, size)
@@ -111,6 +115,10 @@ def _track_file(
     on_frame: OnFrame,
 ) -> LiveTake:
     """Track a capture, with the corrections beside OUT, and write the take."""
+    from gloves.takes.corrections import corrections_path
+    from track.capture_tracking import track_capture
+    from track.live import LiveTake
+
     corrections = corrections_path(out)
     with progress_bar("frames") as (bar, task):
         take = track_capture(
@@ -133,6 +141,8 @@ def _track_file(
 
 def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
     """Print what was tracked, and warn of what looks wrong; `seconds` is the time of the median frame."""
+    from track.take_summary import summarize, suspicions
+
     take, frames = tracked.take, tracked.num_frames
     _, measured, size = take.settings["user"].partition("auto, ")
     lines = [f"size of the hands: {size}"] if measured else []
@@ -146,6 +156,9 @@ def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
 def _check_options(
     capture: Path | None, live: str | None, seconds: float | None, out: Path, labeled: Path | None
 ) -> None:
+    from gloves.captures.formats import WRITABLE, check_suffix
+    from handsim.cli.options import check_take_file
+
     if (capture is None) == (live is None):
         given = (
             "neither a capture nor --live" if capture is None else f"a capture, {capture}, and --live {live}"

@@ -18,10 +18,8 @@ from handsim.cli.parsing import run_command
 from handsim.cli.presets import PresetCommand, given_option
 from handsim.errors import DatasetError, HandSimError
 from train.config import KINDS, PRESETS, Kind, Preset, TrainConfig, default_config, preset_config
-from train.data.shards import load_manifest
 from train.devices.world import world_of
 from train.reports.figures_table import print_figures
-from train.reports.run_page import PAGE
 
 _PAPER_FRAMES: Final = 170_330  # for the help, which knows no training set
 
@@ -42,6 +40,8 @@ def _train(
         preset: A published recipe, which replaces the defaults; options given beside it hold.
         threads: Threads on a CPU; the faster of one and all when not given, measured now and then.
     """
+    from train.reports.run_page import PAGE
+
     del preset  # it is in `config` already
     from train.devices.agreement import PeerError
     from train.loop import train_labeler
@@ -95,6 +95,8 @@ def _command_of_rank(args: Sequence[str], prog: str) -> Callable[..., None]:
 
 def _with_recipe_as_default(args: Sequence[str], prog: str) -> functools.partial[None]:
     """`handsim train` with the settings of the given labeler or preset as the default of `config`."""
+    from train.data.shards import load_manifest
+
     name = given_option(args, "--preset")
     preset = next((preset for preset in PRESETS if preset == name), None)
     if preset is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -12,20 +12,16 @@ from rich.console import Console
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.messages import LiveStatus, print_line
 from handsim.app.progress import progress_bar
-from handsim.cli.options import check_take_file, chosen_hands
 from handsim.errors import ArgumentError
 from handsim.files.outputs import check_outputs
 from handsim.hand.topology import Side
-from handsim.space.cameras import load_rig
-from track.config import TrackerConfig
-from track.live import measured_setup
-from track.recorder import Recorder
-from track.setup import USUAL_SIZE, Size, TrackerSetup, warm_up
-from track.streams.addresses import open_source
-from track.viewer.contents import Content, first_look, open_content
-from track.viewer.live_view import LiveView
-from track.viewer.server import LOOPBACK, address_of, opened_server
-from track.viewer.video import write_video
+from track.config import Size, TrackerConfig
+from track.network_address import LOOPBACK
+from track.viewer.server import address_of, opened_server
+
+if TYPE_CHECKING:
+    from track.setup import TrackerSetup
+    from track.viewer.contents import Content
 
 
 def view(
@@ -67,6 +63,10 @@ def view(
         labeler: Folder of a trained labeler for a live tracker, or an exported .onnx file.
         video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
     """
+    from handsim.cli.options import check_take_file, chosen_hands
+    from track.setup import USUAL_SIZE, TrackerSetup
+    from track.viewer.contents import open_content
+
     if (file is None) == (live is None):
         given = "neither a file nor --live" if file is None else f"a file, {file}, and --live {live}"
         raise ArgumentError(f"given {given}, expected a file or --live natnet://host")
@@ -93,6 +93,9 @@ def view(
 
 def _draw(name: str, content: Content, video: Path) -> None:
     """Draw the video of a recording."""
+    from track.viewer.contents import first_look
+    from track.viewer.video import write_video
+
     check_outputs((name,), (video,))
     from render.illustrations.clip import write_clip  # OpenCV and the painters
 
@@ -114,6 +117,13 @@ def _view_live(
     url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None, out: Path | None
 ) -> None:
     """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
+    from handsim.space.cameras import load_rig
+    from track.live import measured_setup
+    from track.recorder import Recorder
+    from track.setup import warm_up
+    from track.streams.addresses import open_source
+    from track.viewer.live_view import LiveView
+
     cameras = None if rig is None else load_rig(rig)
     with Console(stderr=True).status("getting ready"):
         warm_up(setup.user, setup.labeler)

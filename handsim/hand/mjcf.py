@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from handsim.hand.capsules import Capsules
 from handsim.hand.skeleton import Skeleton
 from handsim.hand.topology import BONE_NAMES, BONES, JOINTS
+
+if TYPE_CHECKING:
+    import mujoco
 
 FLESH_DENSITY: Final = 1100.0
 """Density of the hand [kg/m^3], soft tissue and bone together."""
@@ -43,6 +45,8 @@ def build_spec(
     With `actuators` each joint has a position servo of its name: a control is an angle [rad] within the
     joint's range.
     """
+    import mujoco
+
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.compiler.degree = False

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -18,6 +18,9 @@ from handsim.hand.skeleton import Skeleton, build_skeleton
 from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import HandSurface, build_surface
 from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 class HandModel:
@@ -100,7 +103,8 @@ class HandModel:
         Raises:
             ArgumentError: `qpos` is not (T, 27) or not finite.
         """
-        return penetration_depth(self.capsules, self.forward_kinematics(qpos))
+        values = check_array("qpos", qpos, (None, NUM_QPOS))
+        return penetration_depth(self.capsules, bone_transforms(self.skeleton, values))
 
 
 def load_model(model: HandModel | HandShape | str) -> HandModel:

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation, Slerp
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError
@@ -96,6 +95,8 @@ def bridge_gaps(times: Float[np.ndarray, "T"], qpos: Float[np.ndarray, "T 27"], 
         qpos: Poses, NaN where there is none; at least one must be there.
         rate: Frames per second of the motion [Hz].
     """
+    from scipy.spatial.transform import Rotation, Slerp
+
     there = np.flatnonzero(np.isfinite(qpos[:, 0]))
     known = times[there]
     asked = np.clip(times, known[0], known[-1])
@@ -174,6 +175,8 @@ def _between(
     rows: NDArray[np.float64], before: NDArray[np.intp], share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Rows between each old frame and the next; NaN where one that counts is."""
+    from scipy.spatial.transform import Rotation
+
     quaternions = slice(3, 7)
     after = np.minimum(before + 1, len(rows) - 1)
     first = np.where(share[:, None] == 1.0, rows[after], rows[before])

@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from handsim.hand.keypoints import KEYPOINT_BONES, KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.mjcf import Site
@@ -103,6 +102,8 @@ def _add_capsule(
     shapes: ET.Element, name: str, start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"], radius: float
 ) -> None:
     """A cylinder and two spheres, since OpenSim draws no capsule."""
+    from scipy.spatial.transform import Rotation
+
     along = (end - start) / np.linalg.norm(end - start)
     turn, _ = Rotation.align_vectors(along[None], [[0.0, 1.0, 0.0]])  # cylinders lie along y
     half_height = number_text(0.5 * float(np.linalg.norm(end - start)))

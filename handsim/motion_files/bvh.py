@@ -20,8 +20,8 @@ from handsim.files.atomic import atomic_write
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, PALM
 from handsim.motion_files.local_poses import CHILDREN, local_rotations
-from handsim.motion_files.motion import Motion, PosedHand, UpAxis, file_axes, posed_bodies, posed_hands
-from handsim.space.transforms import euler_angles
+from handsim.motion_files.motion import Motion, PosedHand, file_axes, posed_bodies, posed_hands
+from handsim.space.transforms import UpAxis, euler_angles
 
 ROOT: Final = "world_cm"
 _CENTIMETERS: Final = 100.0

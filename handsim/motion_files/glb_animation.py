@@ -30,13 +30,13 @@ from handsim.motion_files.motion import (
     Motion,
     PosedBody,
     PosedHand,
-    UpAxis,
     changes,
     file_axes,
     posed_bodies,
     posed_hands,
     seconds_of,
 )
+from handsim.space.transforms import UpAxis
 
 _MATERIALS: Final = (SKIN, THING)
 

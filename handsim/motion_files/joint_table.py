@@ -17,7 +17,8 @@ from handsim.files.atomic import atomic_write
 from handsim.files.inputs import read_bytes
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES, SIDES, Side
-from handsim.motion_files.motion import Motion, PosedHand, UpAxis, posed_hands
+from handsim.motion_files.motion import Motion, PosedHand, posed_hands
+from handsim.space.transforms import UpAxis
 
 _FIRST: Final = ("frame", "time_s", "hand")
 _QPOS: Final = (

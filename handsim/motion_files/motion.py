@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final, Literal, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from handsim.hand.model import HandModel
 from handsim.hand.topology import Side
 from handsim.space.objects import RigidObject
-from handsim.space.transforms import pose_matrices
-
-UpAxis = Literal["y", "z"]
+from handsim.space.transforms import UpAxis, pose_matrices
 
 
 class Material(NamedTuple):

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from handsim.files.atomic import atomic_write
 from handsim.hand.osim import coordinate_names
-from handsim.motion_files.motion import Motion, PosedHand, UpAxis, posed_hands, seconds_of
-from handsim.space.transforms import body_fixed_angles, quaternion_matrix
+from handsim.motion_files.motion import Motion, PosedHand, posed_hands, seconds_of
+from handsim.space.transforms import UpAxis, body_fixed_angles, quaternion_matrix
 
 
 def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:

@@ -29,12 +29,12 @@ from handsim.motion_files.motion import (
     Motion,
     PosedBody,
     PosedHand,
-    UpAxis,
     changes,
     posed_bodies,
     posed_hands,
     seconds_of,
 )
+from handsim.space.transforms import UpAxis
 
 _AROUND: Final = 0.03  # [m] of skin around keypoints
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
@@ -142,6 +141,8 @@ def _read_mesh(path: Path) -> Any:
     check_regular(path, error=ObjectError, most=_MOST_BYTES)
     if not path.is_file():
         raise ObjectError(f"{path}: no such file")
+    import trimesh
+
     try:
         mesh = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # readers of damaged files fail in many ways
@@ -181,6 +182,8 @@ def _library() -> dict[str, Any]:
 
 
 def _build(name: str, entry: dict[str, Any]) -> RigidObject:
+    import trimesh
+
     parts: list[Part] = []
     surfaces: list[Any] = []
     for kind, numbers in entry["solids"]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from numpy.typing import NDArray
 
@@ -44,6 +43,8 @@ def build_solid(kind: str, numbers: Sequence[float]) -> Solid:
 
 def hull_part(vertices: Float[np.ndarray, "N 3"]) -> Part:
     """The convex hull of some points [m] as a part."""
+    import trimesh
+
     hull = trimesh.convex.convex_hull(np.asarray(vertices))
     return Part("mesh", np.zeros(3), np.eye(4), np.asarray(hull.vertices))
 
@@ -70,6 +71,8 @@ def _along(start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[NDArra
 
 
 def _sphere(numbers: NDArray[np.float64]) -> Solid:
+    import trimesh
+
     position, radius = 1e-3 * numbers[:3], 1e-3 * numbers[3]
     pose = _at(position)
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
@@ -77,6 +80,8 @@ def _sphere(numbers: NDArray[np.float64]) -> Solid:
 
 
 def _capsule(numbers: NDArray[np.float64]) -> Solid:
+    import trimesh
+
     radius = 1e-3 * numbers[6]
     pose, length = _along(1e-3 * numbers[:3], 1e-3 * numbers[3:6])
     mesh = trimesh.creation.capsule(height=length, radius=radius, count=[_AROUND, _AROUND // 2])
@@ -85,12 +90,16 @@ def _capsule(numbers: NDArray[np.float64]) -> Solid:
 
 
 def _box(numbers: NDArray[np.float64]) -> Solid:
+    import trimesh
+
     pose = _at(1e-3 * numbers[:3], axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])))
     mesh = trimesh.creation.box(extents=2e-3 * numbers[3:6])
     return [_part("box", 1e-3 * numbers[3:6], pose)], mesh.apply_transform(pose)
 
 
 def _ellipsoid(numbers: NDArray[np.float64]) -> Solid:
+    import trimesh
+
     pose = _at(1e-3 * numbers[:3], axis_angle_matrix(np.eye(3)[1], np.deg2rad(numbers[6])))
     mesh = trimesh.creation.icosphere(subdivisions=2)
     mesh.apply_scale(1e-3 * numbers[3:6])
@@ -99,6 +108,8 @@ def _ellipsoid(numbers: NDArray[np.float64]) -> Solid:
 
 def _cup(numbers: NDArray[np.float64]) -> Solid:
     """A hollow cup to cameras, a full cylinder to fingers."""
+    import trimesh
+
     low, high, radius, wall, depth = 1e-3 * numbers
     inner, floor = radius - wall, high - depth
     profile = [(0, low), (radius, low), (radius, high), (inner, high), (inner, floor), (0, floor)]
@@ -129,6 +140,8 @@ def _tube_mesh(
     ring: bool,
 ) -> Any:
     """Mesh around a polyline: closed upon itself, or with flat ends."""
+    import trimesh
+
     angle = np.linspace(0.0, 2 * np.pi, _TUBE_SIDES, endpoint=False)
     cross = np.cos(angle)[:, None, None] * outward + np.sin(angle)[:, None, None] * across
     rows = (points + tube * cross).swapaxes(0, 1)  # (points, sides, 3)

@@ -5,11 +5,14 @@ Quaternions are wxyz (MuJoCo's order). A matrix `T_a_b` maps coordinates of fram
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+UpAxis = Literal["y", "z"]
+"""The axis of a file that points up."""
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """Right hand to left hand and back, in the wrist frame."""
 
@@ -38,6 +41,8 @@ def quaternion_matrix(quaternion: Float[np.ndarray, "*batch 4"]) -> NDArray[np.f
 
 def rotation_quaternions(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation matrices."""
+    from scipy.spatial.transform import Rotation
+
     quaternions: NDArray[np.float64] = Rotation.from_matrix(rotations).as_quat(scalar_first=True)
     return quaternions
 
@@ -59,15 +64,18 @@ def transform_poses(transforms: Float[np.ndarray, "T 4 4"]) -> NDArray[np.float6
 
 def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]:
     """Unit wxyz quaternions (T, 4) of rotation vectors [rad]."""
+    from scipy.spatial.transform import Rotation
+
     quaternions: NDArray[np.float64] = Rotation.from_rotvec(vectors).as_quat(scalar_first=True)
     return quaternions
 
 
-def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
-    """Rotation Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
+def euler_matrix(angles: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
+    """Rotations Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
+    yaw, pitch, roll = np.moveaxis(np.asarray(angles), -1, 0)
     x, y, z = np.eye(3)
     matrix: NDArray[np.float64] = (
-        axis_angle_matrix(z, angles[0]) @ axis_angle_matrix(y, angles[1]) @ axis_angle_matrix(x, angles[2])
+        axis_angle_matrix(z, yaw) @ axis_angle_matrix(y, pitch) @ axis_angle_matrix(x, roll)
     )
     return matrix
 

@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from handsim._checks import check_number
 from poses.shapes.couplings import HIGH, LOW, apply_couplings, finger_view
@@ -97,6 +96,8 @@ def _tremble(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _curl_fingers(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    from scipy.special import ndtr
+
     angles = _thumbs(count, rng)
     digits = finger_view(angles)
     within = rng.uniform(0.3, 1.0, size=(count, 1))  # how much the two joints of one finger move together

@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, PoseError, choices
@@ -139,6 +138,8 @@ def is_touching(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str
 
 
 def _solve(model: HandModel, finger: str, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    from scipy.optimize import least_squares
+
     number = DIGITS.index(finger)
     moving = np.r_[0:4, 4 * number : 4 * number + 4]
     low, high = LOW[moving], HIGH[moving]

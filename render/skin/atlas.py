@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from handsim.hand.skin.cage_topology import WRIST, cage_topology
-from handsim.hand.skin.subdivision import catmull_clark, subdivided_loop
+from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
 
 TILE: Final = 16
 """Texels along a tile's side."""
@@ -71,7 +71,7 @@ def skin_atlas() -> Atlas:
         np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]), (len(quads), 4, 2)
     )
     for _ in range(_LEVELS):
-        loop = subdivided_loop(loop, quads, count)
+        (loop,) = subdivided_loops([loop], quads, count)
         step, quads = catmull_clark(quads, count)
         count = step.shape[0]
         coordinates = _child_coordinates(coordinates)

@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from handsim.space.transforms import rigid_fit
 from track.association.frame_state import FrameState, Numbering
+from train.matching.assignment import assign
 
 _LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
 # Distance of a point from its prediction [m], before hands are aligned and after each alignment.
@@ -162,9 +162,9 @@ def _assign(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Points and predicted points, one to one, within a distance [m]."""
     squares = ((points[:, None] - predicted) ** 2).sum(axis=-1)
-    rows, columns = linear_sum_assignment(np.minimum(squares, distance**2))
-    near = squares[rows, columns] < distance**2
-    return rows[near], columns[near]
+    _, labels = assign(squares, np.full(len(points), distance**2))
+    near = np.flatnonzero(labels >= 0)
+    return near, labels[near]
 
 
 def change_of_distances(before: Float[np.ndarray, "O 3"], points: Float[np.ndarray, "P 3"]) -> float:

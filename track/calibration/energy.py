@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from handsim.hand.jacobian import skinned_jacobian
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
-from handsim.hand.skin.surface import build_surface
+from handsim.hand.skin.surface import rest_vertices
 from handsim.hand.topology import NUM_BONES
 from handsim.kernels.integration import move
 from track.calibration.contacts import (
@@ -204,7 +204,7 @@ class Problem:
         skin = fit.model.surface.vertices
         patch = SkinPatch(self._faces(estimate))
         corners, rest = patch.corners(skin), self._rest_jacobian(estimate, patch, skin)
-        skeleton = shape_jacobian(self.shape, estimate.parameters, skeleton_parameters)
+        skeleton = np.ascontiguousarray(shape_jacobian(self.shape, estimate.parameters, skeleton_parameters))
         by_pose, by_shared = self._marker_jacobians(
             estimate, fit, _part(corners, 0, count), rest[:count], skeleton
         )
@@ -236,9 +236,7 @@ class Problem:
             self._surface_jacobian is None
             or np.abs(estimate.parameters - self._linearized_at).max() > _RELINEARIZE
         ):
-            self._surface_jacobian = shape_jacobian(
-                self.shape, estimate.parameters, lambda shape: build_surface(shape).vertices
-            )
+            self._surface_jacobian = shape_jacobian(self.shape, estimate.parameters, rest_vertices)
             self._linearized_at = estimate.parameters
         coordinates = self._all_coordinates(estimate)
         here, _ = skin_points(coordinates, patch.corners(skin))

@@ -7,7 +7,7 @@ the digits, girths and the palm's thickness vary in addition, as in `handsim.han
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -68,27 +68,25 @@ def shape_precision() -> Float[np.ndarray, "53 53"]:
 def shape_jacobian(
     start: HandShape,
     parameters: Float[np.ndarray, "53"],
-    function: Callable[[HandShape], NDArray[np.float64]],
+    function: Callable[[list[HandShape]], Float[np.ndarray, "B *shape"]],
 ) -> Float[np.ndarray, "*shape 53"]:
     """Derivative of a function of the shape by the parameters, by finite differences.
 
     Args:
         start: Shape of zero parameters.
         parameters: Where to differentiate.
-        function: Any array that depends on the shape.
+        function: Arrays that depend on shapes, one for each.
     """
-    here = function(shape_at(start, parameters))
-    columns = []
-    for number in range(NUM_PARAMETERS):
-        nudged = parameters.copy()
-        nudged[number] += _STEP
-        columns.append((function(shape_at(start, nudged)) - here) / _STEP)
-    return np.stack(columns, axis=-1)
+    nudged = parameters + _STEP * np.eye(1 + NUM_PARAMETERS, NUM_PARAMETERS, -1)  # the first as it is
+    values = function([shape_at(start, one) for one in nudged])
+    jacobian: NDArray[np.float64] = np.moveaxis((values[1:] - values[0]) / _STEP, 0, -1)
+    return jacobian
 
 
-def skeleton_parameters(shape: HandShape) -> Float[np.ndarray, "45"]:
-    """The part of a shape that determines the skeleton: bone lengths [m], knuckles [m], base angles [rad]."""
-    return np.concatenate([shape.bone_lengths.ravel(), shape.knuckles.ravel(), shape.base_angles.ravel()])
+def skeleton_parameters(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B 45"]:
+    """What of shapes determines their skeletons: bone lengths [m], knuckles [m], base angles [rad]."""
+    parts = [(shape.bone_lengths, shape.knuckles, shape.base_angles) for shape in shapes]
+    return np.array(parts).reshape(len(shapes), -1)
 
 
 def skinned_shape_jacobian(

@@ -7,10 +7,11 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
+from handsim.hand.skeleton import build_skeleton
+from handsim.hand.skin.surface import rest_vertices
 from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS
 from handsim.space.transforms import quaternion_matrix
 from track.calibration.contacts import contact_geometry, initialize_contacts
@@ -44,6 +45,8 @@ def repeated_share(qpos: Float[np.ndarray, "T 27"], residuals: Float[np.ndarray,
         qpos: Poses of a fitted hand, two or more.
         residuals: Model minus marker [m], NaN where a marker is missing.
     """
+    from scipy.spatial import cKDTree
+
     local = np.einsum("tji,tmj->tmi", quaternion_matrix(qpos[:, 3:7]), residuals)
     nearest = cKDTree(qpos[:, 7:]).query(qpos[:, 7:], k=2)[1][:, 1]
     products, squares = local * local[nearest], 0.5 * (local**2 + local[nearest] ** 2)
@@ -75,12 +78,13 @@ def standard_errors(
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
 
-    def on_bones(shape: HandShape) -> NDArray[np.float64]:
-        model = HandModel(shape)
-        rest = model.rest_transforms[bones]
-        points = skin_points(estimate.coordinates, patch.corners(model.surface.vertices))[0]
-        local: NDArray[np.float64] = np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3])
-        return local
+    def on_bones(shapes: list[HandShape]) -> NDArray[np.float64]:
+        local = []
+        for shape, vertices in zip(shapes, rest_vertices(shapes), strict=True):
+            rest = build_skeleton(shape).rest_transforms()[bones]
+            points = skin_points(estimate.coordinates, patch.corners(vertices))[0]
+            local.append(np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3]))
+        return np.array(local)
 
     count = len(bones)
     jacobian = np.zeros((count, 3, len(covariance)))

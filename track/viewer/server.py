@@ -17,7 +17,6 @@ from handsim.errors import ArgumentError, HandSimError
 if TYPE_CHECKING:
     from viser import ViserServer
 
-LOOPBACK: Final = "127.0.0.1"
 """The address that only this machine reaches."""
 _HINT: Final = "install it with: pip install 'handsim[view]'"
 _DARK_OR_LIGHT: Final = """<!doctype html><html><script>

@@ -16,8 +16,8 @@ from train.labelers.batch_network import BatchNetwork
 from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.cnn_network import DeepLabelCNN, cnn_loss
 from train.labelers.protocol import Labeler
-from train.labelers.set_labeler import TrainedSetLabeler, set_loss
-from train.labelers.set_network import SetLabeler
+from train.labelers.set_labeler import TrainedSetLabeler
+from train.labelers.set_network import SetLabeler, set_loss
 from train.labelers.views import MeanHand
 
 _PREPARED: Final = 20_000  # frames
@@ -76,4 +76,4 @@ def labeler_of(network: nn.Module, marker_names: tuple[str, ...]) -> Labeler:
     if isinstance(network, DeepLabelCNN):
         return cnn_labeler(network, marker_names)
     assert isinstance(network, SetLabeler)
-    return TrainedSetLabeler(network, marker_names)
+    return TrainedSetLabeler(network.config, network.numpy_weights(), network.prior, marker_names)

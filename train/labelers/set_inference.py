@@ -1,10 +1,11 @@
-"""The set labeler on one cloud, compiled: torch's time for so few points goes to its calls.
+"""The set labeler on one cloud, compiled and without torch, whose time for so few points goes to its calls.
 
 Operations in their order are those of `train.labelers.set_network`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,9 +13,11 @@ from jaxtyping import Float, Float32, Int32
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
-from train.labelers.set_network import SetLabeler
+from train.config import SetLabelerConfig
 
 Floats = NDArray[np.float32]
+Weights = Mapping[str, Floats]
+"""Weights of the network by their names in `train.labelers.set_network`."""
 
 _EPSILON: Final = np.float32(1e-5)  # of torch's LayerNorm
 _NEAREST: Final = np.float32(1e-12)  # [m^2] added to squared distances
@@ -72,14 +75,14 @@ class CloudScorer:
     """Scores of one cloud without padding.
 
     Args:
-        network: Network in evaluation mode; later changes of its weights have no effect.
+        config: Size of the network.
+        weights: Its weights, of the names and shapes of `weight_shapes`.
     """
 
-    def __init__(self, network: SetLabeler) -> None:
-        config = network.config
+    def __init__(self, config: SetLabelerConfig, weights: Weights) -> None:
         self._sharpness = np.float32(-0.5 * ((config.num_distances - 1) / config.reach) ** 2)
-        self._centers = network.centers.numpy()
-        weights = {name: value.detach().numpy() for name, value in network.state_dict().items()}
+        self._centers = _centers(config)
+        weights = {name: np.asarray(one, dtype=np.float32) for name, one in weights.items()}
         rounds = [f"rounds.{number}." for number in range(config.depth)]
         ends = _linear(weights, rounds, "ends")
         gate_bias = np.stack([weights[f"{one}distance_gate.bias"] for one in rounds])
@@ -120,7 +123,42 @@ class CloudScorer:
         )
 
 
-def _linear(weights: dict[str, Floats], parts: list[str], name: str) -> _Linear:
+def weight_shapes(config: SetLabelerConfig) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a network's weights, as torch has them: a linear layer is (outputs, inputs)."""
+    width, labels = config.width, config.num_labels
+    linear = {
+        "embed.0": (width, config.num_distances + 1),
+        "embed.2": (width, width),
+        "to_scores": (labels + 1, width),
+        "to_occluded.0": (width, width),
+        "to_occluded.2": (labels, width),
+    }
+    norms = ["norm"]
+    for number in range(config.depth):
+        one = f"rounds.{number}."
+        linear |= {
+            f"{one}values": (width, width),
+            f"{one}ends": (2 * config.gates, width),
+            f"{one}distance_gate": (config.gates, config.num_distances),
+            f"{one}mix": (width, width),
+            f"{one}think.1": (2 * width, width),
+            f"{one}think.3": (width, 2 * width),
+        }
+        norms += [f"{one}norm", f"{one}think.0"]
+    shapes: dict[str, tuple[int, ...]] = {f"{name}.weight": shape for name, shape in linear.items()}
+    shapes |= {f"{name}.bias": (outputs,) for name, (outputs, _) in linear.items()}
+    return shapes | {f"{name}.{part}": (width,) for name in norms for part in ("weight", "bias")}
+
+
+def _centers(config: SetLabelerConfig) -> Float32[np.ndarray, "K"]:
+    """Distances around which the bumps stand [m]; torch's linspace counts the second half from its end."""
+    reach, count = np.float32(config.reach), config.num_distances
+    steps = np.arange(count) * np.float64(reach / np.float32(count - 1))
+    centers: Floats = np.where(np.arange(count) < count // 2, steps, reach - steps[::-1]).astype(np.float32)
+    return centers
+
+
+def _linear(weights: Weights, parts: list[str], name: str) -> _Linear:
     """A linear layer of some parts of the network, by its name there."""
     return _Linear(
         np.stack([np.ascontiguousarray(weights[f"{part}{name}.weight"].T) for part in parts]),
@@ -128,7 +166,7 @@ def _linear(weights: dict[str, Floats], parts: list[str], name: str) -> _Linear:
     )
 
 
-def _norm(weights: dict[str, Floats], parts: list[str], name: str) -> _Norm:
+def _norm(weights: Weights, parts: list[str], name: str) -> _Norm:
     """A layer norm of some parts of the network, by its name there."""
     weight, bias = (
         np.stack([weights[f"{part}{name}.{kind}"] for part in parts]) for kind in ("weight", "bias")

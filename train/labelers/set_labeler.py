@@ -1,18 +1,16 @@
-"""The set labeler with weights, and its loss."""
+"""The set labeler with weights; without torch."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from train.data.batches import Batch
+from train.config import SetLabelerConfig
 from train.labelers.protocol import Labeling, check_clouds, check_output
-from train.labelers.set_inference import CloudScorer
-from train.labelers.set_network import SetLabeler, labeling_loss
+from train.labelers.set_inference import CloudScorer, Weights
 from train.matching.pose_prior import PosePrior
 from train.matching.verification import match_scores
 
@@ -21,19 +19,22 @@ class TrainedSetLabeler:
     """The set labeler with weights, ready to use.
 
     Args:
-        network: Trained network.
+        config: Size of the network.
+        weights: Its weights; later changes of them have no effect.
+        prior: What it knows of hands as wholes.
         marker_names: Markers in label order.
     """
 
-    def __init__(self, network: SetLabeler, marker_names: tuple[str, ...]) -> None:
-        self.network = network.eval()
+    def __init__(
+        self,
+        config: SetLabelerConfig,
+        weights: Weights,
+        prior: PosePrior | None,
+        marker_names: tuple[str, ...],
+    ) -> None:
+        self.prior = prior
         self.marker_names = marker_names
-        self._scorer = CloudScorer(self.network)
-
-    @property
-    def prior(self) -> PosePrior | None:
-        """What it knows of hands as wholes."""
-        return self.network.prior
+        self._scorer = CloudScorer(config, weights)
 
     def label_frames(self, frames: Sequence[Float[np.ndarray, "N 3"]]) -> list[Labeling]:
         """Label the points [m] of every frame, see `train.labelers.protocol.Labeler`."""
@@ -44,12 +45,4 @@ class TrainedSetLabeler:
             return Labeling(np.zeros(0, dtype=np.int64), np.zeros(0))
         by_point, by_label = self._scorer.score(cloud)
         check_output(by_label)
-        return Labeling(*match_scores(cloud, by_point, by_label, self.network.prior))
-
-
-def set_loss(network: torch.nn.Module, batch: Batch, device: torch.device) -> torch.Tensor:
-    """Loss of one batch, see `train.labelers.set_network.labeling_loss`."""
-    cloud = batch.cloud
-    points = torch.from_numpy(cloud.points.astype(np.float32)).to(device)
-    present, truth = torch.from_numpy(cloud.present).to(device), torch.from_numpy(cloud.truth).to(device)
-    return labeling_loss(network(points, present), truth, present, weights=batch.weights)
+        return Labeling(*match_scores(cloud, by_point, by_label, self.prior))

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from train.config import SetLabelerConfig
-from train.data.batches import WHOLE, Weights
+from train.data.batches import WHOLE, Batch, Weights
 from train.matching.pose_prior import PosePrior
 
 
@@ -71,6 +72,10 @@ class SetLabeler(nn.Module):
             torch.log_softmax(scores, dim=-1),
             torch.log_softmax(torch.cat([by_label, occluded], dim=-1), dim=-1),
         )
+
+    def numpy_weights(self) -> dict[str, np.ndarray]:
+        """The weights by name, in the network's own memory."""
+        return {name: value.detach().numpy() for name, value in self.state_dict().items()}
 
 
 class MessageRound(nn.Module):
@@ -129,3 +134,11 @@ def labeling_loss(scores: LabelScores, truth: Tensor, present: Tensor, *, weight
     of_label = of_label.scatter(1, known, indices)[:, :num_labels]
     label_loss = -scores.labels.gather(-1, of_label[..., None]).mean()
     return weights.points * point_loss + weights.clouds * label_loss
+
+
+def set_loss(network: nn.Module, batch: Batch, device: torch.device) -> Tensor:
+    """Loss of one batch, see `labeling_loss`."""
+    cloud = batch.cloud
+    points = torch.from_numpy(cloud.points.astype(np.float32)).to(device)
+    present, truth = torch.from_numpy(cloud.present).to(device), torch.from_numpy(cloud.truth).to(device)
+    return labeling_loss(network(points, present), truth, present, weights=batch.weights)

@@ -39,7 +39,7 @@ class SideClassifier:
         if len(fours) > _MAX_FOURS:
             fours = fours[rng.choice(len(fours), size=_MAX_FOURS, replace=False)]
         markers = np.concatenate([_right_hands(layout, size, rng) for size in _SIZES])
-        mean = np.sign(_volumes(markers[:, fours])).mean(axis=0)
+        mean = _mean_orientation(markers, fours)
         self._fours: NDArray[np.int64] = fours
         self._votes: NDArray[np.float64] = np.arctanh(mean.clip(-0.999, 0.999))
         self._num_markers = layout.num_markers
@@ -67,31 +67,33 @@ def _right_hands(layout: MarkerLayout, size: str, rng: np.random.Generator) -> N
     return markers
 
 
-def _volumes(fours: Float[np.ndarray, "*B 4 3"]) -> NDArray[np.float64]:
-    """Six times the signed volume of each tetrahedron."""
-    a, b, c = (fours[..., k, :] - fours[..., 0, :] for k in (1, 2, 3))
-    volumes: NDArray[np.float64] = (np.cross(a, b) * c).sum(-1)
-    return volumes
+@kernel
+def _mean_orientation(
+    hands: Float[np.ndarray, "T M 3"], fours: Int[np.ndarray, "F 4"]
+) -> NDArray[np.float64]:
+    """Mean over hands of the sign of the volume of each group of four (F,); markers in [m]."""
+    mean = np.zeros(len(fours))
+    for hand in range(len(hands)):
+        for number in range(len(fours)):
+            volume = _volume(hands[hand], fours[number])
+            mean[number] += 1.0 if volume > 0.0 else -1.0 if volume < 0.0 else 0.0
+    return mean / len(hands)
 
 
 @kernel
 def _vote(
-    markers: NDArray[np.float64], fours: NDArray[np.int64], votes: NDArray[np.float64]
+    markers: Float[np.ndarray, "M 3"], fours: Int[np.ndarray, "F 4"], votes: Float[np.ndarray, "F"]
 ) -> tuple[float, float]:
     """The sum of the votes of all groups of four, and the greatest sum that they could have.
 
     Args:
-        markers: Markers (M, 3) [m], NaN where missing.
-        fours: Groups (F, 4) of markers.
-        votes: Vote (F,) of each group, if its orientation is that of most right hands.
+        markers: Markers [m], NaN where missing.
+        fours: Groups of markers.
+        votes: Vote of each group, if its orientation is that of most right hands.
     """
     vote, most = 0.0, 0.0
     for number in range(len(fours)):
-        corner = markers[fours[number, 0]]
-        ax, ay, az = markers[fours[number, 1]] - corner
-        bx, by, bz = markers[fours[number, 2]] - corner
-        cx, cy, cz = markers[fours[number, 3]] - corner
-        volume = (ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz
+        volume = _volume(markers, fours[number])
         if volume > 0.0:
             vote += votes[number]
             most += abs(votes[number])
@@ -99,3 +101,13 @@ def _vote(
             vote -= votes[number]
             most += abs(votes[number])
     return vote, most
+
+
+@kernel
+def _volume(markers: Float[np.ndarray, "M 3"], four: Int[np.ndarray, "4"]) -> float:
+    """Six times the signed volume [m^3] of the tetrahedron of four markers."""
+    x, y, z = markers[four[0], 0], markers[four[0], 1], markers[four[0], 2]
+    ax, ay, az = markers[four[1], 0] - x, markers[four[1], 1] - y, markers[four[1], 2] - z
+    bx, by, bz = markers[four[2], 0] - x, markers[four[2], 1] - y, markers[four[2], 2] - z
+    cx, cy, cz = markers[four[3], 0] - x, markers[four[3], 1] - y, markers[four[3], 2] - z
+    return float((ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz)

@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 import platformdirs
+from numpy.typing import NDArray
 
 from gloves.layout import list_layouts
 from handsim._plugins import is_plugin, list_plugins
@@ -21,10 +26,12 @@ from handsim.files.inputs import read_bytes
 from handsim.files.json_files import save_json
 from train.config import CNNConfig, Kind, NetworkConfig, SetLabelerConfig
 from train.labelers.protocol import LABELERS, Labeler, OwnLabeler, checked_names
+from train.labelers.set_inference import weight_shapes
+from train.labelers.set_labeler import TrainedSetLabeler
 from train.matching.pose_prior import PosePrior
 
 if TYPE_CHECKING:
-    from torch import Tensor, nn
+    from torch import nn
 
 LEARNED: Final = ".safetensors"
 """How the files in `learned_folder` end."""
@@ -34,6 +41,7 @@ _ANY_LAYOUT: Final = "any_layout"  # weights of the network for any layout
 _PRIOR: Final = "pose_prior."  # in the names of the prior's tensors
 _METADATA: Final = "__metadata__"  # key in the header of a safetensors file
 _LENGTH: Final = 8  # bytes that hold the header's length
+_LEAST_BYTES: Final = 4  # of a number of a network
 _MOST_CARD: Final = 1 << 24  # bytes
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
@@ -76,10 +84,12 @@ def load_stored_labeler(name_or_path: str | Path) -> Labeler:
     name = str(name_or_path)
     if not Path(name).exists() and (is_plugin(name) or name in list_plugins(LABELERS)):
         return OwnLabeler(name)
-    from train.labelers.kinds import labeler_of
+    stored = _read(*_files(name_or_path))
+    if isinstance(stored.config, SetLabelerConfig):
+        return TrainedSetLabeler(stored.config, stored.weights, stored.prior, stored.marker_names)
+    from train.labelers.kinds import labeler_of  # torch
 
-    network, card = load_network(name_or_path)
-    return labeler_of(network, tuple(card["marker_names"]))
+    return labeler_of(stored.network(), stored.marker_names)
 
 
 def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
@@ -88,25 +98,56 @@ def load_network(name_or_path: str | Path) -> tuple[nn.Module, dict[str, Any]]:
     Raises:
         WeightsError: Unknown, damaged, or not a labeler's weights.
     """
+    stored = _read(*_files(name_or_path))
+    return stored.network(), stored.card
+
+
+def _files(name_or_path: str | Path) -> tuple[Path, Path]:
+    """Weights and card of a shipped labeler or a folder."""
     if str(name_or_path) in shipped_labelers():
-        weights, card = _SHIPPED / f"{name_or_path}.safetensors", _SHIPPED / f"{name_or_path}.json"
-    else:
-        weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
-        if not weights.is_file() or not card.is_file():
-            unknown = choices(str(name_or_path), list_layouts(), noun="labeler or glove")
-            raise WeightsError(
-                f"{unknown}, a layout's .toml file, a folder that handsim train wrote, an .onnx file, or "
-                "module:name"
-            )
-    return _read_network(weights, card)
+        return _SHIPPED / f"{name_or_path}.safetensors", _SHIPPED / f"{name_or_path}.json"
+    weights, card = Path(name_or_path) / WEIGHTS, Path(name_or_path) / CARD
+    if not weights.is_file() or not card.is_file():
+        unknown = choices(str(name_or_path), list_layouts(), noun="labeler or glove")
+        raise WeightsError(
+            f"{unknown}, a layout's .toml file, a folder that handsim train wrote, an .onnx file, or "
+            "module:name"
+        )
+    return weights, card
 
 
-def _read_network(weights: Path, card: Path) -> tuple[nn.Module, dict[str, Any]]:
-    """A network from its two files; nothing in them is trusted."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stored:
+    """What the two files of a labeler hold."""
+
+    config: NetworkConfig
+    card: dict[str, Any]
+    weights: dict[str, NDArray[Any]]
+    """The network's weights by name."""
+    prior: PosePrior | None
+
+    @property
+    def marker_names(self) -> tuple[str, ...]:
+        """Markers in label order."""
+        return tuple(self.card["marker_names"])
+
+    def network(self) -> nn.Module:
+        """The network in torch."""
+        import torch
+
+        from train.labelers.kinds import new_network
+
+        network = new_network(self.config)
+        network.load_state_dict({name: torch.from_numpy(one) for name, one in self.weights.items()})
+        if self.prior is not None:
+            network.prior = self.prior  # type: ignore[assignment]
+        return network
+
+
+def _read(weights: Path, card: Path) -> _Stored:
+    """What two files hold; nothing in them is trusted."""
     from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    from train.labelers.kinds import new_network
+    from safetensors.numpy import load_file
 
     try:
         content = json.loads(read_bytes(card, error=WeightsError, most=_MOST_CARD))
@@ -114,43 +155,59 @@ def _read_network(weights: Path, card: Path) -> tuple[nn.Module, dict[str, Any]]
         config = _CONFIGS[content.get("labeler", "set")](**content["network"])
         if len(names) != config.num_labels:
             raise WeightsError(f"{card} names {len(names)} markers for {config.num_labels} labels")
-        if weights.stat().st_size < _bytes_of(config):  # before memory is asked for
+        expected = _shapes_of(config)
+        if weights.stat().st_size < _LEAST_BYTES * sum(map(math.prod, expected.values())):
             raise ValueError("it is too short for the network that its card describes")
-        network = new_network(config)
         tensors = load_file(weights)
-        prior = {name: tensors.pop(name) for name in list(tensors) if name.startswith(_PRIOR)}
-        network.load_state_dict(tensors)
-        if prior:
-            network.prior = _read_prior(prior, config.num_labels)  # type: ignore[assignment]
+        tables = {name: tensors.pop(name) for name in list(tensors) if name.startswith(_PRIOR)}
+        _check_shapes(tensors, expected)
+        prior = _read_prior(tables, config.num_labels) if tables else None
     except WeightsError:
         raise
     except (HandSimError, SafetensorError, OSError, ValueError, LookupError, TypeError) as error:
         raise _damaged(weights, error) from error
     except (AttributeError, RuntimeError, RecursionError, OverflowError) as error:
         raise _damaged(weights, error) from error
-    for name, tensor in network.state_dict().items():
-        if not tensor.isfinite().all():
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
             raise WeightsError(f"{weights} is damaged: {name} holds NaN or infinite values")
-    return network, content
+    return _Stored(config, content, tensors, prior)
 
 
-def _read_prior(tensors: dict[str, Tensor], num_labels: int) -> PosePrior:
-    """The pose prior of a network with so many labels, from its tensors."""
-    prior = PosePrior.of_tensors({name.removeprefix(_PRIOR): one.numpy() for name, one in tensors.items()})
-    if prior.num_markers != num_labels:
-        raise WeightsError(f"the pose prior has {prior.num_markers} markers for {num_labels} labels")
-    return prior
-
-
-def _bytes_of(config: NetworkConfig) -> int:
-    """Size of a network's weights, which are not made."""
+def _shapes_of(config: NetworkConfig) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a network's weights, which are not made."""
+    if isinstance(config, SetLabelerConfig):
+        return weight_shapes(config)
     import torch
 
     from train.labelers.kinds import new_network
 
     with torch.device("meta"):
-        state = new_network(config).state_dict()
-    return sum(tensor.numel() * tensor.element_size() for tensor in state.values())
+        return {name: tuple(one.shape) for name, one in new_network(config).state_dict().items()}
+
+
+def _check_shapes(tensors: Mapping[str, NDArray[Any]], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse tensors that are not those of a network.
+
+    Raises:
+        ValueError: One lacks, is too many, or has another shape.
+    """
+    for name, shape in expected.items():
+        if name not in tensors:
+            raise ValueError(f"it lacks {name}")
+        if tensors[name].shape != shape:
+            raise ValueError(f"{name} has shape {tensors[name].shape}, expected {shape}")
+    for name in tensors:
+        if name not in expected:
+            raise ValueError(f"it holds {name}, which is no part of the network")
+
+
+def _read_prior(tensors: dict[str, NDArray[Any]], num_labels: int) -> PosePrior:
+    """The pose prior of a network with so many labels, from its tensors."""
+    prior = PosePrior.of_tensors({name.removeprefix(_PRIOR): one for name, one in tensors.items()})
+    if prior.num_markers != num_labels:
+        raise WeightsError(f"the pose prior has {prior.num_markers} markers for {num_labels} labels")
+    return prior
 
 
 def _damaged(weights: Path, error: Exception) -> WeightsError:

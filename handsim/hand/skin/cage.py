@@ -1,15 +1,14 @@
-"""The skin's control cage in space: its vertices for a shape, and the scales that the fit adjusts."""
+"""The skin's control cage in space: its vertices for many shapes at once, at scales that the fit adjusts."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
-from handsim.hand.skeleton import build_skeleton
 from handsim.hand.skin.cage_topology import (
     AROUND,
     CARPUS,
@@ -26,6 +25,7 @@ from handsim.hand.skin.cage_topology import (
     palmar,
 )
 from handsim.hand.topology import DIGITS
+from handsim.space.transforms import euler_matrix
 
 if TYPE_CHECKING:
     from handsim.hand.shape import HandShape
@@ -111,148 +111,171 @@ _SECTIONS: Final = {
 
 
 _WAISTS: Final = {"before 1": 0.985, "at 1": 1.01, "after 1": 0.985}
+_THUMB, _FINGERS = slice(0, 1), slice(1, len(DIGITS))
+_GROUPS: Final = ((_THUMB, THUMB_RINGS), (_FINGERS, FINGER_RINGS))  # digits with the same rings
 
 
-@dataclass(slots=True, eq=False)
-class CageScales:
-    """Scales that the fit to a shape's measures adjusts, because subdivision shrinks the cage."""
+class CageHands(NamedTuple):
+    """Measures of B right hands, as in `handsim.hand.shape.HandShape`."""
 
-    rings: list[Float[np.ndarray, " R"]]
-    """Factor on the radius of each ring of each digit."""
-    tips: Float[np.ndarray, " 5"]
-    """How far the last ring of each digit is pushed out [m]."""
-    breadth: float
-    thickness: float
+    breadth: Float[np.ndarray, "B"]
+    palm_thickness: Float[np.ndarray, "B"]
+    bone_lengths: Float[np.ndarray, "B 5 3"]
+    knuckles: Float[np.ndarray, "B 5 3"]
+    radii: Float[np.ndarray, "B 5 4"]
+    frames: Float[np.ndarray, "B 5 4 4"]
+    """`T_wrist_bone` of each digit's first bone at zero angles."""
 
+    @classmethod
+    def of(cls, shapes: Sequence[HandShape]) -> Self:
+        """The measures of some hands, whatever their sides."""
+        frames = np.tile(np.eye(4), (len(shapes), len(DIGITS), 1, 1))
+        frames[..., :3, :3] = euler_matrix(np.stack([shape.base_angles for shape in shapes]))
+        frames[..., :3, 3] = knuckles = np.stack([shape.knuckles for shape in shapes])
+        return cls(
+            np.array([shape.breadth for shape in shapes]),
+            np.array([shape.palm_thickness for shape in shapes]),
+            np.stack([shape.bone_lengths for shape in shapes]),
+            knuckles,
+            np.stack([shape.radii for shape in shapes]),
+            frames,
+        )
 
-def first_scales() -> CageScales:
-    """Factors that suit the mean hand."""
-    rings = [np.full(len(THUMB_RINGS if digit == 0 else FINGER_RINGS), 1.2) for digit in range(len(DIGITS))]
-    return CageScales(rings, np.zeros(len(DIGITS)), 1.1, 1.1)
+    def ring_girths(self) -> Float[np.ndarray, "B R"]:
+        """Girth of the skin at each ring [m]: a little more at the joints, a little less between them."""
+        girths = []
+        for digits, names in _GROUPS:
+            waist = np.array([_WAISTS.get(name, 1.0) for name in names])
+            radii = self._radius_at(digits, self._ring_distances(digits))
+            girths.append((2.0 * np.pi * waist * radii).reshape(len(radii), -1))
+        return np.concatenate(girths, axis=1)
 
+    def cage_parts(self, topology: CageTopology) -> Float[np.ndarray, "3 B K 3"]:
+        """The cage is affine in its scales: vertices in the wrist frame [m] at zero, per width, per depth.
 
-def ring_distances(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
-    """Distance of each ring from the digit's first joint, along the straight digit [m]."""
-    first, second, third = shape.bone_lengths[digit]
-    _, radius_1, radius_2, radius_3 = shape.radii[digit]
-    joint_2, tip = first + second, first + second + third
-    after_2 = joint_2 + 0.6 * radius_2
-    distances = [
-        first - 0.75 * radius_1,
-        first,
-        first + 0.75 * radius_1,
-        joint_2 - 0.6 * radius_2,
-        after_2,
-        np.clip(tip - radius_3, after_2 + 0.35 * (tip - after_2), after_2 + 0.6 * (tip - after_2)),
-        after_2 + 0.88 * (tip - after_2),
-    ]
-    return np.array([0.5 * first, *distances] if digit == 0 else distances)
+        Width scales rings and the palm's breadth; depth pushes the last rings out and scales the palm's
+        thickness.
+        """
+        wide, deep = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        cages = np.empty((len(self.breadth), 3, topology.num_vertices, 3))
+        cages[:, :, topology.palm] = self._palm(wide, deep)
+        for digits, names in _GROUPS:
+            distances = self._ring_distances(digits)[:, None]  # (B, 1, D, R)
+            sections = np.array([_SECTIONS[name] for name in names])
+            sections[:-2] += _PALMWARD
+            radii = self._radius_at(digits, distances[:, 0])[:, None] * wide[:, None, None]  # (B, 3, D, R)
+            along = np.repeat(distances, 3, axis=1)
+            along[..., -1] += deep[:, None]
+            rings = np.stack(topology.rings[digits])
+            cages[:, :, rings] = self._around(digits, along[..., None], sections * radii[..., None, None])
+        self._shape_thumb_base(cages, topology)
+        parts = cages.swapaxes(0, 1)
+        parts[1:] -= parts[0].copy()
+        return parts
 
+    def _ring_distances(self, digits: slice) -> NDArray[np.float64]:
+        """Distance of each ring from its digit's first joint (B, D, R), along straight digits [m]."""
+        first, second, third = np.moveaxis(self.bone_lengths[:, digits], -1, 0)
+        _, radius_1, radius_2, radius_3 = np.moveaxis(self.radii[:, digits], -1, 0)
+        joint_2, tip = first + second, first + second + third
+        after_2 = joint_2 + 0.6 * radius_2
+        distances = [
+            first - 0.75 * radius_1,
+            first,
+            first + 0.75 * radius_1,
+            joint_2 - 0.6 * radius_2,
+            after_2,
+            np.clip(tip - radius_3, after_2 + 0.35 * (tip - after_2), after_2 + 0.6 * (tip - after_2)),
+            after_2 + 0.88 * (tip - after_2),
+        ]
+        return np.stack([0.5 * first, *distances] if digits == _THUMB else distances, axis=-1)
 
-def ring_girths(shape: HandShape, digit: int) -> Float[np.ndarray, " R"]:
-    """Girth of the skin at each ring [m]: a little more at the joints, a little less between them."""
-    names = THUMB_RINGS if digit == 0 else FINGER_RINGS
-    waist = np.array([_WAISTS.get(name, 1.0) for name in names])
-    girths: np.ndarray = 2.0 * np.pi * waist * radius_at(shape, digit, ring_distances(shape, digit))
-    return girths
+    def _radius_at(self, digits: slice, distances: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Skin radius [m] at distances (B, D, R) along digits: straight between the shape's four radii."""
+        first, second, third = np.moveaxis(self.bone_lengths[:, digits], -1, 0)
+        radii = self.radii[:, digits]
+        knots = np.stack(
+            [np.zeros_like(first), first, first + second, first + second + third - radii[..., 3]], axis=-1
+        )
+        slopes = np.diff(radii) / np.diff(knots)
+        between = radii[..., :1]
+        for part in range(3):
+            start = knots[..., part, None]
+            line = slopes[..., part, None] * (distances - start) + radii[..., part, None]
+            between = np.where(distances >= start, line, between)
+        result: NDArray[np.float64] = np.where(distances >= knots[..., 3:], radii[..., 3:], between)
+        return result
 
+    def _around(
+        self, digits: slice, distances: NDArray[np.float64], offsets: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Points at `offsets` (B, S, D, ..., 2) (y, z) [m] from digits' axes, `distances` along them."""
+        along = np.broadcast_to(distances, offsets.shape[:-1])
+        local = np.concatenate([along[..., None], offsets], axis=-1)
+        frames = self.frames[:, None, digits]
+        flat = local.reshape(*local.shape[:3], -1, 3) @ frames[..., :3, :3].swapaxes(-1, -2)
+        points: NDArray[np.float64] = (flat + frames[..., None, :3, 3]).reshape(local.shape)
+        return points
 
-def radius_at(shape: HandShape, digit: int, distances: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
-    """Skin radius [m] at distances along a digit: straight between the shape's four radii."""
-    first, second, third = shape.bone_lengths[digit]
-    radii = shape.radii[digit]
-    knots = [0.0, first, first + second, first + second + third - radii[3]]
-    radius: np.ndarray = np.interp(distances, knots, radii)
-    return radius
+    def _palm(self, wide: NDArray[np.float64], deep: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The palm's rows (B, 3, 8, 18, 3) at three scales of breadth and thickness [m]."""
+        count = len(self.breadth)
+        wrist = np.zeros((count, 1, 4, 3))
+        wrist[..., 1] = _WRIST_COLUMNS * self.breadth[:, None, None]
+        wrist[..., 2] = _CARPUS_RISE * self.palm_thickness[:, None, None]
+        knuckles = self.knuckles[:, None, 1:]
+        along = np.clip(_ROW_POSITIONS, 0.0, 1.0)[:, None, None]
+        centers = (1.0 - along) * wrist + along * knuckles  # (B, 6, 4, 3)
+        centers[..., 0] = _ROW_POSITIONS[:, None] * np.where(
+            _ROW_POSITIONS[:, None] < 0.0, knuckles[:, :, 1:2, 0], knuckles[..., 0]
+        )
+        columns = np.empty((count, 1, 6, 9, 3))
+        columns[:, 0, :, 1::2] = centers
+        columns[:, 0, :, 2:-1:2] = 0.5 * (centers[:, :, :-1] + centers[:, :, 1:])
+        columns[..., 0, :], columns[..., 8, :] = columns[..., 1, :], columns[..., 7, :]
+        columns = np.repeat(columns, 3, axis=1)
+        edges = _EDGES * self.breadth[:, None, None, None] * wide[:, None, None]  # (B, 3, 2, 6)
+        columns[..., 0, 1] += edges[:, :, 0]
+        columns[..., 8, 1] -= edges[:, :, 1]
+        thickness = (self.palm_thickness[:, None] * deep)[..., None, None]
+        rows = np.empty((count, 3, NUM_ROWS, AROUND, 3))
+        rows[:, :, :6, :9], rows[:, :, :6, 9:] = columns, columns[..., ::-1, :]
+        rows[:, :, :6, :9, 2] += (_HEIGHTS + _ARCH[:, None]) * thickness
+        rows[:, :, :6, 9:, 2] -= _DEPTHS[:, ::-1] * thickness
+        past = np.repeat(0.7 * self.radii[:, 1:, :1], 6, axis=2)
+        rows[:, :, PAST_KNUCKLES] = self._finger_bases(past, 0.12)
+        rows[:, :, WEB] = self._finger_bases(_WEB_DISTANCES * self.bone_lengths[:, 1:, :1], 0.0)
+        return rows
 
+    def _finger_bases(self, distances: NDArray[np.float64], deepen: float) -> NDArray[np.float64]:
+        """A palm row (B, 1, 18, 3) across the fingers, `distances` (B, 4, 6) [m] past their first joints.
 
-def digit_frames(shape: HandShape) -> Float[np.ndarray, "5 4 4"]:
-    """`T_wrist_bone` of each digit's first bone on the right hand at zero angles."""
-    return build_skeleton(shape.with_side("right")).rest_transforms()[1::3]
+        Neighbors share their sides.
+        """
+        radius = 1.2 * self._radius_at(_FINGERS, distances)
+        section = (_ROUND + _PALMWARD) * radius[..., None]
+        section[..., 3:, 1] -= deepen * radius[..., 3:]
+        bases = self._around(_FINGERS, distances[:, None], section[:, None])
+        row, shared = np.zeros((len(distances), 1, AROUND, 3)), np.zeros(AROUND)
+        for finger in range(len(DIGITS) - 1):
+            slots = finger_slots(finger)
+            row[:, :, slots] += bases[:, :, finger]
+            shared[slots] += 1.0
+        return row / shared[:, None]
 
+    def _shape_thumb_base(self, cages: NDArray[np.float64], topology: CageTopology) -> None:
+        """Thenar muscle and first web: the palm's rows around the thumb's metacarpal, in the thumb's frame.
 
-def _around(frame: Float[np.ndarray, "4 4"], distance: ArrayLike, offsets: np.ndarray) -> np.ndarray:
-    """Points at `offsets` (..., 2) (y, z) [m] from a digit's axis, `distance` (...) [m] along it."""
-    along = np.broadcast_to(np.asarray(distance, dtype=np.float64), offsets.shape[:-1])
-    local = np.concatenate([along[..., None], offsets], axis=-1)
-    points: np.ndarray = local @ frame[:3, :3].T + frame[:3, 3]
-    return points
-
-
-def cage_vertices(
-    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], topology: CageTopology, scales: CageScales
-) -> Float[np.ndarray, "K 3"]:
-    """Cage vertices of a right hand in the wrist frame [m]; `frames` as `digit_frames` gives them."""
-    vertices = np.empty((topology.num_vertices, 3))
-    vertices[topology.palm] = _palm(shape, frames, scales)
-    for digit, rings in enumerate(topology.rings):
-        names = THUMB_RINGS if digit == 0 else FINGER_RINGS
-        distances = ring_distances(shape, digit)
-        sections = np.array([_SECTIONS[name] for name in names])
-        sections[:-2] += _PALMWARD
-        sections = sections * (radius_at(shape, digit, distances) * scales.rings[digit])[:, None, None]
-        distances[-1] += scales.tips[digit]
-        vertices[rings] = _around(frames[digit], distances[:, None], sections)
-    _shape_thumb_base(shape, frames, vertices, topology)
-    return vertices
-
-
-def _palm(
-    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], scales: CageScales
-) -> Float[np.ndarray, "8 18 3"]:
-    rows = np.empty((NUM_ROWS, AROUND, 3))
-    wrist = np.zeros((4, 3))
-    wrist[:, 1] = _WRIST_COLUMNS * shape.breadth
-    wrist[:, 2] = _CARPUS_RISE * shape.palm_thickness
-    knuckles = shape.knuckles[1:]
-    along = np.clip(_ROW_POSITIONS, 0.0, 1.0)[:, None, None]
-    centers = (1.0 - along) * wrist + along * knuckles
-    centers[..., 0] = _ROW_POSITIONS[:, None] * np.where(
-        _ROW_POSITIONS[:, None] < 0.0, knuckles[1, 0], knuckles[:, 0]
-    )
-    columns = np.empty((6, 9, 3))
-    columns[:, 1::2] = centers
-    columns[:, 2:-1:2] = 0.5 * (centers[:, :-1] + centers[:, 1:])
-    edges = _EDGES * shape.breadth * scales.breadth
-    columns[:, 0], columns[:, 8] = columns[:, 1], columns[:, 7]
-    columns[:, 0, 1] += edges[0]
-    columns[:, 8, 1] -= edges[1]
-    thickness = shape.palm_thickness * scales.thickness
-    rows[:6, :9], rows[:6, 9:] = columns, columns[:, ::-1]
-    rows[:6, :9, 2] += (_HEIGHTS + _ARCH[:, None]) * thickness
-    rows[:6, 9:, 2] -= _DEPTHS[:, ::-1] * thickness
-    past = np.repeat(0.7 * shape.radii[1:, :1], 6, axis=1)
-    rows[PAST_KNUCKLES] = _finger_bases(shape, frames, past, 0.12)
-    rows[WEB] = _finger_bases(shape, frames, _WEB_DISTANCES * shape.bone_lengths[1:, :1], 0.0)
-    return rows
-
-
-def _finger_bases(
-    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], distances: Float[np.ndarray, "4 6"], deepen: float
-) -> Float[np.ndarray, "18 3"]:
-    """A palm row across the fingers, `distances` [m] past their first joints; neighbors share their sides."""
-    row = np.zeros((AROUND, 3))
-    shared = np.zeros(AROUND)
-    for finger, distance in enumerate(distances):
-        digit, slots = finger + 1, finger_slots(finger)
-        radius = 1.2 * radius_at(shape, digit, distance)
-        section = (_ROUND + _PALMWARD) * radius[:, None]
-        section[3:, 1] -= deepen * radius[3:]
-        row[slots] += _around(frames[digit], distance, section)
-        shared[slots] += 1.0
-    return row / shared[:, None]
-
-
-def _shape_thumb_base(
-    shape: HandShape, frames: Float[np.ndarray, "5 4 4"], vertices: np.ndarray, topology: CageTopology
-) -> None:
-    """Thenar muscle and first web: the palm's rows around the thumb's metacarpal, in the thumb's frame."""
-    length, radius = shape.bone_lengths[0, 0], shape.radii[0, 0]
-    moved = topology.palm[_THUMB_BASE_ROWS, _THUMB_BASE_COLUMNS]
-    along, across, share = np.split(_THUMB_BASE, [1, 3], axis=1)
-    targets = _around(frames[0], along[:, 0] * length, radius * across)
-    vertices[moved] = (1.0 - share) * vertices[moved] + share * targets
-    ring = topology.rings[0][0]
-    section = np.array([[1.02, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.2, -1.0], [0.95, -0.62]])
-    along = np.array([0.55, 0.5, 0.55, 0.72, 0.77, 0.67]) * length
-    vertices[ring] = _around(frames[0], along, 1.12 * radius * section)
+        Args:
+            cages: Vertices (B, 3, K, 3) [m], changed in place.
+            topology: Of the cage.
+        """
+        length, radius = self.bone_lengths[:, None, :1, :1], self.radii[:, None, :1, :1]
+        moved = topology.palm[_THUMB_BASE_ROWS, _THUMB_BASE_COLUMNS]
+        along, across, share = np.split(_THUMB_BASE, [1, 3], axis=1)
+        targets = self._around(_THUMB, along[:, 0] * length, radius[..., None] * across)[:, :, 0]
+        cages[:, :, moved] = (1.0 - share) * cages[:, :, moved] + share * targets
+        section = np.array([[1.02, 0.6], [0.0, 1.1], [-1.1, 0.7], [-1.4, -0.6], [0.2, -1.0], [0.95, -0.62]])
+        along = np.array([0.55, 0.5, 0.55, 0.72, 0.77, 0.67]) * length
+        ring = self._around(_THUMB, along, (1.12 * radius)[..., None] * section)
+        cages[:, :, topology.rings[0][0]] = ring[:, :, 0]

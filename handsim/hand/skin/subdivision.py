@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Int
 from scipy import sparse
@@ -50,13 +52,16 @@ def catmull_clark(
     return sparse.csr_array(sparse.vstack([vertex_points, edge_points, faces])), new_quads
 
 
-def subdivided_loop(
-    loop: Int[np.ndarray, " K"], quads: Int[np.ndarray, "Q 4"], num_vertices: int
-) -> np.ndarray:
-    """The 2 K vertices that a closed loop of edges passes through after one `catmull_clark` step."""
+def subdivided_loops(
+    loops: Sequence[Int[np.ndarray, "K"]], quads: Int[np.ndarray, "Q 4"], num_vertices: int
+) -> list[Int[np.ndarray, "2*K"]]:
+    """The vertices that each closed loop of edges passes through after one `catmull_clark` step."""
     edges, _ = edge_table(quads)
-    number = {(int(a), int(b)): index for index, (a, b) in enumerate(edges)}
-    result = []
-    for first, second in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
-        result += [first, num_vertices + number[min(first, second), max(first, second)]]
-    return np.array(result)
+    number = {(a, b): num_vertices + index for index, (a, b) in enumerate(edges.tolist())}
+    results = []
+    for loop in loops:
+        result = []
+        for first, second in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
+            result += [first, number[min(first, second), max(first, second)]]
+        results.append(np.array(result))
+    return results

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
-from handsim.hand.skin.cage import CageScales, cage_vertices, digit_frames, first_scales, ring_girths
+from handsim.hand.skin.cage import CageHands
 from handsim.hand.skin.cage_topology import (
     KNUCKLES,
     METACARPUS,
@@ -19,9 +20,8 @@ from handsim.hand.skin.cage_topology import (
     dorsal,
     palmar,
 )
-from handsim.hand.skin.subdivision import catmull_clark, subdivided_loop
+from handsim.hand.skin.subdivision import catmull_clark, subdivided_loops
 from handsim.hand.skin.weights import cage_weights, strongest_weights
-from handsim.hand.topology import DIGITS
 from handsim.kernels.kernel import kernel
 from handsim.space.transforms import MIRROR
 
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _LEVELS: Final = 2
 _FIT_STEPS: Final = 4
+_FIRST_RING, _FIRST_PALM = 1.2, 1.1  # scales that suit the mean hand
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +71,7 @@ def _template() -> _Template:
     subdivide = sparse.eye_array(count, format="csr")
     for _ in range(_LEVELS):
         step, next_quads = catmull_clark(quads, count)
-        loops = [subdivided_loop(loop, quads, count) for loop in loops]
+        loops = subdivided_loops(loops, quads, count)
         subdivide = step @ subdivide
         quads, count = next_quads, step.shape[0]
     children = np.arange(len(quads)).reshape(len(topology.quads), -1)  # a quad's four follow one another
@@ -92,48 +93,52 @@ def build_surface(shape: HandShape) -> HandSurface:
     Subdivision shrinks, so the cage is enlarged until the skin has the shape's girths, lengths, breadth and
     palm thickness. A left hand is the exact mirror image of the right one.
     """
-    template = _template()
-    vertices, faces = template.subdivide @ _fitted_cage(shape, template), template.faces
+    template, vertices = _template(), rest_vertices([shape])[0]
+    faces = template.faces
     if shape.side == "left":
         vertices, faces = vertices @ MIRROR, faces[:, ::-1]
     return HandSurface(vertices, faces, template.bone_indices, template.bone_weights)
 
 
-def _fitted_cage(shape: HandShape, template: _Template) -> np.ndarray:
-    """Cage vertices after a few corrections of their scales by the ratio of expected and measured size."""
-    topology, frames, first = template.topology, digit_frames(shape), first_scales()
-    still, wide, deep = _cage_parts(shape, frames, topology)
+def rest_vertices(shapes: Sequence[HandShape]) -> Float[np.ndarray, "B V 3"]:
+    """Vertices of the skins of hands as right hands, as in `build_surface` [m]; many cost little more."""
+    template = _template()
+    return _subdivided(template.subdivide, _fitted_cages(CageHands.of(shapes), template))
+
+
+def _subdivided(matrix: sparse.csr_array, cages: np.ndarray) -> np.ndarray:
+    """Rows of the subdivision of each cage (B, K, 3): (B, R, 3)."""
+    count = len(cages)
+    rows = matrix @ cages.swapaxes(0, 1).reshape(-1, 3 * count)
+    return np.ascontiguousarray(rows.reshape(-1, count, 3).swapaxes(0, 1))
+
+
+def _fitted_cages(hands: CageHands, template: _Template) -> np.ndarray:
+    """Cage vertices (B, K, 3) after a few corrections of their scales by expected over measured sizes."""
+    topology, count = template.topology, len(hands.breadth)
+    still, wide, deep = hands.cage_parts(topology)
     palm, on_ring = topology.palm.size, topology.rings[0].shape[1]
-    sideways = np.concatenate([np.full(palm, first.breadth), np.concatenate(first.rings).repeat(on_ring)])
-    upwards = np.concatenate([np.full(palm, first.thickness), np.zeros(len(still) - palm)])
-    rings = sideways[palm:].reshape(-1, on_ring)  # a view
+    sideways, upwards = np.full((2, count, topology.num_vertices), _FIRST_PALM)
+    sideways[:, palm:], upwards[:, palm:] = _FIRST_RING, 0.0
+    rings = sideways[:, palm:].reshape(count, -1, on_ring)  # a view
     tip_rings = np.cumsum([len(digit) for digit in topology.rings]) - 1
     outermost = np.array([digit[-1] for digit in topology.rings])
-    girths = np.concatenate([ring_girths(shape, digit) for digit in range(len(DIGITS))])
+    girths, reach = hands.ring_girths(), hands.bone_lengths.sum(axis=2)
     for _ in range(_FIT_STEPS):
-        points = template.measured @ (still + sideways[:, None] * wide + upwards[:, None] * deep)
-        loops = points[template.ring_loops]
-        rings *= (girths / np.linalg.norm(loops - np.roll(loops, 1, axis=1), axis=-1).sum(axis=1))[:, None]
-        rings[tip_rings] = rings[tip_rings - 1]
-        ahead = np.einsum("dni,di->dn", points[template.tips] - frames[:, None, :3, 3], frames[:, :3, 0])
-        upwards[outermost] += (shape.bone_lengths.sum(axis=1) - ahead.max(axis=1))[:, None]
-        sideways[:palm] *= shape.breadth / np.ptp(points[template.knuckle_loop, 1])
-        upwards[:palm] *= -shape.palm_thickness / np.diff(points[template.back_and_palm, 2])
-    cage: np.ndarray = still + sideways[:, None] * wide + upwards[:, None] * deep
-    return cage
-
-
-def _cage_parts(shape: HandShape, frames: np.ndarray, topology: CageTopology) -> np.ndarray:
-    """The cage is affine in its scales: vertices (3, K, 3) [m] at zero, per width, per depth."""
-
-    def scaled(wide: float, deep: float) -> np.ndarray:
-        rings = [np.full(len(digit), wide) for digit in topology.rings]
-        return cage_vertices(
-            shape, frames, topology, CageScales(rings, np.full(len(DIGITS), deep), wide, deep)
-        )
-
-    still = scaled(0.0, 0.0)
-    return np.stack([still, scaled(1.0, 0.0) - still, scaled(0.0, 1.0) - still])
+        cages = still + sideways[..., None] * wide + upwards[..., None] * deep
+        points = _subdivided(template.measured, cages)
+        loops = points.take(template.ring_loops, axis=1)
+        around = np.linalg.norm(loops - np.roll(loops, 1, axis=2), axis=-1).sum(axis=2)
+        rings *= (girths / around)[..., None]
+        rings[:, tip_rings] = rings[:, tip_rings - 1]
+        tips = points[:, template.tips] - hands.frames[:, :, None, :3, 3]
+        ahead = np.einsum("bdni,bdi->bdn", tips, hands.frames[..., :3, 0])
+        upwards[:, outermost] += (reach - ahead.max(axis=2))[..., None]
+        across = np.ptp(points[:, template.knuckle_loop, 1], axis=1)
+        sideways[:, :palm] *= (hands.breadth / across)[:, None]
+        upwards[:, :palm] *= -hands.palm_thickness[:, None] / np.diff(points[:, template.back_and_palm, 2])
+    fitted: np.ndarray = still + sideways[..., None] * wide + upwards[..., None] * deep
+    return fitted
 
 
 def vertex_normals(

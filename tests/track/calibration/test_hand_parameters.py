@@ -58,7 +58,7 @@ def test_points_follow_the_skeleton(rng):
         return np.einsum("ml,tmli->tmi", weights, carried)
 
     jacobian = skinned_shape_jacobian(model, model.forward_kinematics(qpos), worn.points, weights)
-    here, step = skeleton_parameters(shape), 1e-6
+    here, step = skeleton_parameters([shape])[0], 1e-6
     for number, nudge in enumerate(step * np.eye(len(here))):
         quotient = (placed(here + nudge) - placed(here - nudge)) / (2 * step)
         np.testing.assert_allclose(jacobian[..., number], quotient, atol=1e-7)
@@ -66,6 +66,8 @@ def test_points_follow_the_skeleton(rng):
 
 def test_jacobian_of_a_linear_function(rng):
     shape = sample_shape(rng=rng)
-    jacobian = shape_jacobian(shape, np.zeros(NUM_PARAMETERS), lambda hand: hand.knuckles.ravel())
+    jacobian = shape_jacobian(
+        shape, np.zeros(NUM_PARAMETERS), lambda hands: np.array([hand.knuckles.ravel() for hand in hands])
+    )
     np.testing.assert_allclose(jacobian[:, 17:32], np.eye(15), atol=1e-9)
     np.testing.assert_allclose(jacobian[::3, 0], shape.knuckles[:, 0], rtol=1e-4)

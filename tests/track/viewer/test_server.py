@@ -12,7 +12,8 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from handsim.errors import ArgumentError, HandSimError
-from track.viewer.server import LOOPBACK, address_of, is_own_page, opened_server
+from track.network_address import LOOPBACK
+from track.viewer.server import address_of, is_own_page, opened_server
 
 
 def test_the_page_is_served_here_until_the_end(capsys):

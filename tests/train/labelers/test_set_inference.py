@@ -9,17 +9,33 @@ import torch
 from train.config import SetLabelerConfig
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import pad_clouds
-from train.labelers.set_inference import CloudScorer
+from train.labelers.set_inference import CloudScorer, _centers, weight_shapes
 from train.labelers.set_labeler import TrainedSetLabeler
 from train.labelers.set_network import SetLabeler
 from train.labelers.storage import load_network
 from train.simulation.held_out import held_out_markers
 
 
+def scorer(network: SetLabeler) -> CloudScorer:
+    return CloudScorer(network.config, network.numpy_weights())
+
+
+@pytest.mark.parametrize("config", [SetLabelerConfig(), SetLabelerConfig(depth=2, gates=8, num_labels=7)])
+def test_weights_have_the_networks_names_and_shapes(config):
+    state = SetLabeler(config).state_dict()
+    assert weight_shapes(config) == {name: tuple(one.shape) for name, one in state.items()}
+
+
+@pytest.mark.parametrize("count", range(2, 40))
+def test_the_centers_are_torchs(count):
+    config = SetLabelerConfig(num_distances=count, reach=0.23)
+    np.testing.assert_array_equal(_centers(config), SetLabeler(config).centers.numpy())
+
+
 def compare(network: SetLabeler, points: np.ndarray) -> None:
     with torch.inference_mode():
         expected = network(*(torch.from_numpy(part) for part in pad_clouds([points])))
-    for mine, theirs in zip(CloudScorer(network).score(points), expected, strict=True):
+    for mine, theirs in zip(scorer(network).score(points), expected, strict=True):
         np.testing.assert_allclose(mine, theirs[0].numpy(), atol=1e-4)
 
 
@@ -41,7 +57,7 @@ def test_huge_scores_do_not_overflow(rng):
         for weight in network.parameters():
             weight.mul_(30.0)
     with np.errstate(over="raise", invalid="raise"):
-        for scores in CloudScorer(network.eval()).score(rng.uniform(-0.1, 0.1, (9, 3))):
+        for scores in scorer(network.eval()).score(rng.uniform(-0.1, 0.1, (9, 3))):
             assert np.isfinite(scores).all()
 
 

@@ -86,7 +86,7 @@ def test_a_pose_prior_of_another_glove_is_told(tmp_path):
 def test_weights_without_a_pose_prior_are_read(tmp_path):
     tensors = load_file(_SHIPPED / "dense19.safetensors")
     write(tmp_path, SHIPPED, {name: one for name, one in tensors.items() if "pose_prior" not in name})
-    assert load_labeler(tmp_path).network.prior is None
+    assert load_labeler(tmp_path).prior is None
 
 
 def header(content: bytes) -> dict:

@@ -19,7 +19,7 @@ TIP, PIP = LAYOUT.names.index("RingTip"), LAYOUT.names.index("PinkyTip")
 
 @pytest.fixture(scope="module")
 def prior():
-    return load_labeler("dense19").network.prior
+    return load_labeler("dense19").prior
 
 
 def hand(rng):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from handsim.hand.skin.subdivision import catmull_clark, edge_table, subdivided_loop
+from handsim.hand.skin.subdivision import catmull_clark, edge_table, subdivided_loops
 
 CUBE = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -40,7 +40,7 @@ def test_affine_maps_commute_with_subdivision():
 
 def test_loop_runs_along_edges_of_the_new_mesh():
     matrix, quads = catmull_clark(CUBE, 8)
-    loop = subdivided_loop(np.array([0, 1, 3, 2]), CUBE, 8)
+    (loop,) = subdivided_loops([np.array([0, 1, 3, 2])], CUBE, 8)
     assert len(loop) == 8 and len(set(loop.tolist())) == 8
     edges = {tuple(edge) for edge in edge_table(quads)[0].tolist()}
     for first, second in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):

@@ -1,0 +1,445 @@
+"""Every speed that pages quote, in one run, each also in a unit that the machine gave a moment before.
+
+    OPENBLAS_NUM_THREADS=1 MUJOCO_GL=egl python -m benchmarks.speed
+        [--only tracker labels ...] [--seeds 0 1 2 3 4] [--cnn RUN] [--quick] [--save speed]
+
+The unit is the time of 1,000 calls of MuJoCo's `mj_kinematics` on our hand, measured anew before each
+section: where another machine or another hour has another unit, compare figures in units. Times are the
+median, the 99th percentile and the longest over all seeds.
+
+tracker: a frame with two hands, for each kind of capture, of the true hands and of hands calibrated as users
+    calibrate them; of hand-hand with a new ID for every point in every frame; a frame in which both hands are
+    initialized, and the longest of five frames after a second of darkness.
+labels: one hand with drops and ghosts, alone and in batches; of a glove without weights, and learning it.
+paper: the same by the paper's network (trained, with --cnn), and its images.
+commands: `handsim label` and `handsim track` of captures of 24 and 1,200 frames, and `handsim label --help`.
+training: images that the paper's network learns from, alone and beside a busy process.
+pictures: 640 x 480 of two hands, in one process and in one a core, and written; the stream of training
+    pictures; a plain pyrender loop and MuJoCo's renderer.
+generation: training frames of single hands and of the default mix.
+solvers: a pose from the frame before by our solver, MuJoCo's Jacobian in numpy, SciPy and mink, from nothing,
+    and from eight starts.
+rays: lines of sight past a hand by our kernel and by `mj_multiRay`.
+
+Run it where nothing else runs. --quick tries every part with a few frames and one seed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import multiprocessing
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import mujoco
+import numpy as np
+import torch
+
+from benchmarks import inverse_kinematics, rendering
+from benchmarks.agreement import blocked_rays
+from benchmarks.paper.take_evaluation import nominal_users, seen_frame, true_users
+from benchmarks.paper.trials import hide_points
+from benchmarks.record import Figures, add_save, describe, save_figures
+from benchmarks.tracking import calibrated_users, labeler, twin
+from gloves.attachment import attach_markers
+from gloves.captures.formats import write_capture
+from gloves.fit import GloveFit
+from gloves.layout import load_layout
+from gloves.optics.visibility import free_rays
+from gloves.takes.take import Take
+from handsim.hand.model import HandModel, join_qpos
+from handsim.space.cameras import named_rig
+from poses.shapes.validity import sample_valid_angles
+from track.setup import warm_up
+from track.tracker import Tracker
+from train.config import CNNConfig, batch_recipe, default_config
+from train.data.augmentation import Corruption, corrupt
+from train.data.batches import draw_batch
+from train.data.shards import Dataset
+from train.devices.fabric_start import start_fabric
+from train.glove_labeler import load_labeler
+from train.labelers.kinds import labeler_of, new_network
+from train.labelers.onnx_labeler import OnnxLabeler, export_onnx
+from train.labelers.protocol import Labeler
+from train.labelers.storage import load_network
+from train.simulation.dataset_config import DatasetConfig
+from train.simulation.frame_scenes import SceneMix
+from train.simulation.generation import make_dataset
+from train.simulation.held_out import held_out_markers
+from train.simulation.room_settings import KINDS
+from train.simulation.takes import simulate_take
+from train.threads import TrainingThreads
+from train.training_state import TrainingState
+
+NEW_GLOVE: Final = Path(__file__).parents[1] / "examples" / "ten_markers.toml"
+WARM_UP: Final = 30  # frames of a tracker that do not count
+BEFORE, DARK, AFTER = 60, 120, 5  # frames around a second of darkness
+CORES: Final = os.cpu_count() or 1
+COMMAND: Final = "import sys; from handsim.cli.main import main; sys.exit(main())"
+
+
+class Speeds:
+    """What is measured: printed, and kept as figures."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.seeds: list[int] = options.seeds[:1] if options.quick else options.seeds
+        self.cnn: Path | None = options.cnn
+        self._quick: bool = options.quick
+        self.figures: Figures = {}
+        self._unit = unit()
+        self._units = [self._unit]
+
+    def some(self, full: int, few: int) -> int:
+        """A number of frames, or of other things: all, or a few for a try."""
+        return few if self._quick else full
+
+    def begin(self, section: str) -> None:
+        """Measure the unit for a section."""
+        self._unit = unit()
+        self._units.append(self._unit)
+        what = "1,000 calls of mj_kinematics before each section, least and most [ms]"
+        self.figures["unit"] = (what, [1e3 * min(self._units), 1e3 * max(self._units)])
+        print(f"\n{section}; the unit is {1e3 * self._unit:.2f} ms", flush=True)
+
+    def times(self, key: str, what: str, seconds: Sequence[float]) -> None:
+        """Keep the distribution of a time [s]."""
+        milliseconds = 1e3 * np.asarray(seconds)
+        row = [*np.quantile(milliseconds, [0.5, 0.99, 1.0]), np.median(seconds) / self._unit]
+        self.figures[key] = (f"{what}: median, 99th percentile, longest [ms]; median in units", row)
+        shown = "{:9.3f} {:9.3f} {:9.3f} ms {:9.4f} units".format(*row)
+        print(f"  {what:66s} {shown}", flush=True)
+
+    def rate(self, key: str, what: str, per_second: float) -> None:
+        """Keep how many of something are made in a second."""
+        row = [per_second, per_second * self._unit]
+        self.figures[key] = (f"{what}: in a second; in a unit", row)
+        print(f"  {what:66s} {row[0]:12.1f} /s {row[1]:9.4f} /unit", flush=True)
+
+
+def unit() -> float:
+    """Time of 1,000 calls of `mj_kinematics` on our hand [s]."""
+    model = HandModel.named("M").mj_model
+    data = mujoco.MjData(model)
+    data.qpos[7:] = 0.3
+    return float(np.median([timed(lambda: [mujoco.mj_kinematics(model, data) for _ in range(1000)])
+                            for _ in range(15)]))  # fmt: skip
+
+
+def timed(job: Callable[[], object]) -> float:
+    """Time of a job [s]."""
+    start = time.perf_counter()
+    job()
+    return time.perf_counter() - start
+
+
+def each_time(job: Callable[[np.ndarray], object], inputs: Sequence[np.ndarray]) -> list[float]:
+    """Time of a job on each input [s], after a tenth of them to warm up."""
+    for one in inputs[: len(inputs) // 10 + 1]:
+        job(one)
+    return [timed(functools.partial(job, one)) for one in inputs]
+
+
+def tracker(speeds: Speeds) -> None:
+    takes = {kind: [twin(kind, speeds.some(1200, 120), seed) for seed in speeds.seeds] for kind in KINDS}
+    for kind, some in takes.items():
+        warm_up(nominal_users(some[0]), labeler())
+        key = kind.replace("-", "_")
+        true = [follow(take, true_users(take)) for take in some]
+        speeds.times(f"{key}_true", f"a frame of {kind}, two true hands", np.concatenate(true))
+        calibrated = [
+            follow(take, calibrated_users(take, seed, speeds.some(40, 12)))
+            for seed, take in zip(speeds.seeds, some, strict=True)
+        ]
+        what = f"a frame of {kind}, two calibrated hands"
+        speeds.times(f"{key}_calibrated", what, np.concatenate(calibrated))
+    fresh = [follow(take, true_users(take), fresh=True) for take in takes["hand-hand"]]
+    speeds.times("fresh_ids", "a frame of hand-hand, every ID new in every frame", np.concatenate(fresh))
+    every = [take for some in takes.values() for take in some]
+    count = speeds.some(25, 5)
+    starts = [first_frame(take, at) for take in every for at in spread(take.num_frames, count)]
+    speeds.times("initialization", "a frame in which both hands are initialized", starts)
+    after = [
+        longest_after_darkness(take, at)
+        for take in every
+        if take.num_frames >= BEFORE + DARK + AFTER
+        for at in spread(take.num_frames - BEFORE - DARK - AFTER + 1, speeds.some(10, 2))
+    ]
+    if after:
+        speeds.times("recovery", f"the longest of {AFTER} frames after a second of darkness", after)
+
+
+def spread(end: int, count: int) -> list[int]:
+    """So many numbers below an end, evenly apart."""
+    return np.linspace(0, end - 1, count).astype(int).tolist()
+
+
+def follow(take: Take, users: Sequence[GloveFit], *, fresh: bool = False) -> list[float]:
+    """Time of each frame of a take [s]; with `fresh` every point has a new ID in every frame."""
+    tracking, lap, times = Tracker(users, labeler()), int(take.ids.max()) + 1, []
+    for number in range(take.num_frames):
+        seen = seen_frame(take, number)
+        ids = seen.ids + number * lap if fresh else seen.ids
+        times.append(timed(functools.partial(tracking.step, seen.points, ids, number / take.rate)))
+    return times[WARM_UP:]
+
+
+def first_frame(take: Take, at: int) -> float:
+    """Time of a new tracker's first frame [s]."""
+    tracking, seen = Tracker(true_users(take), labeler()), seen_frame(take, at)
+    return timed(lambda: tracking.step(seen.points, seen.ids, 0.0))
+
+
+def longest_after_darkness(take: Take, at: int) -> float:
+    """The longest time of a frame [s] after a second without points."""
+    part = hide_points(take.cut(at, at + BEFORE + DARK + AFTER), BEFORE, DARK)
+    tracking, times = Tracker(true_users(take), labeler()), []
+    for number in range(part.num_frames):
+        seen = seen_frame(part, number)
+        times.append(timed(functools.partial(tracking.step, seen.points, seen.ids, number / take.rate)))
+    return max(times[-AFTER:])
+
+
+@cache
+def clouds(glove: str, count: int, seeds: tuple[int, ...]) -> list[np.ndarray]:
+    """Held-out hands [m] with the paper's drops and ghosts."""
+    found: list[np.ndarray] = []
+    for seed in seeds:
+        markers = held_out_markers(glove, count, seed=seed)
+        cloud = corrupt(markers, Corruption(), rng=np.random.default_rng(seed))
+        found += [points[here] for points, here in zip(cloud.points, cloud.present, strict=True)]
+    return found
+
+
+def label(speeds: Speeds, key: str, what: str, some: Labeler, hands: list[np.ndarray]) -> None:
+    """How long a labeler takes for a hand, alone and in batches."""
+    speeds.times(key, f"one hand, {what}", each_time(lambda hand: some.label_frames([hand]), hands))
+    batches = [hands[first : first + 500] for first in range(0, len(hands), 500)]
+    per_hand = [timed(functools.partial(some.label_frames, batch)) / len(batch) for batch in batches]
+    speeds.times(f"{key}_batch", f"one hand of many, {what}", per_hand)
+
+
+def exported(network: torch.nn.Module, names: tuple[str, ...], folder: str) -> OnnxLabeler:
+    """A network as others get it."""
+    path = Path(folder) / "labeler.onnx"
+    export_onnx(network, names, path)
+    return OnnxLabeler(path)
+
+
+def labels(speeds: Speeds) -> None:
+    hands = clouds("dense19", speeds.some(1000, 50), tuple(speeds.seeds))
+    label(speeds, "set", "set labeler", load_labeler("dense19"), hands)
+    network, card = load_network("dense19")
+    with tempfile.TemporaryDirectory() as folder:
+        onnx = exported(network, tuple(card["marker_names"]), folder)
+        label(speeds, "set_onnx", "set labeler, onnxruntime", onnx, hands)
+        before = os.environ.get("XDG_CACHE_HOME")
+        os.environ["XDG_CACHE_HOME"] = folder  # where nothing was learned before
+        try:
+            start = time.perf_counter()
+            learned = load_labeler(NEW_GLOVE, "any-layout")
+            took = time.perf_counter() - start
+            speeds.times("new_glove_learned", "learning a glove without weights", [took])
+        finally:
+            os.environ.pop("XDG_CACHE_HOME")
+            if before is not None:
+                os.environ["XDG_CACHE_HOME"] = before
+    hands = clouds(str(NEW_GLOVE), speeds.some(300, 20), tuple(speeds.seeds))
+    label(speeds, "new_glove", "a glove without weights", learned, hands)
+
+
+def paper(speeds: Speeds) -> None:
+    hands = clouds("dense19", speeds.some(100, 10), tuple(speeds.seeds))
+    network = new_network(CNNConfig()) if speeds.cnn is None else load_network(speeds.cnn)[0]
+    names = load_layout("dense19").names
+    how = "untrained, so that it tries every view" if speeds.cnn is None else "trained"
+    with tempfile.TemporaryDirectory() as folder:
+        onnx = exported(network, names, folder)
+        label(speeds, "cnn_onnx", f"the paper's network, onnxruntime, {how}", onnx, hands)
+    label(speeds, "cnn", f"the paper's network, torch, {how}", labeler_of(network, names), hands)
+    images = torch.rand(8, 1, 52, 52)
+    with torch.inference_mode():
+        for count, key in ((1, "image"), (8, "eight_images")):
+            times = [timed(lambda: network(images[:count])) for _ in range(speeds.some(100, 5))]  # noqa: B023
+            speeds.times(key, f"the paper's network, torch, images at once: {count}", times)
+
+
+def commands(speeds: Speeds) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        runs = [["label", "--help"]]
+        for frames in (24, 1200):
+            capture = f"{folder}/{frames}.c3d"
+            write_capture(capture, simulate_take(num_frames=frames, seed=speeds.seeds[0]).capture())
+            runs += [[name, capture, "--out"] for name in ("label", "track")]
+        for words in runs:
+            times = []
+            for number in range(1 + speeds.some(7, 1)):
+                out = [f"{folder}/{number}{Path(words[1]).stem}{'.trc' if words[0] == 'label' else '.npz'}"]
+                command = [sys.executable, "-c", COMMAND, *words, *(out if words[-1] == "--out" else [])]
+                times.append(timed(lambda: subprocess.run(command, check=True, capture_output=True)))  # noqa: B023
+            frames_said = "" if words[-1] == "--help" else f" of {Path(words[1]).stem} frames"
+            shown = f"handsim {words[0]}{frames_said or ' --help'}"
+            key = "_".join([words[0], Path(words[1]).stem.strip("-")])
+            speeds.times(key, shown, times[1:])  # the first compiles
+
+
+def training(speeds: Speeds) -> None:
+    torch.set_num_threads(CORES)
+    config = default_config("cnn")
+    with tempfile.TemporaryDirectory() as folder:
+        make_dataset(DatasetConfig(num_frames=2000), Path(folder) / "set")
+        rows = Dataset(Path(folder) / "set").rows()
+        state = TrainingState(config, start_fabric(config, Path(folder)), rows)
+        rng, recipe = np.random.default_rng(0), batch_recipe(config, rows["markers"].shape[1])
+
+        def images(seconds: float) -> float:
+            """Images a second over a while."""
+            count, start = 0, time.perf_counter()
+            while time.perf_counter() - start < seconds:
+                with threads.timed_step():
+                    state.step(draw_batch(rows, recipe, rng=rng), rng=rng)
+                count += config.batch
+            return count / (time.perf_counter() - start)
+
+        def try_step() -> None:
+            state.try_step(draw_batch(rows, recipe, rng=rng), rng=rng)
+
+        threads = TrainingThreads(None, try_step)
+        with threads.in_use():
+            images(speeds.some(20, 1))
+            alone = images(speeds.some(60, 2))
+            with busy_process():
+                beside = images(speeds.some(60, 2))
+    torch.set_num_threads(1)
+    speeds.rate("training", "images learned by the paper's network", alone)
+    speeds.rate("training_beside", "the same beside a busy process", beside)
+
+
+@contextmanager
+def busy_process() -> Iterator[None]:
+    """Within the block another process computes all the time."""
+    process = multiprocessing.get_context("spawn").Process(target=compute, daemon=True)
+    process.start()
+    try:
+        yield
+    finally:
+        process.kill()
+        process.join()
+
+
+def compute() -> None:
+    """Compute without end."""
+    while True:
+        sum(range(100_000))
+
+
+def pictures(speeds: Speeds) -> None:
+    frames = speeds.some(200, 8)
+    take = rendering.a_take(frames)
+    with tempfile.TemporaryDirectory() as folder:
+        for key, (name, job) in rendering.jobs(frames, Path(folder)).items():
+            speeds.rate(key, f"pictures, {name}", rendering.rate(functools.partial(job, 0), frames))
+            if not speeds.some(0, 1):
+                many = rendering.rate_in_processes(job, CORES, frames)
+                speeds.rate(f"{key}_all", f"pictures, {name}, {CORES} processes", many)
+    for color, name in ((False, "depth"), (True, "colors")):
+        loop = functools.partial(rendering.plain_pyrender, take, color)
+        what = f"pictures, a plain pyrender loop, {name}"
+        speeds.rate(f"pyrender_{name}", what, rendering.rate(loop, frames))
+        loop = functools.partial(rendering.mujoco_loop, take, color)
+        what = f"pictures, MuJoCo's renderer, capsules without skin, {name}"
+        speeds.rate(f"mujoco_{name}", what, rendering.rate(loop, frames))
+    stream = iter(rendering.a_stream())
+    drawing = lambda: [next(stream) for _ in range(frames)]  # noqa: E731
+    size = f"{rendering.CROP} x {rendering.CROP}"
+    speeds.rate("stream", f"pictures of the stream, one hand, {size}", rendering.rate(drawing, frames))
+    batches, count = rendering.stream_batches(), -(-4 * frames // rendering.BATCH)
+    seconds = timed(lambda: [next(batches) for _ in range(count)])
+    many = count * rendering.BATCH / seconds
+    speeds.rate("stream_all", f"pictures of the stream, {CORES} workers of a DataLoader", many)
+    one = simulate_take(kind="single-hand", num_frames=frames, hands=("right",))
+    loop = functools.partial(rendering.plain_pyrender, one, True, (rendering.CROP, rendering.CROP))
+    what = f"pictures, a plain pyrender loop, one hand, {size}, colors"
+    speeds.rate("pyrender_one", what, rendering.rate(loop, frames))
+
+
+def generation(speeds: Speeds) -> None:
+    for key, name, scenes, workers in (
+        ("frames_single", "single hands", SceneMix(alone=1.0, together=0.0, holding=0.0), CORES),
+        ("frames_mix", "the default mix", SceneMix(), CORES),
+        ("frames_mix_one", "the default mix", SceneMix(), 1),
+    ):
+        with tempfile.TemporaryDirectory() as folder:
+            config = DatasetConfig(num_frames=speeds.some(100_000, 3000), scenes=scenes)
+            seconds = timed(lambda: make_dataset(config, Path(folder) / "set", workers=workers))  # noqa: B023
+        speeds.rate(key, f"training frames of {name}, workers: {workers}", config.num_frames / seconds)
+
+
+def solvers(speeds: Speeds) -> None:
+    for key, what, seconds in inverse_kinematics.times(speeds.seeds, speeds.some(300, 20)):
+        speeds.times(key, what, seconds)
+
+
+def rays(speeds: Speeds) -> None:
+    rng, model = np.random.default_rng(0), HandModel.named("M")
+    cameras, count = named_rig("figure5").positions, speeds.some(2000, 100)
+    qpos = join_qpos(sample_valid_angles(model, count, rng=rng), position=[0.0, 0.0, 1.1])
+    bones = model.forward_kinematics(qpos)
+    markers, _ = attach_markers(load_layout("dense19"), model).markers(model, bones)
+    segments, radii = model.capsules.posed(bones), model.capsules.radii
+    free_rays(markers, cameras, segments, radii)
+    lines = markers.shape[1] * len(cameras)
+    ours = np.median([timed(lambda: free_rays(markers, cameras, segments, radii)) for _ in range(5)])
+    speeds.rate("rays", "lines of sight past a hand", count * lines / float(ours))
+    data = mujoco.MjData(model.mj_model)
+
+    def by_mujoco(frames: Iterable[int]) -> None:
+        for frame in frames:
+            data.qpos[:] = qpos[frame]
+            mujoco.mj_kinematics(model.mj_model, data)
+            blocked_rays(model, data, markers[frame], cameras)
+
+    few = range(min(count, 200))
+    theirs = np.median([timed(lambda: by_mujoco(few)) for _ in range(5)])
+    what = "the same by mj_multiRay, kinematics included"
+    speeds.rate("rays_mujoco", what, len(few) * lines / float(theirs))
+
+
+SECTIONS: Final[dict[str, Callable[[Speeds], None]]] = {
+    section.__name__: section
+    for section in (tracker, labels, paper, commands, training, pictures, generation, solvers, rays)
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", nargs="+", choices=SECTIONS, default=list(SECTIONS), metavar="SECTION")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2, 3, 4])
+    parser.add_argument("--cnn", type=Path, help="folder of a trained network of the paper")
+    parser.add_argument("--quick", action="store_true", help="a try: a few frames, one seed")
+    add_save(parser)
+    options = parser.parse_args()
+    if options.save and options.quick:
+        parser.error("--quick is a try and saves nothing")
+    torch.set_num_threads(1)
+    torch.set_flush_denormal(True)
+    print(describe("mujoco", "numba", "torch"))
+    speeds = Speeds(options)
+    for name in options.only:
+        speeds.begin(name)
+        SECTIONS[name](speeds)
+    save_figures(options.save, speeds.figures)
+
+
+if __name__ == "__main__":
+    main()
