@@ -17,12 +17,12 @@ from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.cameras import named_rig
 from tests.rigs import mixed_rig
+from track.take_summary import doubts_of, frame_confidence, runs_of
 from track.user import User
 from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings.captures import CaptureRecording
 from track.viewer.recordings.datasets import DatasetRecording
-from track.viewer.recordings.recording import runs_of
-from track.viewer.recordings.takes import TakeRecording, doubts_of, frame_confidence
+from track.viewer.recordings.takes import TakeRecording
 from track.viewer.scene.rig_view import box_edges, camera_counts
 from train.data.shards import Dataset
 
