@@ -43,7 +43,7 @@ class HandFigures:
 
     @property
     def rms(self) -> Float[np.ndarray, "T"]:
-        """3D RMS of the residuals of each frame [m]; NaN where there is none."""
+        """3D RMS of the residuals of each frame [m], of a truth too; NaN where there is none."""
         known = np.isfinite(self.residuals)
         total = np.sum(np.square(self.residuals), axis=1, where=known)
         rms = np.full(len(total), np.nan)

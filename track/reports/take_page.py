@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -73,7 +73,7 @@ def write_take_page(out: Path, take: Take, *, source: str) -> tuple[Path, ...]:
         _write_rows(joints, *_joint_table(hands))
         _write_rows(markers, *_marker_table(take, hands))
         _write_rows(looks, ("first_frame", "last_frame", "start_s", "end_s", "frame", "of", "why"),
-                    [_doubt_row(take, doubt) for doubt in doubts])  # fmt: skip
+                    [map(_cell, _doubt_row(take, doubt)) for doubt in doubts])  # fmt: skip
     return paths
 
 
@@ -244,7 +244,7 @@ def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> list[list[object]]:
     rows: list[list[object]] = []
     for frame, time in enumerate(take.times.tolist()):
         for hand, count, table in zip(hands, counts, numbers, strict=True):
-            first = [frame, f"{time:.9g}", hand.side, STATUSES[hand.status[frame]], count[frame]]
+            first = [frame, _cell(time), hand.side, STATUSES[hand.status[frame]], count[frame]]
             rows.append([*first, *map(_number, table[frame])])
     return rows
 
@@ -285,7 +285,12 @@ def _number(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.6g}"
 
 
-def _write_rows(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+def _cell(value: float | str) -> str:
+    """A number with nine digits, as times need them."""
+    return value if isinstance(value, str) else f"{value:.9g}"
+
+
+def _write_rows(path: Path, header: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
