@@ -119,14 +119,14 @@ def _median_rms(rms: Float[np.ndarray, "T"]) -> list[str]:
     return [f"median RMS {1e3 * np.nanmedian(rms):.2f} mm"] if np.isfinite(rms).any() else []
 
 
-def doubts_of(take: Take, most: int = _MOST_DOUBTS) -> tuple[Doubt, ...]:
+def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
     """Spans in which a hand is lost or coasts, the longest first, then unsure labels, the worst first.
 
     A hand that has not been seen yet is not lost.
 
     Args:
         take: A tracked take; of a truth there is nothing to doubt.
-        most: The number of spans.
+        most: The largest number of spans; all when None.
     """
     found: list[tuple[float, int, Doubt]] = []
     for number, side in enumerate(take.sides):

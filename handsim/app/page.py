@@ -31,8 +31,9 @@ th, td { padding: .35rem .9rem .35rem 0; border-bottom: 1px solid var(--line); t
 th:first-child, td:first-child { text-align: left; padding-right: 2.5rem; }
 @media print {
   :root { color-scheme: light; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --line: #d9dde3; }
-  body { max-width: none; padding: 0; font-size: .8rem; } h2 { break-after: avoid; }
-  figure, tr, .card { break-inside: avoid; } thead { display: table-header-group; }
+  @page { margin: 14mm; }
+  body { max-width: none; padding: 0; font-size: .8rem; }
+  h2, h2 + p, tr:first-child { break-after: avoid; } figure, tr { break-inside: avoid; }
 }
 """
 

@@ -10,7 +10,8 @@ import tyro
 from gloves.takes.take import load_take
 from handsim.app.messages import print_line
 from handsim.files.outputs import check_outputs
-from track.reports.take_page import table_paths, write_take_page
+from track.reports.take_page import write_take_page
+from track.reports.take_tables import table_paths
 
 
 def report(take: Annotated[Path, tyro.conf.Positional], out: Path) -> None:

@@ -2,5 +2,6 @@
 
 - hand_figures: angles, residuals and presence of markers of each hand, and their statistics.
 - take_plots: the pictures: angles, residuals and presence over time.
-- take_page: the HTML page and its tables as .csv.
+- take_page: the HTML page.
+- take_tables: its tables, as .csv.
 """

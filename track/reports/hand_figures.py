@@ -7,12 +7,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
 from gloves.takes.take import INITIALIZED, LOST, Take
 from handsim.hand.topology import Side
 
-PERCENTILES: Final = (0.0, 5.0, 50.0, 95.0, 100.0)
-"""Of a range of motion: the least angle, the median, the largest, and what one frame in twenty is beyond."""
+RANGE: Final = {"least": 0.0, "5th": 5.0, "median": 50.0, "95th": 95.0, "largest": 100.0}
+"""What is told of a range of motion, as percentiles."""
 _CHUNK: Final = 4096  # frames whose bones are posed at once
 
 
@@ -34,27 +35,31 @@ class HandFigures:
     @property
     def seen(self) -> Bool[np.ndarray, "T M"]:
         """Which markers have a point."""
-        return np.isfinite(self.confidence)
+        seen: NDArray[np.bool_] = np.isfinite(self.confidence)
+        return seen
 
     @property
     def fitted(self) -> Bool[np.ndarray, "T"]:
         """Frames whose pose was fitted to points, which a coasting hand's is not."""
-        return np.asarray(self.status >= INITIALIZED)
+        fitted: NDArray[np.bool_] = self.status >= INITIALIZED
+        return fitted
 
     @property
     def rms(self) -> Float[np.ndarray, "T"]:
         """3D RMS of the residuals of each frame [m], of a truth too; NaN where there is none."""
         known = np.isfinite(self.residuals)
         total = np.sum(np.square(self.residuals), axis=1, where=known)
-        rms = np.full(len(total), np.nan)
-        np.divide(total, known.sum(axis=1), out=rms, where=known.any(axis=1))
-        return np.sqrt(rms)
+        square: NDArray[np.float64] = np.full(len(total), np.nan)
+        np.divide(total, known.sum(axis=1), out=square, where=known.any(axis=1))
+        rms: NDArray[np.float64] = np.sqrt(square)
+        return rms
 
     def range_of_motion(self) -> Float[np.ndarray, "20 5"]:
-        """`PERCENTILES` of each joint's angle over the fitted frames [deg]; NaN where there are none."""
+        """`RANGE` of each joint's angle over the fitted frames [deg]; NaN where there are none."""
         if not self.fitted.any():
-            return np.full((self.angles.shape[1], len(PERCENTILES)), np.nan)
-        return np.percentile(self.angles[self.fitted], PERCENTILES, axis=0).T
+            return np.full((self.angles.shape[1], len(RANGE)), np.nan)
+        ranges: NDArray[np.float64] = np.percentile(self.angles[self.fitted], list(RANGE.values()), axis=0)
+        return ranges.T
 
     def markers(self) -> list[MarkerFigures]:
         """What was seen of each marker, in the order of the glove."""

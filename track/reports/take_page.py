@@ -1,10 +1,9 @@
-"""The page on a take and its tables: angles, range of motion, markers, residuals, frames to look at."""
+"""The page on a take: angles, range of motion, markers, residuals, frames to look at."""
 
 from __future__ import annotations
 
-import csv
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -12,22 +11,20 @@ from typing import Final, get_args
 
 import numpy as np
 
-from gloves.takes.take import STATUSES, Take
+from gloves.takes.take import Take
 from handsim.app.page import Section, write_page
 from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
-from handsim.hand.topology import JOINT_NAMES, JOINTS
+from handsim.hand.topology import JOINTS
 from track.reports import take_plots
-from track.reports.hand_figures import HandFigures, hand_figures
+from track.reports.hand_figures import RANGE, HandFigures, hand_figures
+from track.reports.take_tables import table_paths, tables_of, write_table
 from track.setup import Size
 from track.take_summary import Doubt, doubts_of, summarize, suspicions
 from train.evaluation.metrics import percent
 from train.reports.plot_style import picture
 
-TABLES: Final = (".csv", ".joints.csv", ".markers.csv", ".doubts.csv")
-"""How the names of a page's tables end: its frames, ranges of motion, markers, and frames to look at."""
 _MOST_DOUBTS: Final = 100  # rows; with more a take is not worth reading line by line
-_COLUMNS: Final = ("least", "5th", "median", "95th", "largest")
 _NOTHING: Final = "-"
 _SHADES: Final = "Gray: the hand is lost and has no pose. Orange: it coasts, its pose is predicted."
 _UNCALIBRATED: Final = (
@@ -45,8 +42,7 @@ def write_take_page(out: Path, take: Take, *, source: str) -> tuple[Path, ...]:
     """Write the page on a take and its tables beside it, all or none.
 
     Args:
-        out: The page, an .html file. The tables have its name and end in `TABLES`; their angles are in
-            degrees and their residuals in millimeters, and empty cells are numbers that do not exist.
+        out: The page, an .html file; `take_tables` says what its tables are.
         take: What was tracked, or the truth of a simulation.
         source: The take's file, for the command that shows it.
 
@@ -54,32 +50,22 @@ def write_take_page(out: Path, take: Take, *, source: str) -> tuple[Path, ...]:
         The page and its tables.
 
     Raises:
-        ArgumentError: The page's name does not end in .html, or there is no frame.
+        ArgumentError: The page's name does not end in .html.
         OSError: A file cannot be written.
     """
     if out.suffix.lower() != ".html":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .html")
-    if not take.num_frames or not take.hands:
-        raise ArgumentError(f"{source}: there is no frame of a hand in it, expected a take of at least one")
-    hands, doubts = hand_figures(take), doubts_of(take, _MOST_DOUBTS + 1)
+    hands, doubts = hand_figures(take), doubts_of(take, most=None)
     sections = [_summary_section(take), _calibration_section(take)]
     for hand in hands:
         sections += _hand_sections(take, hand)
     sections.append(_doubts_section(take, doubts, source))
     paths = (out, *table_paths(out))
-    with atomic_writes(*paths) as (page, frames, joints, markers, looks):
+    with atomic_writes(*paths) as (page, *tables):
         write_page(page, sections, title=f"Take {Path(source).name}", lead=_lead(take))
-        _write_rows(frames, _frame_header(), _frame_rows(take, hands))
-        _write_rows(joints, *_joint_table(hands))
-        _write_rows(markers, *_marker_table(take, hands))
-        _write_rows(looks, ("first_frame", "last_frame", "start_s", "end_s", "frame", "of", "why"),
-                    [map(_cell, _doubt_row(take, doubt)) for doubt in doubts])  # fmt: skip
+        for path, table in zip(tables, tables_of(take, hands, doubts), strict=True):
+            write_table(path, table)
     return paths
-
-
-def table_paths(out: Path) -> tuple[Path, ...]:
-    """The tables beside a page."""
-    return tuple(out.with_suffix(ending) for ending in TABLES)
 
 
 def _lead(take: Take) -> str:
@@ -154,7 +140,7 @@ def _angles_section(take: Take, hand: HandFigures) -> Section:
 
 
 def _range_section(hand: HandFigures) -> Section:
-    table = [["joint [deg]", *_COLUMNS, "range of the model"]]
+    table = [["joint [deg]", *RANGE, "range of the model"]]
     for joint, row in zip(JOINTS, hand.range_of_motion(), strict=True):
         cells = [f"{value:.1f}" for value in row]
         table.append([joint.name.replace("_", " "), *cells, f"{joint.low:g} to {joint.high:g}"])
@@ -210,88 +196,19 @@ def _doubts_section(take: Take, doubts: Sequence[Doubt], source: str) -> Section
         return Section("Doubtful frames", "No hand is lost or coasts, and every label is sure.")
     table = [["frames", "start [s]", "end [s]", "of", "why", "to look at", "in"]]
     for doubt in doubts[:_MOST_DOUBTS]:
-        first, last, start, end, worst, of, why = _doubt_row(take, doubt)
-        frames = f"{first}" if first == last else f"{first} to {last}"
-        look = f"frame {worst}, {take.times[doubt.worst]:.3f} s"
-        table.append([frames, f"{start:.3f}", f"{end:.3f}", str(of), str(why), look, command])
+        frames = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first} to {doubt.last}"
+        start, end, worst = (f"{take.times[one]:.3f}" for one in (doubt.first, doubt.last, doubt.worst))
+        look = f"frame {doubt.worst}, {worst} s"
+        table.append([frames, start, end, doubt.of, doubt.why, look, command])
     text = (
         "Frames in which a hand is lost or coasts, the longest first, then labels of little confidence, "
         f"which is given. <code>{escape(command)}</code> lists the worst of them too; a click leads there, "
         "and a wrong label can be corrected."
     )
-    notes = [f"There are more; these are the worst {_MOST_DOUBTS}."] if len(doubts) > _MOST_DOUBTS else []
+    more = f"These are the worst {_MOST_DOUBTS} of {len(doubts):,}; the table beside the page has all."
+    notes = [more] if len(doubts) > _MOST_DOUBTS else []
     return Section("Doubtful frames", text, table=table, notes=notes)
-
-
-def _doubt_row(take: Take, doubt: Doubt) -> tuple[int, int, float, float, int, str, str]:
-    start, end = float(take.times[doubt.first]), float(take.times[doubt.last])
-    return doubt.first, doubt.last, start, end, doubt.worst, doubt.of, doubt.why
 
 
 def _millimeters(meters: float) -> str:
     return _NOTHING if np.isnan(meters) else f"{1e3 * meters:.2f}"
-
-
-def _frame_header() -> tuple[str, ...]:
-    angles = (f"{joint}_deg" for joint in JOINT_NAMES)
-    return ("frame", "time_s", "hand", "status", "markers_seen", "residual_rms_mm", *angles)
-
-
-def _frame_rows(take: Take, hands: Sequence[HandFigures]) -> list[list[object]]:
-    """One row per frame and hand."""
-    numbers = [np.column_stack([1e3 * hand.rms, hand.angles]).tolist() for hand in hands]
-    counts = [hand.seen.sum(axis=1).tolist() for hand in hands]
-    rows: list[list[object]] = []
-    for frame, time in enumerate(take.times.tolist()):
-        for hand, count, table in zip(hands, counts, numbers, strict=True):
-            first = [frame, _cell(time), hand.side, STATUSES[hand.status[frame]], count[frame]]
-            rows.append([*first, *map(_number, table[frame])])
-    return rows
-
-
-def _joint_table(hands: Sequence[HandFigures]) -> tuple[Sequence[str], list[list[object]]]:
-    rows: list[list[object]] = [
-        [hand.side, joint.name, *map(_number, row), _number(joint.low), _number(joint.high)]
-        for hand in hands
-        for joint, row in zip(JOINTS, hand.range_of_motion().tolist(), strict=True)
-    ]
-    columns = (f"{name}_deg" for name in (*_COLUMNS, "model_low", "model_high"))
-    return ("hand", "joint", *columns), rows
-
-
-def _marker_table(take: Take, hands: Sequence[HandFigures]) -> tuple[Sequence[str], list[list[object]]]:
-    header = ("hand", "marker", "seen_share", "gaps", "longest_gap_frames", "longest_gap_s",
-              "residual_median_mm", "residual_95th_mm", "confidence_median")  # fmt: skip
-    rows: list[list[object]] = [
-        [
-            hand.side,
-            marker.name,
-            _number(marker.seen),
-            marker.num_gaps,
-            marker.longest_gap,
-            _number(marker.longest_gap / take.rate),
-            _number(1e3 * marker.median_residual),
-            _number(1e3 * marker.high_residual),
-            _number(marker.median_confidence),
-        ]
-        for hand in hands
-        for marker in hand.markers()
-    ]
-    return header, rows
-
-
-def _number(value: float) -> str:
-    """Six digits; nothing for NaN."""
-    return "" if np.isnan(value) else f"{value:.6g}"
-
-
-def _cell(value: float | str) -> str:
-    """A number with nine digits, as times need them."""
-    return value if isinstance(value, str) else f"{value:.9g}"
-
-
-def _write_rows(path: Path, header: Sequence[str], rows: Iterable[Iterable[object]]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows(rows)

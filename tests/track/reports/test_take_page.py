@@ -15,7 +15,8 @@ from handsim.errors import ArgumentError
 from handsim.hand.topology import JOINT_NAMES, JOINTS
 from track.capture_tracking import track_capture
 from track.reports.hand_figures import hand_figures
-from track.reports.take_page import table_paths, write_take_page
+from track.reports.take_page import write_take_page
+from track.reports.take_tables import table_paths
 from train.simulation.takes import simulate_take
 
 FRAMES = 60
