@@ -16,10 +16,10 @@ from handsim.app.page import Section, write_page
 from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_writes
 from handsim.hand.topology import JOINTS
+from track.config import Size
 from track.reports import take_plots
 from track.reports.hand_figures import RANGE, HandFigures, hand_figures
 from track.reports.take_tables import table_paths, tables_of, write_table
-from track.setup import Size
 from track.take_summary import Doubt, doubts_of, summarize, suspicions
 from train.evaluation.metrics import percent
 from train.reports.plot_style import picture
