@@ -20,7 +20,13 @@ _PALM_SIDE: Final = [name == "wrist" or name.endswith(("CMC", "MCP")) for name i
 
 
 def hand_truth(
-    figure: HandFigure, qpos: Float[np.ndarray, "27"], number: int, camera: Camera, pictures: Pictures
+    figure: HandFigure,
+    qpos: Float[np.ndarray, "27"],
+    number: int,
+    camera: Camera,
+    pictures: Pictures,
+    *,
+    recorded: bool = True,
 ) -> HandTruth:
     """Ground truth of one hand.
 
@@ -30,6 +36,7 @@ def hand_truth(
         number: Index of the hand among those in the picture.
         camera: The camera.
         pictures: Depth and parts of that camera.
+        recorded: Whether to compute the vertices, else there are none.
     """
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
@@ -43,7 +50,7 @@ def hand_truth(
         keypoints_world=keypoints,
         visible=_visible(keypoints, pixels, figure.thickness, number, camera, pictures),
         box=_box(pictures.parts, number),
-        vertices=model.skin(qpos[None])[0].astype(np.float32),
+        vertices=model.skin(qpos[None])[0].astype(np.float32) if recorded else np.empty((0, 3), np.float32),
         marker_names=figure.fit.layout.names if worn else (),
         markers=figure.markers(qpos) if worn else np.empty((0, 3)),
     )

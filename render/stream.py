@@ -261,7 +261,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         skin = sitting.studio.skin
         chosen = sample_choices(self.config, skin, rng, camera.size)
         fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
-        frame = sitting.studio.photograph(moment, camera, fresh)
+        frame = sitting.studio.photograph(moment, camera, fresh, recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))
         hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(take.hands)]
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}

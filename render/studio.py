@@ -144,13 +144,16 @@ class Studio:
         """The people's skin; None where gloves hide it."""
         return self._people[0].skin if self._people[0].glove is None else None
 
-    def photograph(self, moment: Moment, camera: Camera, choices: FrameChoices) -> RenderedFrame:
+    def photograph(
+        self, moment: Moment, camera: Camera, choices: FrameChoices, *, recorded: bool = True
+    ) -> RenderedFrame:
         """Draw one moment.
 
         Args:
             moment: Poses of the studio's hands and bodies.
             camera: The camera.
             choices: All other choices.
+            recorded: Whether the frame has its choices as JSON and the hands' vertices, which take time.
 
         Raises:
             HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
@@ -171,7 +174,7 @@ class Studio:
         if noisy:
             noisy_depth = self._noisy_depth(seen, rgb, present, camera, choices.depth_noise, rng)
         hands = tuple(
-            hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth)
+            hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth, recorded=recorded)
             for index, number in enumerate(present)
         )
         bodies = tuple(
@@ -191,7 +194,7 @@ class Studio:
             points=take.points[frame, known],
             labels=take.labels[frame, known],
             label_names=take.label_names,
-            choices=self._record(choices),
+            choices=self._record(choices) if recorded else {},
         )
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:

@@ -127,8 +127,8 @@ class Tracker:
         exchanged = exchange_labels(followed, expected)
         fitted, tracks = self._fit_kept_labels(exchanged, predictions)
         labeled = label_new_points(fitted, tracks, self._digits)
-        reviewed, estimated = self._review_labels(fitted, labeled, tracks)
-        updated, outcomes = self._update(reviewed, estimated)
+        reviewed, tracks = self._review_labels(fitted, labeled, tracks)
+        updated, outcomes = self._update(reviewed, tracks)
         started, outcomes = self._initialize_lost(updated, outcomes)
         final, outcomes = self._replace_doubted(started, outcomes)
         self._history.keep(final)
@@ -189,13 +189,14 @@ class Tracker:
 
     def _review_labels(
         self, fitted: FrameState, frame: FrameState, tracks: Sequence[HandTrack]
-    ) -> tuple[FrameState, tuple[HandTrack, ...]]:
+    ) -> tuple[FrameState, list[HandTrack]]:
         """Fit hands with new labels again, and compare their labels with the labeler's."""
-        refitted = []
+        reviewed = []
         for fit in tracks:
             frame, track = refit_labels(fitted, frame, fit)
-            refitted.append(track)
-        return self._review.review(frame, refitted)
+            frame, track = self._review.review(frame, track)
+            reviewed.append(track)
+        return frame, reviewed
 
     def _coasted_out(self, state: HandState, time: float) -> bool:
         """Whether a pose is too old to be predicted on."""

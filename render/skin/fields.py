@@ -73,7 +73,7 @@ def smooth(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
     return result
 
 
-def bump(distance: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+def bump(distance: NDArray[Any], width: float | np.float32) -> NDArray[Any]:
     """A Gaussian bell of height 1."""
-    height: NDArray[np.float64] = np.exp(-((distance / width) ** 2))
+    height: NDArray[Any] = np.exp(-((distance / width) ** 2))
     return height

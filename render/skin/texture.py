@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 _CREASE: Final = (-0.006, 0.02)  # [m] behind the wrist, where the palm's skin ends
+_VEIN: Final = 0.0017  # [m] half as wide as a vein
 _UNEVEN: Final = np.float32(0.03)  # [m] of that border, where the border of pigment has 1
 _INNER_ARM: Final = 0.88  # pigment of the inner forearm, where the back of the hand has 1
 
@@ -158,20 +159,27 @@ def _blood() -> _Blood:
     return _Blood(lab.astype(np.float32), knuckles.astype(np.float32))
 
 
-def _veins(rng: np.random.Generator) -> NDArray[np.float64]:
+def _veins(rng: np.random.Generator) -> NDArray[np.float32]:
     """Visibility of veins at each texel (N,): three of them wind along the back of hand and forearm."""
-    texels = skin_texels()
-    back = texels.back
-    x, y = texels.positions[:, 0], texels.positions[:, 1]
-    near = np.flatnonzero((back > 0.5) & (x > -0.16) & (x < 0.085))
-    x, y = x[near], y[near]
-    veins = np.zeros(len(back))
+    near, x, y, back = _vein_texels()
+    veins = np.zeros(len(skin_texels().back), dtype=np.float32)
     for start in (0.016, -0.004, -0.022):
         knots = np.linspace(-0.17, 0.09, 9)
         course = start + np.cumsum(rng.normal(0.0, 0.0035, 9)) - 0.006
-        veins[near] = np.maximum(veins[near], bump(y - np.interp(x, knots, course), 0.0017))
-    veins *= back
+        away = y - np.interp(x, knots, course).astype(np.float32)
+        (close,) = np.nonzero(np.abs(away) < 4.0 * _VEIN)
+        rows = near[close]
+        veins[rows] = np.maximum(veins[rows], back[close] * bump(away[close], np.float32(_VEIN)))
     return veins
+
+
+@functools.cache
+def _vein_texels() -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Texels (K,) that may have veins, their x and y [m] and how far they are on the back (K,)."""
+    texels = skin_texels()
+    x, y, back = (values.astype(np.float32) for values in (*texels.positions[:, :2].T, texels.back))
+    near = np.flatnonzero((back > 0.5) & (x > -0.16) & (x < 0.085))
+    return near, x[near], y[near], back[near]
 
 
 @functools.cache

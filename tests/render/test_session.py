@@ -154,7 +154,8 @@ def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):
     )
     render_take(path, tmp_path / "out", ["png"], config, workers=1)
     for frame in draw(path, config=config, frames=[0, 7, 30]):
-        written = cv2.imread(str(next((tmp_path / "out").rglob(f"{frame.key}.png"))))
+        (file,) = (tmp_path / "out").glob(f"images/shard-*/{frame.key}.png")
+        written = cv2.imread(str(file))
         np.testing.assert_array_equal(written[..., ::-1], frame.rgb)
 
 

@@ -39,8 +39,8 @@ SPARE_POINTS: Final = 6
 """Points beyond a hand's markers from which on a group may be two hands that touch."""
 CUTS: Final = 12
 """Directions along which a group is cut, even over half a sphere."""
-CUTS_PER_FRAME: Final = 3
-"""Directions tried in a frame of a capture in motion: a hand among others is found within four frames."""
+CUTS_PER_FRAME: Final = 6
+"""Directions tried in a frame of a capture in motion: with all, touching hands would take 20 ms."""
 _STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
 _MOST_FITS: Final = 8  # labeled clouds that are fitted, the most confident first
 _FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image

@@ -7,7 +7,6 @@ likelihood of the points: as markers of the fitted hand, or as strays where they
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -72,27 +71,12 @@ class LabelerReview:
         """Note that a hand was initialized at a time [s]: its labels are reviewed soon."""
         self._wait[index], self._last[index] = _FIRST_WAIT, time
 
-    def review(
-        self, frame: FrameState, tracks: Sequence[HandTrack]
-    ) -> tuple[FrameState, tuple[HandTrack, ...]]:
-        """Review the hand whose review is due for the longest time, if one is due; the others wait a frame.
-
-        So a frame has one question to the labeler at most, and takes no longer for two hands.
-        """
-        near = [self._near(frame, track, frame.markers(track.hand)) for track in tracks]
-        due = [row for row, track in enumerate(tracks) if self._is_due(track.hand, frame, near[row])]
-        if not due:
-            return frame, tuple(tracks)
-        row = min(due, key=lambda one: self._last[tracks[one].hand])
-        self._plan_next(tracks[row].hand, frame, near[row])
-        frame, track = self._review(frame, tracks[row], near[row])
-        return frame, (*tracks[:row], track, *tracks[row + 1 :])
-
-    def _review(
-        self, frame: FrameState, track: HandTrack, near: NDArray[np.bool_]
-    ) -> tuple[FrameState, HandTrack]:
-        """Compare a hand's labels with the labeler's, and take over the likelier ones."""
+    def review(self, frame: FrameState, track: HandTrack) -> tuple[FrameState, HandTrack]:
+        """Compare a hand's labels with the labeler's if that is due, and take over the likelier ones."""
         markers = frame.markers(track.hand)
+        near = self._near(frame, track, markers)
+        if not self._is_due(track.hand, frame, near):
+            return frame, track
         cloud = np.flatnonzero((markers >= 0) | near)
         if len(cloud) > MOST_POINTS:
             return frame, track
@@ -154,17 +138,15 @@ class LabelerReview:
         return near
 
     def _is_due(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> bool:
-        """Whether a review is due: for points that it was not about, or after a while."""
-        new = not self._open[index].issuperset(frame.ids[near].tolist())
-        return new or frame.time >= self._last[index] + self._wait[index]
-
-    def _plan_next(self, index: int, frame: FrameState, near: NDArray[np.bool_]) -> None:
-        """Plan the review after this one."""
+        """Whether a review is due; the next one is planned then."""
         points = frozenset(frame.ids[near].tolist())
         new = bool(points - self._open[index])
+        if not new and frame.time < self._last[index] + self._wait[index]:
+            return False
         self._open[index], self._last[index] = points, frame.time
         longer = min(_WAIT_FACTOR * self._wait[index], self._config.longest_review_wait)
         self._wait[index] = _FIRST_WAIT if new else longer
+        return True
 
     def _gain(self, frame: FrameState, track: HandTrack, proposal: _Proposal) -> float:
         """Log-odds by which proposed labels are likelier than those of the frame."""

@@ -93,7 +93,7 @@ def test_a_place_that_takes_no_files_is_told(name: str, make_frame, tmp_path: Pa
     writer = open_writer(name, tmp_path / "file" / "set")
     with pytest.raises(
         HandSimError,
-        match="writing shard 0 failed: (Not a directory|.*is a file, not a folder); shards that were",
+        match=r"writing shard 0 failed: (Not a directory|.*is a file, not a folder); shards that were",
     ) as told:
         writer.write(0, [make_frame()])
     assert "\n" not in str(told.value)
