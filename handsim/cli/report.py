@@ -7,11 +7,8 @@ from typing import Annotated
 
 import tyro
 
-from gloves.takes.take import load_take
 from handsim.app.messages import print_line
 from handsim.files.outputs import check_outputs
-from track.reports.take_page import write_take_page
-from track.reports.take_tables import table_paths
 
 
 def report(take: Annotated[Path, tyro.conf.Positional], out: Path) -> None:
@@ -24,6 +21,10 @@ def report(take: Annotated[Path, tyro.conf.Positional], out: Path) -> None:
         take: A take (.npz, of handsim track or the .truth.npz of handsim simulate).
         out: The page, an .html file, whole in itself.
     """
+    from gloves.takes.take import load_take
+    from track.reports.take_page import write_take_page
+    from track.reports.take_tables import table_paths
+
     check_outputs([take], [out, *table_paths(out)])
     page, frames, *tables = write_take_page(out, load_take(take), source=str(take))
     print_line(f"{page}: page on {take}; tables in {', '.join(map(str, (frames, *tables)))}")

@@ -34,8 +34,8 @@ def test_help_shows_no_types_and_no_empty_defaults(words, capsys, monkeypatch):
 
 
 LIGHT = (
-    "body", "calibrate", "demo", "doctor", "evaluate", "export", "glove", "hand", "label", "replay", "track",
-    "view",
+    "body", "calibrate", "demo", "doctor", "evaluate", "export", "glove", "hand", "label", "replay", "report",
+    "track", "view",
 )  # fmt: skip
 
 
