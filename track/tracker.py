@@ -22,7 +22,7 @@ from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 from track.association.candidates import SETTLED_EVIDENCE
 from track.association.frame_state import FrameState, Numbering, targets_of
-from track.association.hand_state import HandEstimate, HandState, HandTrack, Prediction
+from track.association.hand_state import HandState, HandTrack, Prediction
 from track.association.initialization import HandInitializer, InitializedHand
 from track.association.label_consistency import exchange_labels, fit_labels, gate_labels, refit_labels
 from track.association.label_new_points import digit_table, label_new_points
@@ -51,8 +51,8 @@ class _Outcome(NamedTuple):
     """What a frame brought for a hand."""
 
     status: Status
-    estimate: HandEstimate | None = None
-    """The pose fitted to its labels; None where it is predicted, or there is none."""
+    rms: float = np.nan
+    """RMS distance of its labeled markers from the pose's, biases included [m]; NaN without a fit."""
 
 
 class Tracker:
@@ -216,11 +216,12 @@ class Tracker:
                 own, before = markers[labeled], evidence[labeled]
                 settled = np.zeros(state.num_markers, dtype=bool)
                 settled[own] = before >= SETTLED_EVIDENCE
+                rms = state.rms_without_bias(estimate)  # by the biases that the pose was fitted with
                 state.update(estimate, settled, frame.time)
                 squares = ((frame.points[labeled] - state.positions[own]) ** 2).sum(axis=1)
                 gain = _EVIDENCE_PER_FRAME - 0.5 * squares / state.variance[own]
                 evidence[labeled] = np.clip(before + gain, 0.0, _MOST_EVIDENCE)
-                outcomes.append(_Outcome(Status.TRACKED, estimate))
+                outcomes.append(_Outcome(Status.TRACKED, rms))
                 continue
             if state.qpos is not None and self._coasted_out(state, frame.time):
                 state.qpos = None
@@ -297,7 +298,7 @@ class Tracker:
         targets = targets_of(frame.points, markers, state.num_markers)
         estimate = state.initialize(found.fit.qpos[0], targets, frame.time)
         self._review.restart(found.index, frame.time)
-        started = _Outcome(Status.INITIALIZED, estimate)
+        started = _Outcome(Status.INITIALIZED, state.rms_without_bias(estimate))
         others = outcomes[: found.index], outcomes[found.index + 1 :]
         return frame.with_markers(found.index, markers), (*others[0], started, *others[1])
 
@@ -329,5 +330,5 @@ def _tracked_hand(
     markers[own[labeled]] = points[labeled]
     present = np.zeros(count, dtype=bool)
     present[own[labeled]] = True
-    rms = np.nan if outcome.estimate is None else state.rms_without_bias(outcome.estimate)
-    return TrackedHand(side, outcome.status, state.qpos.copy(), rms, markers, np.flatnonzero(~present))
+    filled = np.flatnonzero(~present)
+    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled)

@@ -59,6 +59,19 @@ def test_hands_are_initialized_and_tracked(take, labeler):
         assert np.rad2deg(np.abs(poses[:, 7:] - hand.qpos[:, 7:])).mean() <= 1.0
 
 
+def test_the_rms_is_the_distance_from_the_given_hand_in_the_first_frames_too(take, labeler):
+    """Biases are learned there, and a frame's own must not count as known before it."""
+    tracker = Tracker([nominal_fit(hand.layout, "M", hand.side) for hand in users(take)], labeler)
+    for number, frame in enumerate(run(tracker, take, range(12))):
+        points = seen(take, number)[0]
+        for index, (fit, hand) in enumerate(zip(tracker.hands, frame.hands, strict=True)):
+            count = fit.layout.num_markers
+            own = (frame.labels >= index * count) & (frame.labels < (index + 1) * count)
+            markers = fit.markers(hand.qpos[None])[0][0][frame.labels[own] - index * count]
+            distances = np.linalg.norm(points[own] - markers, axis=1)
+            assert hand.rms == pytest.approx(np.sqrt((distances**2).mean()), abs=2e-5)
+
+
 @pytest.mark.parametrize("seed", [0, 2])
 def test_gloves_with_few_markers_far_apart_are_tracked(seed):
     """Large hands in the sparse glove: stretched fingers are over 85 mm from the markers on the back."""
