@@ -103,9 +103,10 @@ def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
         only_wide: See `unit_fault`.
 
     Raises:
-        ArgumentError: They cannot be, see `unit_fault`, or all points are at the origin.
+        ArgumentError: They cannot be, see `unit_fault`; or all points are at the origin, which a single
+            cloud's (`only_wide`) may be.
     """
-    if all_at_origin(clouds):
+    if not only_wide and all_at_origin(clouds):
         raise ArgumentError(f"{AT_ORIGIN}, expected positions in meters")
     fault = unit_fault(clouds, only_wide=only_wide)
     if fault is not None:

@@ -116,7 +116,6 @@ class HandInitializer:
             hands: Indices of the hands that are looked for.
         """
         initialized: list[InitializedHand] = []
-        self._first_cut += self._cuts
         for group in self._groups(points, hands):
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
@@ -130,6 +129,7 @@ class HandInitializer:
             self._attempts[missing] += 1
         for hand in initialized:
             self._attempts[hand.index] = 0
+        self._first_cut += self._cuts
         return initialized
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
