@@ -21,7 +21,6 @@ import tempfile
 import threading
 import time
 import warnings
-from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,7 +32,7 @@ from gloves.takes.growing import GrownArchive
 from gloves.takes.take import Take, load_take
 from track.recorder import Recorder
 from track.streams import natnet
-from track.streams.frame_source import LiveStream
+from track.streams.live_stream import LiveStream
 from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.streams.point_stream import open_stream
@@ -192,12 +191,13 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
     server.start()
     start, memory, first = time.perf_counter(), [], 0
     there = np.zeros(frames, dtype=bool)
-    with closing(open_stream(server.url, ended=server.ended.is_set)) as stream:
+    packets = open_stream(server.url)
+    with LiveStream(packets, ended=server.ended.is_set) as stream:
         with Recorder(out, tracker) as recorder:
-            for frame in LiveStream(stream):
+            for frame in stream:
                 tracked = tracker.step(frame.points, frame.ids, frame.time)
                 recorder.add(frame, tracked)
-                server.read = stream.packets
+                server.read = packets.packets
                 first += server.segment * frame.restarted
                 if not frame.silent and first + frame.number < frames:
                     there[first + frame.number] = True

@@ -1,9 +1,10 @@
 """Accuracy of drawn depth, and memory; and the pictures that `benchmarks.speed` times.
 
-    python -m benchmarks.rendering [accuracy memory] [--frames 200 --images 20000]
+    python -m benchmarks.rendering [accuracy memory stream] [--frames 200 --images 20000]
 
 accuracy: depth and ids against embree through trimesh on the same triangles.
 memory: resident memory over many pictures.
+stream: resident memory of a `DataLoader` of the stream, with a worker a core, over as many as --frames.
 
 What is timed are 640 x 480 pictures of two hands from a simulated take: depth alone; colors, depth, ids and
 keypoints; the same painted by OpenGL, and written as WebDataset. Beside them the loop that a user would write
@@ -25,6 +26,7 @@ from typing import Final
 import mujoco
 import numpy as np
 import trimesh
+from torch.utils.data import DataLoader
 
 from benchmarks.record import Figures, add_save, describe, save_figures
 from gloves.takes.take import Take
@@ -39,11 +41,13 @@ from render.painting.gl import load_pyrender, offscreen_renderer
 from render.painting.opengl_painter import OPENGL_FROM_OPENCV
 from render.painting.rasterizer import join, rasterize
 from render.skin.look import ALL_TONES
+from render.stream import PictureStream
 from render.studio import Moment, Studio
 from render.subject import subject_of_take
 from train.simulation.takes import simulate_take
 
-SECTIONS: Final = ("accuracy", "memory")
+SECTIONS: Final = ("accuracy", "memory", "stream")
+CROP, BATCH = 256, 16  # of the stream's pictures [px], and in a batch
 ROUNDS: Final = 3
 PLAIN: Final = RenderConfig(depth_sensor=None, color_sensor=None, painter="compiled")
 DEPTH: Final = dataclasses.replace(PLAIN, passes=("depth",))
@@ -97,11 +101,11 @@ def rate_in_processes(job: Callable[[int], int], cores: int, frames: int) -> flo
     return (len(steady) - 1) * frames / (steady[-1] - steady[0])
 
 
-def plain_pyrender(take: Take, color: bool) -> None:
+def plain_pyrender(take: Take, color: bool, size: tuple[int, int] = (640, 480)) -> None:
     """What a user would write: one scene per frame, skinned meshes, one light."""
     pyrender = load_pyrender()
     view = Viewpoints(PLAIN.view, take, rng=np.random.default_rng(0))
-    renderer = offscreen_renderer(640, 480)
+    renderer = offscreen_renderer(*size)
     for frame in range(take.num_frames):
         scene, camera = pyrender.Scene(), view.cameras(frame)[0]
         for number, hand in enumerate(take.hands):
@@ -109,7 +113,9 @@ def plain_pyrender(take: Take, color: bool) -> None:
             mesh = trimesh.Trimesh(skin, hand.model.surface.faces, process=False)
             scene.add(pyrender.Mesh.from_trimesh(mesh))
         pose = camera.T_world_camera @ OPENGL_FROM_OPENCV
-        scene.add(pyrender.IntrinsicsCamera(600.0, 600.0, 320.0, 240.0), pose=pose)
+        scale = size[1] / 480
+        lens = pyrender.IntrinsicsCamera(600.0 * scale, 600.0 * scale, size[0] / 2, size[1] / 2)
+        scene.add(lens, pose=pose)
         scene.add(pyrender.DirectionalLight(intensity=3.0), pose=pose)
         renderer.render(scene, flags=pyrender.RenderFlags.NONE if color else pyrender.RenderFlags.DEPTH_ONLY)
 
@@ -138,6 +144,43 @@ def jobs(frames: int, folder: Path) -> dict[str, tuple[str, Callable[[int], int]
     }
     writing = functools.partial(draw_and_write, COLORS, folder, frames)
     return drawn | {"written": ("the same written as WebDataset", writing)}
+
+
+def a_stream() -> PictureStream:
+    """Pictures of one hand for training loops: colors, depth, ids, keypoints, sensors."""
+    config = RenderConfig(passes=("rgb", "depth", "ids"))
+    return PictureStream(config=config, crop=CROP, batch=BATCH, seed=0)
+
+
+def stream_batches() -> Iterator[object]:
+    """Batches of the stream from a worker a core, once all have drawn some."""
+    cores = os.cpu_count() or 1
+    batches = iter(DataLoader(a_stream(), batch_size=BATCH, num_workers=cores))
+    for _ in range(4 * cores):
+        next(batches)
+    return batches
+
+
+def stream_memory(images: int) -> Figures:
+    batches, megabytes = stream_batches(), list[float]()
+    for number in range(-(-images // BATCH)):
+        next(batches)
+        if number % max(1, images // BATCH // 4) == 0:
+            megabytes.append(sum(_megabytes(process) for process in ("self", *_children())))
+    print(f"\nresident memory of a stream: {megabytes[0]:.0f} MB at first, {megabytes[-1]:.0f} MB at last")
+    what = "resident memory of all processes of a stream, first | last [MB]"
+    return {"memory": (what, (megabytes[0], megabytes[-1]))}
+
+
+def _children() -> list[str]:
+    me = os.getpid()
+    return Path(f"/proc/{me}/task/{me}/children").read_text().split()
+
+
+def _megabytes(process: str) -> float:
+    """Resident memory."""
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def accuracy(frames: int) -> Figures:
@@ -182,12 +225,10 @@ def bare_studio(take: Take) -> Studio:
 def memory(images: int) -> Figures:
     frames, megabytes = 200, list[float]()
     print(f"\nresident memory over {images} pictures (colors, depth, ids)")
-    page = os.sysconf("SC_PAGE_SIZE")
     for shard in range(images // frames):
         draw(COLORS, frames, shard)
         if shard % max(1, images // frames // 8) == 0:
-            pages = int(Path("/proc/self/statm").read_text().split()[1])
-            megabytes.append(pages * page / 2**20)
+            megabytes.append(_megabytes("self"))
             print(f"  {(shard + 1) * frames:6d}: {megabytes[-1]:.1f} MB", flush=True)
     few = min(1, len(megabytes) - 1)
     return {
@@ -207,7 +248,8 @@ def main() -> None:
         parser.error("--save keeps the figures of one section")
     print(describe())
     for name in options.section or SECTIONS:
-        figures = memory(options.images) if name == "memory" else accuracy(options.frames)
+        section = {"accuracy": accuracy, "stream": stream_memory}.get(name, memory)
+        figures = section(options.images if name == "memory" else options.frames)
         save_figures(options.save, figures)
 
 

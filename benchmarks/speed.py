@@ -59,7 +59,6 @@ from gloves.takes.take import Take
 from handsim.hand.model import HandModel, join_qpos
 from handsim.space.cameras import named_rig
 from poses.shapes.validity import sample_valid_angles
-from render.stream import PictureStream
 from track.setup import warm_up
 from track.tracker import Tracker
 from train.config import CNNConfig, batch_recipe, default_config
@@ -310,7 +309,10 @@ def training(speeds: Speeds) -> None:
                 count += config.batch
             return count / (time.perf_counter() - start)
 
-        threads = TrainingThreads(None)
+        def try_step() -> None:
+            state.try_step(draw_batch(rows, recipe, rng=rng), rng=rng)
+
+        threads = TrainingThreads(None, try_step)
         with threads.in_use():
             images(speeds.some(20, 1))
             alone = images(speeds.some(60, 2))
@@ -355,9 +357,18 @@ def pictures(speeds: Speeds) -> None:
         loop = functools.partial(rendering.mujoco_loop, take, color)
         what = f"pictures, MuJoCo's renderer, capsules without skin, {name}"
         speeds.rate(f"mujoco_{name}", what, rendering.rate(loop, frames))
-    stream = iter(PictureStream(crop=256, people=4))
+    stream = iter(rendering.a_stream())
     drawing = lambda: [next(stream) for _ in range(frames)]  # noqa: E731
-    speeds.rate("stream", "pictures of the stream, one hand, 256 x 256", rendering.rate(drawing, frames))
+    size = f"{rendering.CROP} x {rendering.CROP}"
+    speeds.rate("stream", f"pictures of the stream, one hand, {size}", rendering.rate(drawing, frames))
+    batches, count = rendering.stream_batches(), -(-4 * frames // rendering.BATCH)
+    seconds = timed(lambda: [next(batches) for _ in range(count)])
+    many = count * rendering.BATCH / seconds
+    speeds.rate("stream_all", f"pictures of the stream, {CORES} workers of a DataLoader", many)
+    one = simulate_take(kind="single-hand", num_frames=frames, hands=("right",))
+    loop = functools.partial(rendering.plain_pyrender, one, True, (rendering.CROP, rendering.CROP))
+    what = f"pictures, a plain pyrender loop, one hand, {size}, colors"
+    speeds.rate("pyrender_one", what, rendering.rate(loop, frames))
 
 
 def generation(speeds: Speeds) -> None:

@@ -1,4 +1,4 @@
-"""A hand that does not move, for other programs: a MuJoCo model, a URDF, a rigged mesh, or its skin."""
+"""A hand that does not move, for others: a MuJoCo or OpenSim model, a URDF, a rigged mesh, or its skin."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from handsim.errors import ArgumentError
 from handsim.files.atomic import atomic_write
 from handsim.hand.mjcf import build_spec
 from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.osim import hand_osim
 from handsim.hand.topology import NUM_JOINTS
 from handsim.hand.urdf import hand_urdf
 
-ENDINGS: Final = (".xml", ".urdf", ".glb")
+ENDINGS: Final = (".xml", ".urdf", ".osim", ".glb")
+WITH_MARKERS: Final = (".xml", ".osim")
+"""Endings of files that hold the markers of a glove."""
 MESH_ENDINGS: Final = (".glb", ".obj", ".ply", ".stl")
 _USUAL_GLOVE: Final = "dense19"
 
@@ -26,9 +29,9 @@ def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = Fals
     """Write a hand in the flat pose; meters, radians, kilograms.
 
     Args:
-        path: The file: .xml (MuJoCo: free joint, twenty hinges, capsules), .urdf, or .glb (its skin with
-            bones and weights, y up).
-        hand: The hand; markers of its glove become sites of the .xml.
+        path: The file: .xml (MuJoCo: free joint, twenty hinges, capsules), .urdf, .osim (OpenSim, with the
+            coordinates of the .mot of a take), or .glb (its skin with bones and weights, y up).
+        hand: The hand; markers of its glove become sites of the .xml and markers of the .osim.
         actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
 
     Raises:
@@ -53,6 +56,9 @@ def write_hand(path: Path, hand: HandModel | GloveFit, *, actuators: bool = Fals
             temporary.write_text(hand_urdf(model), "utf-8")
             return
         sites = hand.attachment.sites(model) if isinstance(hand, GloveFit) else ()
+        if suffix == ".osim":
+            temporary.write_text(hand_osim(model, sites), "utf-8")
+            return
         spec = build_spec(model.skeleton, model.capsules, sites=sites, actuators=actuators)
         import mujoco
 

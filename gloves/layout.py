@@ -37,6 +37,7 @@ _ARM: Final = {
     "wrist": "for a marker that moves with the hand write palm, with along from -0.15 to 0",
     "forearm": "markers beyond the wrist's joint move against the hand and are not modeled",
 }
+_ALIASES: Final = {name.replace("little", "pinky"): name for name in BONE_NAMES if name.startswith("little")}
 _SHIPPED: Final = Path(__file__).parent / "layouts"
 _LAYOUT_KEYS: Final = ("name", "description", "source", "sides", "radius_mm", "marker")
 _MARKER_KEYS: Final = ("name", "bone", "along", "around", "across", "height_mm")
@@ -71,7 +72,7 @@ class MarkerPlace:
 
     name: str
     bone: str
-    """One of `handsim.hand.topology.BONE_NAMES`."""
+    """One of `handsim.hand.topology.BONE_NAMES`; pinky_distal is another name of little_distal, and so on."""
     along: float
     """0 at the bone's near end to 1 at its far end, and up to 0.3 beyond either."""
     around: float
@@ -84,6 +85,7 @@ class MarkerPlace:
     def __post_init__(self) -> None:
         check_type("name of a marker", self.name, str, "text")
         check_type(f"bone of marker '{self.name}'", self.bone, str, "the name of one", BONE_NAMES)
+        object.__setattr__(self, "bone", _ALIASES.get(self.bone, self.bone))
         for key in ("along", "around", "across", "height"):
             check_type(
                 f"{key} of marker '{self.name}'", getattr(self, key), (int, float, np.number), "a number"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qsl
 
-from handsim.errors import ArgumentError, HandSimError, choices
+from handsim.errors import ArgumentError, HandSimError, choices, shortened
 
 _NAME: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 _ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
@@ -25,6 +25,7 @@ def is_plugin(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
 
 
+@functools.cache
 def list_plugins(group: str) -> tuple[str, ...]:
     """Names of the entry points of a group, as installed packages registered them."""
     return tuple(sorted({point.name for point in metadata.entry_points(group=group)}))
@@ -93,7 +94,7 @@ def _find(name: str, group: str, noun: str) -> Any:
     if not is_plugin(name):
         points = {point.name: point.value for point in metadata.entry_points(group=group)}
         if name not in points:
-            known = choices(name, points, noun=noun) if points else f"unknown {noun} '{name[:200]}'"
+            known = choices(name, points, noun=noun) if points else f"unknown {noun} '{shortened(name)}'"
             raise ArgumentError(
                 f"{known}; expected module:name, or a name that a package registers as {group}"
             )

@@ -10,15 +10,31 @@ import difflib
 from collections.abc import Iterable
 from typing import Final
 
-_LONGEST: Final = 200  # characters of a name that a sentence shows
+SENTENCE: Final = 500
+"""The most characters of a sentence."""
+_NAME: Final = 120  # characters of an unknown name that a sentence shows
+
+
+def shortened(text: str, most: int = 40) -> str:
+    """A text that a sentence quotes from a file or an argument: its beginning and end, where it is long."""
+    if len(text) <= most:
+        return text
+    end = most // 3
+    return f"{text[: most - end - 3]}...{text[-end:]}"
 
 
 class HandSimError(Exception):
-    """Root of every error that handsim raises on purpose."""
+    """Root of every error that handsim raises on purpose; its sentence has a bounded length."""
+
+    def __str__(self) -> str:
+        return shortened(super().__str__(), SENTENCE)
 
 
 class HandSimWarning(UserWarning):
     """Something in the data that is probably not what the user meant; the work goes on."""
+
+    def __str__(self) -> str:
+        return shortened(super().__str__(), SENTENCE)
 
 
 class ArgumentError(HandSimError):
@@ -60,7 +76,7 @@ class WeightsError(FileError):
 def choices(given: str, valid: Iterable[str], *, noun: str) -> str:
     """Sentence for an unknown name: what was given, the nearest valid name, and all valid names."""
     names = list(valid)
-    given = given if len(given) <= _LONGEST else given[:_LONGEST] + "..."
+    given = shortened(given, _NAME)
     near = difflib.get_close_matches(given, names, n=1)
     hint = f" (did you mean '{near[0]}'?)" if near else ""
     return f"unknown {noun} '{given}'{hint}; valid names: {', '.join(names)}"

@@ -20,10 +20,10 @@ from render.sensors.shutter import ShutterConfig
 from render.skin.look import ALL_TONES, check_tones
 
 NEAR_SENSOR: Final = "d435"
-"""Depth sensor at the user's eyes, 0.4 to 0.6 m from the hands, and of a user's own cameras, which may be as
-near: it measures from 0.2 m on."""
+"""Depth sensor of cameras that may be as near as 0.3 m to the hands: it measures from 0.2 m on."""
 FAR_SENSOR: Final = "kinect2"
-"""Depth sensor of all other placements; it measures from 0.5 m on."""
+"""Depth sensor of rigs, and of others at a set distance of 0.6 m or more; it measures from 0.5 m on."""
+_FAR: Final = 0.6  # [m] from the center of the hands
 
 
 class SpawnKey(enum.IntEnum):
@@ -96,8 +96,10 @@ class RenderConfig:
         """`depth_sensor`, or in the place of auto the one that fits the placement."""
         if self.depth_sensor != "auto":
             return self.depth_sensor
-        near = self.view.placement == "head" or self.view.cameras is not None
-        return DepthNoiseConfig((NEAR_SENSOR if near else FAR_SENSOR,))
+        view = self.view
+        set_far = view.distance is not None and view.distance[0] >= _FAR and view.placement != "head"
+        far = view.cameras is None and (view.placement == "rig" or set_far)
+        return DepthNoiseConfig((FAR_SENSOR if far else NEAR_SENSOR,))
 
     def settled(self) -> RenderConfig:
         """The same without auto: the painter of this machine, and the depth sensor of the placement."""

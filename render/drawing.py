@@ -53,8 +53,9 @@ def draw(
     A frame's picture is the same whatever other frames are asked for.
 
     Args:
-        source: A take or its path; or poses (T, 27), joint angles (T, 20) with the wrist at the origin, or
-            poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
+        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
+            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
+            that is not there.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
             Without it, viewpoints are drawn as `RenderConfig.view` says.
@@ -162,21 +163,23 @@ class Drawing:
         """
         config, cast = self.config, self.subject.cast
         around = self.viewpoints.positions() if self.viewpoints.num_cameras > 1 else None
+        size = self.viewpoints.size
         rng = SpawnKey.SHARD.rng(config.seed, shard, 0)
         studio = self._studio(self.take.hands, rng) if cast is None else None
         kept: dict[int, FrameChoices] = {}
         for place, frame in numbered:
-            person = 0 if cast is None else cast.person_in(frame, shard)
+            # A take has its own hands; their looks change with the shard.
+            person = shard if cast is None else cast.person_in(frame, shard)
             if cast is not None:
                 studio = self._studio_of(person)
                 rng = SpawnKey.SHARD.rng(config.seed, shard, 0)  # all people of a shard are in one place
             assert studio is not None
             own = SpawnKey.SHARD.rng(config.seed, shard, 1 + place)
             if config.vary == "frame":
-                chosen = sample_choices(config, studio.skin, own, around)
+                chosen = sample_choices(config, studio.skin, own, size, around)
             else:
                 if person not in kept:
-                    kept[person] = sample_choices(config, studio.skin, rng, around)
+                    kept[person] = sample_choices(config, studio.skin, rng, size, around)
                 chosen = kept[person]
             moment = Moment(self.take, frame, None if cast is None else cast.person)
             cameras = self.viewpoints.cameras(frame)
@@ -185,7 +188,8 @@ class Drawing:
                 continue
             for camera in cameras:
                 fresh = dataclasses.replace(chosen, seed=int(own.integers(2**31)))
-                yield studio.photograph(moment, camera, fresh)
+                drawn = studio.photograph(moment, camera, fresh)
+                yield dataclasses.replace(drawn, choices={"person": person, **drawn.choices})
 
     def _studio(self, hands: Sequence[GloveFit], rng: np.random.Generator) -> Studio:
         return open_studio(hands, self.config, bodies=self.take.bodies, rng=rng)
@@ -222,10 +226,19 @@ def sample_choices(
     config: RenderConfig,
     skin: SkinLook | None,
     rng: np.random.Generator,
+    size: tuple[int, int],
     around: Float[np.ndarray, "N 3"] | None = None,
 ) -> FrameChoices:
-    """Random choices of a picture; a background that several cameras share is around these positions [m]."""
-    background, lighting = sample_surroundings(config.background, skin, rng=rng)
+    """Random choices of a picture.
+
+    Args:
+        config: What to choose from.
+        skin: See `sample_surroundings`.
+        rng: Source of the choices.
+        size: Of the picture [px].
+        around: Positions that a background of several cameras is around [m].
+    """
+    background, lighting = sample_surroundings(config.background, skin, size, rng=rng)
     sensor = config.chosen_depth_sensor
     return FrameChoices(
         lighting=lighting,

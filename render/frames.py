@@ -53,7 +53,8 @@ class HandTruth:
     keypoints_world: Float[np.ndarray, "21 3"]
     """The same keypoints in the world [m]; `frame.camera.local` gives them in the camera's axes."""
     visible: Bool[np.ndarray, "21"]
-    """Whether each keypoint is in the picture, with nothing in front of it but the flesh around it."""
+    """Whether each keypoint is in the picture on a pixel of its own finger, and no deeper under the surface
+    there than the finger is thick."""
     box: Float[np.ndarray, "4"]
     """Left, top, width, height [px] of the visible hand without its forearm; NaN where none is visible."""
     vertices: Float32[np.ndarray, "V 3"]

@@ -8,19 +8,25 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
-from handsim.hand.keypoints import hand_keypoints
+from handsim.hand.keypoints import KEYPOINT_DIGITS, KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.topology import DIGITS, PALM, bones_of
 from handsim.space.camera import Camera
 from render.frames import PARTS_A_HAND, HandTruth, Pictures
 from render.painting.figures import HandFigure
 from render.skin.forearm import FOREARM
 
-_SLANTING: Final = (
-    2.0  # lines of sight may pass this many times a joint's flesh: they meet skin at 30 degrees
-)
+_PALM_SIDE: Final = [name == "wrist" or name.endswith(("CMC", "MCP")) for name in KEYPOINT_NAMES]
+"""Which keypoints lie in the palm, too."""
 
 
 def hand_truth(
-    figure: HandFigure, qpos: Float[np.ndarray, "27"], number: int, camera: Camera, pictures: Pictures
+    figure: HandFigure,
+    qpos: Float[np.ndarray, "27"],
+    number: int,
+    camera: Camera,
+    pictures: Pictures,
+    *,
+    recorded: bool = True,
 ) -> HandTruth:
     """Ground truth of one hand.
 
@@ -30,6 +36,7 @@ def hand_truth(
         number: Index of the hand among those in the picture.
         camera: The camera.
         pictures: Depth and parts of that camera.
+        recorded: Whether to compute the vertices, else there are none.
     """
     model = figure.fit.model
     keypoints = hand_keypoints(model, qpos[None])[0]
@@ -41,9 +48,9 @@ def hand_truth(
         qpos=qpos,
         keypoints=pixels,
         keypoints_world=keypoints,
-        visible=_visible(keypoints, pixels, figure.flesh, number, camera, pictures),
+        visible=_visible(keypoints, pixels, figure.thickness, number, camera, pictures),
         box=_box(pictures.parts, number),
-        vertices=model.skin(qpos[None])[0].astype(np.float32),
+        vertices=model.skin(qpos[None])[0].astype(np.float32) if recorded else np.empty((0, 3), np.float32),
         marker_names=figure.fit.layout.names if worn else (),
         markers=figure.markers(qpos) if worn else np.empty((0, 3)),
     )
@@ -52,28 +59,42 @@ def hand_truth(
 def _visible(
     keypoints: NDArray[np.float64],
     pixels: NDArray[np.float64],
-    flesh: NDArray[np.float64],
+    thickness: NDArray[np.float64],
     number: int,
     camera: Camera,
     pictures: Pictures,
 ) -> Bool[np.ndarray, "21"]:
-    """Keypoints in the picture with nothing in front of them but the flesh around them.
+    """Keypoints whose pixel shows the finger that they are in.
 
-    Other hands and objects hide whatever is behind them; the hand itself hides what lies deeper under the
-    surface that the pixel shows than the joint's own flesh reaches.
+    The pixel is one of this hand, of the keypoint's digit (or of the palm, where it is at its edge), and the
+    keypoint is no deeper under the surface there than the finger is thick.
     """
-    assert pictures.instances is not None and pictures.depth is not None
+    assert pictures.parts is not None and pictures.instances is not None and pictures.depth is not None
     width, height = camera.size
     inside = (pixels >= 0.0).all(axis=1) & (pixels[:, 0] < width) & (pixels[:, 1] < height)
     columns, rows = np.where(inside[:, None], pixels, 0.0).astype(np.int64).T
-    instances, local = pictures.instances[rows, columns], camera.local(keypoints)
-    mine, ahead = instances == 1 + number, local[:, 2] > 0.0
+    bones = pictures.parts[rows, columns].astype(np.int64) - 1 - PARTS_A_HAND * number
+    own = inside & (pictures.instances[rows, columns] == 1 + number) & (bones >= 0) & (bones < PARTS_A_HAND)
+    own &= _ALLOWED[np.arange(len(keypoints)), np.where(own, bones, 0)]
+    local = camera.local(keypoints)
+    ahead = local[:, 2] > 0.0
     slant = np.linalg.norm(local, axis=1) / np.where(ahead, local[:, 2], np.inf)
     under = slant * (local[:, 2] - pictures.depth[rows, columns])
-    hidden = (instances > 0) & (under > np.where(mine, _SLANTING * flesh, 0.0))
     # Fisheyes see sideways and back, where there is no depth: the hand's own surface must do.
-    visible: NDArray[np.bool_] = inside & np.where(ahead, ~hidden, mine)
+    visible: NDArray[np.bool_] = own & np.where(ahead, under <= thickness, True)
     return visible
+
+
+def _allowed_parts() -> Bool[np.ndarray, "21 32"]:
+    """Parts of the hand that may show each keypoint: those of its digit; the wrist's the palm and forearm."""
+    allowed = np.zeros((len(KEYPOINT_NAMES), PARTS_A_HAND), dtype=bool)
+    for keypoint, digit in enumerate(KEYPOINT_DIGITS):
+        allowed[keypoint, list(bones_of(DIGITS[digit])) if digit >= 0 else [FOREARM]] = True
+        allowed[keypoint, PALM] = _PALM_SIDE[keypoint]
+    return allowed
+
+
+_ALLOWED: Final = _allowed_parts()
 
 
 def _box(parts: UInt8[np.ndarray, "H W"], number: int) -> Float[np.ndarray, "4"]:

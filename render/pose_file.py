@@ -1,11 +1,9 @@
-"""Own poses: qpos in an array or an `.npz`, checked, and whose hands they are."""
+"""Own poses: qpos in an array, an `.npz` or a `.csv`, checked, and whose hands they are."""
 
 from __future__ import annotations
 
 import warnings
-import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -19,18 +17,17 @@ from handsim.files.inputs import check_regular
 from handsim.hand.model import join_qpos
 from handsim.hand.records import HAND_DTYPE, unpack_hand
 from handsim.hand.shape import HandShape, shape_from_measures
-from handsim.hand.topology import NUM_JOINTS, NUM_QPOS
+from handsim.hand.topology import NUM_JOINTS, NUM_QPOS, Side
+from handsim.motion_files.joint_table import read_joint_csv
 from handsim.space.transforms import rotation_quaternions
 from poses.shapes.couplings import HIGH, LOW
 
 KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "hand_size")
+CSV: Final = ".csv"
 MOST_PEOPLE: Final = 1_000_000
 _MOST_FRAMES: Final = 10_000_000
 _FARTHEST: Final = 50.0  # [m] of a wrist from the origin
 _BEYOND: Final = np.deg2rad(10.0)  # out of a joint's range that is told
-_DAMAGE: Final = (
-    ValueError, KeyError, TypeError, OverflowError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error
-)  # fmt: skip
 
 
 class OwnPoses(NamedTuple):
@@ -46,27 +43,44 @@ class OwnPoses(NamedTuple):
     """Hands of the people; None where the poses do not say."""
 
 
-def read_pose_file(path: Path, num_hands: int) -> OwnPoses:
-    """Poses of an `.npz` that `numpy.savez` wrote; docs/rendering.md has its arrays.
+def read_pose_file(path: Path, sides: Sequence[Side] | None = None) -> tuple[OwnPoses, tuple[Side, ...]]:
+    """Poses of an `.npz` that `numpy.savez` wrote, or of a `.csv` of `handsim export`; and whose they are.
+
+    docs/rendering.md has the arrays, docs/motion_files.md the columns.
 
     Args:
         path: The file; nothing in it is unpickled.
-        num_hands: Number of hands in each frame, H.
+        sides: Whose poses an `.npz` has, in its order, a right hand's when not given; or which are read of a
+            `.csv`, all when not given.
 
     Raises:
-        CaptureError: It cannot be read, an array has another shape or impossible numbers, or there is no hand
-            in any frame.
+        CaptureError: It cannot be read, an array or column is missing or has another shape or impossible
+            numbers, or there is no hand in any frame.
     """
-    arrays = _arrays(path)
+    if path.suffix.lower() == CSV:
+        arrays, sides = _columns(path, sides)
+    else:
+        arrays, sides = _arrays(path), tuple(sides or ("right",))
     try:
-        qpos = _stored_qpos(arrays, num_hands)
+        qpos = _stored_qpos(arrays, len(sides))
         times = _times(arrays, len(qpos))
         shapes = _stored_shapes(arrays)
         person = _person(arrays, len(qpos), shapes)
     except HandSimError as error:
         raise CaptureError(f"{path}: {error}") from error
     _tell_beyond(str(path), qpos)
-    return OwnPoses(qpos, times, person, shapes)
+    return OwnPoses(qpos, times, person, shapes), sides
+
+
+def _columns(path: Path, sides: Sequence[Side] | None) -> tuple[dict[str, NDArray[Any]], tuple[Side, ...]]:
+    """A table's poses and times, as the arrays of an `.npz` of these hands."""
+    table = read_joint_csv(path)
+    chosen = tuple(sides or table.sides)
+    for side in chosen:
+        if side not in table.sides:
+            raise CaptureError(f"{path}: {choices(side, table.sides, noun='hand')}")
+    qpos = table.qpos[:, [table.sides.index(side) for side in chosen]]
+    return {"qpos": qpos, "times": table.times}, chosen
 
 
 def check_poses(
@@ -105,7 +119,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
         arrays = read_npz(path)
     except OSError as error:
         raise CaptureError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except _DAMAGE as error:
+    except ValueError as error:
         raise CaptureError(f"{path}: not an .npz of plain arrays, or a damaged one") from error
     for name in arrays:
         if name not in KEYS:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, Final
@@ -37,10 +38,15 @@ from render.scenery.photographs import photo_files
 from render.subject import Model, PoseFile, Source, load_subject, source_of
 
 Progress = Callable[[int, int], None]
-"""Called with the numbers of finished pictures and of all pictures."""
+"""Called with the numbers of finished pictures and of all pictures: first with what is there already, then
+about every second, from a thread of its own."""
 SHEET: Final = "contact_sheet.png"
 _RENAMES: Final = "freihand"
 _LEFT_OUT: Final = "left_out-{}.json"
+_CUT_OFF: Final = "cut_off-{}.json"
+_DRAWN: Final = ".drawn-{}"  # grows by a byte a picture of a shard that is being drawn
+_EVERY: Final = 1.0  # [s] between two looks at those
+_SHOWN: Final = 0.5  # of a hand's keypoints, at least, are in the picture of a hand
 _ON_SHEET: Final = 9
 
 
@@ -62,11 +68,12 @@ def render_take(
     """Draw a take or poses of your own into files; a second call resumes where the first was stopped.
 
     Args:
-        source: A take or its path; or poses (T, 27), joint angles (T, 20) with the wrist at the origin, or
-            poses of two hands (T, 2, 27) [m, rad]. NaN is a hand that is not there.
+        source: A take or its path; the path of a .csv of `handsim export`; or poses (T, 27), joint angles
+            (T, 20) with the wrist at the origin, or poses of two hands (T, 2, 27) [m, rad]. NaN is a hand
+            that is not there.
         out: Folder; or a folder of an object store, as `s3://bucket/prefix` or a `UPath`. Each of several
             formats has a folder of its own in it.
-        formats: Some of webdataset, coco, freihand, interhand, exr, png (docs/formats.md).
+        formats: Some of webdataset, coco, yolo, freihand, interhand, exr, png (docs/formats.md).
         config: What to draw.
         model: The hand of your own poses, or both in the poses' order; drawn people when not given.
         times: Time of each pose (T,) [s]; poses are no motion without them.
@@ -77,11 +84,12 @@ def render_take(
         camera: Camera of your own, fixed in the world and used as it is, or several; or the name of a preset.
         workers: Number of processes, all cores when not given; or an executor, as Dask's
             `Client.get_executor()`.
-        progress: Called after every shard.
+        progress: Called while pictures are drawn.
 
     Returns:
         Number of pictures. Depth is in [m], pixels are in [px], as the format has them. Frames with a camera
-        inside a hand or an object are left out; `left_out_frames` tells which.
+        inside a hand or an object are left out; `left_out_frames` tells which, and `cut_off_pictures` which
+        pictures lack a hand of their frame.
 
     Raises:
         HandSimError: The take or the settings cannot be drawn, or all frames would be left out; finished
@@ -109,11 +117,15 @@ def render_take(
     with open_output(place) as output:
         settings = _settings(drawing) | {"formats": list(formats)}
         output.claim(CONFIG, settings, noun="rendering", error=HandSimError)
-        _draw_shards(output, formats, make, [views * len(shard) for shard in shards], workers, progress)
+        counts = [views * len(shard) for shard in shards]
+        drew = _draw_shards(output, formats, make, counts, workers, progress)
         output.fetch(INDEX, _LEFT_OUT.format("*"))
+        lost = frozenset(left_out_frames(output.folder))
+        there = (output.folder / SHEET).is_file() if output.is_here else SHEET in output.sizes()
+        if there and not drew:  # the sheet comes last
+            return views * sum(frame not in lost for shard in shards for frame in shard)
         for name in formats:
             open_writer(name, _folder(output.folder, formats, name)).finish()
-        lost = frozenset(left_out_frames(output.folder))
         drawn = [[frame for frame in shard if frame not in lost] for shard in shards]
         if not any(drawn):
             raise HandSimError(
@@ -132,23 +144,73 @@ def _draw_shards(
     counts: Sequence[int],
     workers: int | Executor,
     progress: Progress | None,
-) -> None:
-    """Have the shards drawn that are not there; each has a count of pictures."""
+) -> bool:
+    """Have the shards drawn that are not there, each of a count of pictures; whether there were any."""
     output.fetch(INDEX, names_of=[f"*{TAR}"])
     done, total = _finished(output.folder, formats), sum(counts)
     count = sum(counts[number] for number in done if number < len(counts))
     todo = [number for number in range(len(counts)) if number not in done]
+    tell = _Telling(output.folder, count, total, progress)
     try:
         job = output.job(make, last=[INDEX, f"*{TAR}"])
-        for drawn, number in enumerate(run_jobs(job, todo, workers)):
-            count += counts[number]
-            if progress is not None:
-                progress(count, total)
-            if drawn == 0 and output.is_here:
-                _check_space(output.folder, len(done) + 1, len(todo) - 1)
+        with tell:
+            for drawn, number in enumerate(run_jobs(job, todo, workers)):
+                count += counts[number]
+                tell.finished(number, counts[number])
+                if drawn == 0 and output.is_here:
+                    _check_space(output.folder, len(done) + 1, len(todo) - 1)
     except KeyboardInterrupt as stop:
         drawn_so_far = f"{count} of {total} images are in {output}, and the same command goes on after them"
         raise Stopped.again(stop, drawn_so_far) from stop
+    return bool(todo)
+
+
+class _Telling:
+    """Tells of pictures while shards, which take minutes, are being drawn.
+
+    Args:
+        folder: Where workers of this machine leave their `_DRAWN` files.
+        count: Pictures that are there already.
+        total: All pictures.
+        progress: Who is told.
+    """
+
+    def __init__(self, folder: Path, count: int, total: int, progress: Progress | None) -> None:
+        self._folder, self._count, self._total, self._progress = folder, count, total, progress
+        self._told = -1
+        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> None:
+        for left in self._folder.glob(_DRAWN.format("*")):
+            left.unlink(missing_ok=True)
+        self._tell()
+        self._thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        for left in self._folder.glob(_DRAWN.format("*")):
+            left.unlink(missing_ok=True)
+
+    def finished(self, shard: int, count: int) -> None:
+        """A shard of so many pictures is drawn."""
+        with self._lock:
+            (self._folder / _DRAWN.format(shard)).unlink(missing_ok=True)
+            self._count += count
+        self._tell()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(_EVERY):
+            self._tell()
+
+    def _tell(self) -> None:
+        with self._lock:
+            parts = [file.stat().st_size for file in self._folder.glob(_DRAWN.format("*")) if file.is_file()]
+            count = min(self._count + sum(parts), self._total)
+            if self._progress is not None and count > self._told:
+                self._told = count
+                self._progress(count, self._total)
 
 
 def _settings(drawing: Drawing) -> dict[str, Any]:
@@ -169,6 +231,22 @@ def left_out_frames(out: str | Place) -> list[int]:
         output.fetch(_LEFT_OUT.format("*"))
         files = sorted(output.folder.glob(_LEFT_OUT.format("*")))
         return sorted(frame for file in files for frame in load_json(file)["frames"])
+
+
+def cut_off_pictures(out: str | Place) -> list[str]:
+    """Pictures of a rendering that lack a hand of their frame: they have less than half of its keypoints."""
+    with open_output(out) as output:
+        output.fetch(_CUT_OFF.format("*"))
+        files = sorted(output.folder.glob(_CUT_OFF.format("*")))
+        return sorted(name for file in files for name in load_json(file)["pictures"])
+
+
+def _lacks_a_hand(frame: RenderedFrame) -> bool:
+    """Whether a hand of the frame is not in its picture, or little of it."""
+    inside = [
+        ((hand.keypoints >= 0.0) & (hand.keypoints < frame.camera.size)).all(axis=1) for hand in frame.hands
+    ]
+    return any(float(shown.mean()) < _SHOWN for shown in inside)
 
 
 def _check_formats(formats: Sequence[str], config: RenderConfig) -> None:
@@ -216,8 +294,20 @@ def _render_shard(
         lost.append(frame)  # on the disk before the shard is, so that no kill loses it
         save_json(out / _LEFT_OUT.format(f"{shard:05d}"), {"frames": lost})
 
-    frames = drawing.frames(shard, enumerate(drawing.shards()[shard]), leave_out=leave_out)
-    kept = list(frames) if len(formats) > 1 else frames
+    cut: list[str] = []
+
+    def counted() -> Iterator[RenderedFrame]:
+        with (out / _DRAWN.format(shard)).open("ab", buffering=0) as drawn:
+            for frame in drawing.frames(shard, enumerate(drawing.shards()[shard]), leave_out=leave_out):
+                if _lacks_a_hand(frame):
+                    cut.append(frame.key)
+                yield frame
+                drawn.write(b".")
+        (out / _DRAWN.format(shard)).unlink(missing_ok=True)
+        if cut:
+            save_json(out / _CUT_OFF.format(f"{shard:05d}"), {"pictures": cut})
+
+    kept = list(counted()) if len(formats) > 1 else counted()
     for name in formats:
         writer = open_writer(name, _folder(out, formats, name))
         if shard not in writer.done():

@@ -16,7 +16,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from gloves.layout import MarkerLayout
 from gloves.takes.take import Take
 from handsim._checks import check_number, check_span, check_type, shown_value
-from handsim.errors import ArgumentError, choices
+from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.keypoints import NUM_KEYPOINTS, hand_keypoints
 from handsim.hand.model import HandModel
 from handsim.hand.records import pack_hand
@@ -29,11 +29,12 @@ from render.cameras.viewpoints import around_hands, crop_around
 from render.config import NEAR_SENSOR, RenderConfig, SpawnKey
 from render.drawing import configured, open_studio, sample_choices
 from render.frames import HandTruth, RenderedFrame
+from render.labeled_photographs import cut_out, load_labeled_hands
 from render.sensors.depth_noise import DepthNoiseConfig
 from render.studio import Moment, Studio
 from render.subject import Model, Subject, load_subject, models_of, source_of, subject_of_poses
 
-_PICTURE, _PERSON = 0, 1  # what a stream's spawn key goes on with
+_PICTURE, _PERSON, _PHOTOGRAPH = 0, 1, 2  # what a stream's spawn key goes on with
 _CROPPED: Final = 0.5  # of the share that hands have of a crop: what they have of the picture it is cut from
 _TRIES: Final = 20  # of a viewpoint that is outside of hands and objects
 _SIDE_CHOICES: Final = (*SIDES, "either")
@@ -48,6 +49,8 @@ class _Sitting(NamedTuple):
     subject: Subject
     frames: NDArray[np.int64]
     """Of the take, in the order in which they are drawn."""
+    person: int
+    """Number of the person."""
 
 
 class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
@@ -73,11 +76,17 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
     | `shape` | (67,) float32 | the numbers of `HandShape`, lengths in [m] |
     | `side` | () int64 | 0 left, 1 right |
     | `K`, `T_world_camera` | (3, 3), (4, 4) float32 | of the camera |
+    | `person`, `tone` | () int64, () float32 | who it is; typology angle of the skin [deg], NaN in gloves |
+    | `drawn` | () bool | whether it is drawn; False for a photograph of yours |
     | `number` | () int64 | k |
 
     Pictures of two hands have an axis of hands in the place of the dots: `keypoints` is (2, 21, 2), and so on
     for all that belongs to a hand. The hands are in the order of the poses or the take; one that is absent is
     NaN, and not visible.
+
+    With `photographs`, some of the pictures are your own labeled photographs. All pictures have then what
+    photographs have: `rgb` (of the simulated sensor, where there is one), `keypoints` (NaN: no label),
+    `visible`, `box`, `side` (-1: unknown), `drawn` and `number`.
 
     Args:
         sampler: Draws joint angles (T, 20) [rad] or whole poses (T, 27) of one hand, which are made valid: a
@@ -98,6 +107,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         glove: Marker layout on the hands, where the config dresses them in gloves.
         batch: Number of pictures in a row that one worker draws. The batches of a `DataLoader` of this batch
             size are then the same with any number of workers; else it is the pictures, in another order.
+        photographs: File of COCO keypoints of your own photographs (21 a hand, in our order), which are
+            beside it or in a folder `images` there; it takes a `crop`.
+        photograph_share: Share of the pictures that are photographs.
         start: Number of the first picture.
         seed: Seed of all random choices; the config's when not given.
 
@@ -122,6 +134,8 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         sitting: int = 128,
         glove: MarkerLayout | str = "dense19",
         batch: int = 1,
+        photographs: str | Path | None = None,
+        photograph_share: float = 0.25,
         start: int = 0,
         seed: int | None = None,
     ) -> None:
@@ -153,6 +167,13 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             raise ArgumentError("the takes have different numbers of hands, expected the same in all")
         if self.config.shutter is not None and not self._takes:
             raise ArgumentError("poses without times have no motion to blur; leave out the shutter")
+        check_number("photograph_share", photograph_share, 0.0, 1.0)
+        self._photographs = None if photographs is None else load_labeled_hands(photographs)
+        self._photograph_share = photograph_share
+        two = bool(self._takes and len(self._takes[0].take.hands) > 1)
+        two |= self._poses is not None and self._poses.ndim == 3
+        if photographs is not None and (crop is None or two or "rgb" not in self.config.passes):
+            raise ArgumentError("photographs go with a crop, colors, and pictures of one hand")
         cv2.setNumThreads(1)  # forked workers would wait for the threads of this process forever
 
     def __iter__(self) -> Iterator[dict[str, torch.Tensor]]:
@@ -164,14 +185,34 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         first = self._start + mine * self._batch
         while True:
             for number in range(first, first + self._batch):
+                rng = SpawnKey.STREAM.rng(self.seed, _PHOTOGRAPH, number)
+                if self._photographs is not None and rng.random() < self._photograph_share:
+                    yield self._photograph(number, rng)
+                    continue
                 place, turn = number % self._people, number // self._people
                 # Not all at once: each of them begins at another point of a sitting.
                 turn += place * self._sitting // self._people
                 person, rank = divmod(turn, self._sitting)
                 if place not in sitting or sitting[place][0] != person:
                     sitting[place] = person, self._new_sitting(person * self._people + place)
-                yield self._picture(number, sitting[place][1], rank)
+                picture = self._picture(number, sitting[place][1], rank)
+                yield picture if self._photographs is None else _as_photographs(picture)
             first += workers * self._batch
+
+    def _photograph(self, number: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+        assert self._photographs is not None and self._crop is not None
+        hand = self._photographs[rng.integers(len(self._photographs))]
+        cut = cut_out(hand, self._crop, float(rng.uniform(*self._fill)), rng=rng)
+        arrays = {
+            "rgb": np.moveaxis(cut.rgb, 2, 0),
+            "keypoints": cut.keypoints.astype(np.float32),
+            "visible": cut.visible,
+            "box": cut.box.astype(np.float32),
+            "side": cut.side,
+            "drawn": np.bool_(False),
+            "number": np.int64(number),
+        }
+        return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
 
     def _new_sitting(self, person: int) -> _Sitting:
         """Somebody new, with poses for all of his or her pictures."""
@@ -183,20 +224,31 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         else:
             subject, frames = self._posed(rng), np.arange(self._sitting)
         studio = open_studio(subject.take.hands, self.config, bodies=subject.take.bodies, rng=rng)
-        return _Sitting(studio, subject, frames)
+        return _Sitting(studio, subject, frames, person)
 
     def _posed(self, rng: np.random.Generator) -> Subject:
         """A person's poses."""
         side: Side = SIDES[rng.integers(2)] if self._side == "either" else self._side
-        shape = sample_shape(side=side, rng=rng)
-        model: Model | tuple[Model, Model] = HandModel(shape) if self._model is None else self._model
-        if self._poses is not None:
-            qpos = self._poses[rng.integers(len(self._poses), size=self._sitting)]
-        else:
-            qpos = sample_poses(models_of(model, 1)[0], self._sitting, self._sampler, rng=rng)
+        while True:
+            shape = sample_shape(side=side, rng=rng)
+            model: Model | tuple[Model, Model] = HandModel(shape) if self._model is None else self._model
+            try:
+                qpos = self._drawn_poses(model, rng)
+                break
+            except PoseError:  # a hand whose fingers are too thick for its breadth
+                if self._model is not None:
+                    raise
         if qpos.ndim == 3 and self._model is None:
             model = (HandModel(shape.with_side("right")), HandModel(shape.with_side("left")))
         return subject_of_poses(qpos, model=model, glove=self._glove)
+
+    def _drawn_poses(
+        self, model: Model | tuple[Model, Model], rng: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """Poses for all pictures of a person."""
+        if self._poses is not None:
+            return self._poses[rng.integers(len(self._poses), size=self._sitting)]
+        return sample_poses(models_of(model, 1)[0], self._sitting, self._sampler, rng=rng)
 
     def _picture(self, number: int, sitting: _Sitting, rank: int) -> dict[str, torch.Tensor]:
         rng = SpawnKey.STREAM.rng(self.seed, _PICTURE, number)
@@ -206,9 +258,10 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         there = {n: pose for n, pose in poses.items() if pose is not None}
         keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
         camera = self._placed(sitting.studio, moment, keypoints, list(there.values()), rng)
-        chosen = sample_choices(self.config, sitting.studio.skin, rng)
+        skin = sitting.studio.skin
+        chosen = sample_choices(self.config, skin, rng, camera.size)
         fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
-        frame = sitting.studio.photograph(moment, camera, fresh)
+        frame = sitting.studio.photograph(moment, camera, fresh, recorded=False)
         truth = dict(zip(there, frame.hands, strict=True))
         hands = [_hand_arrays(truth.get(n), camera, fit.shape) for n, fit in enumerate(take.hands)]
         merged = {name: np.stack([hand[name] for hand in hands]) for name in hands[0]}
@@ -220,6 +273,9 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             | {
                 "K": camera.K.astype(np.float32),
                 "T_world_camera": camera.T_world_camera.astype(np.float32),
+                "person": np.int64(sitting.person),
+                "tone": np.float32(np.nan if skin is None else skin.typology_angle),
+                "drawn": np.bool_(True),
                 "number": np.int64(number),
             }
         )
@@ -245,6 +301,12 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             if studio.is_clear(moment, [camera]):
                 break
         return camera
+
+
+def _as_photographs(picture: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Of a drawn picture what a labeled photograph has."""
+    kept = {name: picture[name] for name in ("keypoints", "visible", "box", "side", "drawn", "number")}
+    return {"rgb": picture.get("noisy_rgb", picture["rgb"])} | kept
 
 
 def _settled(config: RenderConfig) -> RenderConfig:

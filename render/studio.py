@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody, Take
 from handsim.errors import HandSimError
+from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from handsim.space.transforms import pose_matrices
 from render.cameras.warp import faces_for, warp, warp_depth, warp_normals
@@ -26,13 +27,16 @@ from render.painting.painter import Painter, paint, put_before
 from render.painting.rasterizer import NEAR, join, rasterize
 from render.painting.shading import GAMMA
 from render.painting.shadows import light_behind
-from render.scenery.backgrounds import Background, draw_background
+from render.scenery.backgrounds import Background, kept_background
 from render.scenery.enclosures import Enclosure, draw_surroundings
 from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
 from render.sensors.exposure import Exposure, expose, linear_of
 from render.sensors.shutter import Shutter, combine, shutter_times
 from render.skin.look import SkinLook
+
+_AROUND: Final = 8
+"""Pixels around a surface that a depth sensor's windows look at, and more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,13 +144,16 @@ class Studio:
         """The people's skin; None where gloves hide it."""
         return self._people[0].skin if self._people[0].glove is None else None
 
-    def photograph(self, moment: Moment, camera: Camera, choices: FrameChoices) -> RenderedFrame:
+    def photograph(
+        self, moment: Moment, camera: Camera, choices: FrameChoices, *, recorded: bool = True
+    ) -> RenderedFrame:
         """Draw one moment.
 
         Args:
             moment: Poses of the studio's hands and bodies.
             camera: The camera.
             choices: All other choices.
+            recorded: Whether the frame has its choices as JSON and the hands' vertices, which take time.
 
         Raises:
             HandSimError: The camera is inside a hand, or drawing is impossible on this machine.
@@ -164,13 +171,10 @@ class Studio:
         seen = truth
         if choices.enclosure is not None:
             seen = draw_surroundings(choices.background, choices.enclosure, camera).put_behind(truth, camera)
-        if noisy and seen.depth is not None:
-            light, sensor = self._infrared(seen, rgb, present), choices.depth_noise
-            noisy_depth = apply_depth_noise(
-                seen.depth, seen.normals, sensor, camera=camera, reflectance=light, rng=rng
-            )
+        if noisy:
+            noisy_depth = self._noisy_depth(seen, rgb, present, camera, choices.depth_noise, rng)
         hands = tuple(
-            hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth)
+            hand_truth(self._hands[number], take.qpos[frame, number], index, camera, truth, recorded=recorded)
             for index, number in enumerate(present)
         )
         bodies = tuple(
@@ -190,7 +194,7 @@ class Studio:
             points=take.points[frame, known],
             labels=take.labels[frame, known],
             label_names=take.label_names,
-            choices=self._record(choices),
+            choices=self._record(choices) if recorded else {},
         )
 
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
@@ -242,6 +246,43 @@ class Studio:
             warp_normals(camera, normals) if normals else None,
             *ids,
         )
+
+    def _noisy_depth(
+        self,
+        truth: Pictures,
+        rgb: NDArray[np.uint8] | None,
+        present: Sequence[int],
+        camera: Camera,
+        sensor: DepthNoise | None,
+        rng: np.random.Generator,
+    ) -> Float32[np.ndarray, "H W"]:
+        """Depth as the sensor has it; only the part of the picture that has depth takes time."""
+        assert truth.depth is not None
+        noisy = np.zeros_like(truth.depth)
+        left, top, width, height = cv2.boundingRect((truth.depth > 0.0).view(np.uint8))
+        if width == 0:
+            return noisy
+        right, bottom = (
+            min(end + _AROUND, side)
+            for end, side in zip((left + width, top + height), camera.size, strict=True)
+        )
+        left, top = max(0, left - _AROUND), max(0, top - _AROUND)
+        part = np.s_[top:bottom, left:right]
+        cut = {name: getattr(truth, name) for name in ("depth", "normals", "instances")}
+        inner = dataclasses.replace(
+            truth, **{name: None if picture is None else picture[part] for name, picture in cut.items()}
+        )
+        assert inner.depth is not None
+        light = self._infrared(inner, None if rgb is None else rgb[part], present)
+        noisy[part] = apply_depth_noise(
+            inner.depth,
+            inner.normals,
+            sensor,
+            camera=camera.part(left, top, right - left, bottom - top),
+            reflectance=light,
+            rng=rng,
+        )
+        return noisy
 
     def _infrared(
         self, truth: Pictures, rgb: NDArray[np.uint8] | None, present: Sequence[int]
@@ -321,9 +362,18 @@ class Studio:
 
 def _clearance(camera: Camera, drawn: Sequence[Drawn]) -> float:
     """Distance of a camera from the nearest vertex [m]."""
-    center = camera.T_world_camera[:3, 3]
-    distances = (np.linalg.norm(one.triangles.vertices - center, axis=1).min() for one in drawn)
-    return float(min(distances, default=np.inf))
+    x, y, z = camera.T_world_camera[:3, 3].tolist()
+    return min((_distance(one.triangles.vertices, x, y, z) for one in drawn), default=np.inf)
+
+
+@kernel
+def _distance(vertices: NDArray[Any], x: float, y: float, z: float) -> float:
+    """Distance [m] of the nearest of some vertices (V, 3) from a place."""
+    least = np.inf
+    for vertex in range(len(vertices)):
+        dx, dy, dz = vertices[vertex, 0] - x, vertices[vertex, 1] - y, vertices[vertex, 2] - z
+        least = min(least, dx * dx + dy * dy + dz * dz)
+    return float(np.sqrt(least))
 
 
 def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
@@ -338,6 +388,6 @@ def _check_outside(camera: Camera, drawn: Sequence[Drawn], frame: int) -> None:
 @functools.lru_cache(maxsize=2)
 def _background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """SRGB from 0 to 255."""
-    display = cv2.pow(draw_background(background, size), 1.0 / GAMMA)
+    display = cv2.pow(kept_background(background, size), 1.0 / GAMMA)
     drawn: NDArray[np.float32] = np.multiply(display, np.float32(255.0), out=display)
     return drawn

@@ -23,7 +23,7 @@ from handsim.hand.records import HAND_DTYPE, pack_hand
 from handsim.hand.shape import HandShape, sample_shape
 from handsim.hand.topology import SIDES, Side
 from render.config import SpawnKey
-from render.pose_file import MOST_PEOPLE, OwnPoses, check_poses, read_pose_file
+from render.pose_file import CSV, MOST_PEOPLE, OwnPoses, check_poses, read_pose_file
 
 _SECOND: Final = 1.0  # [s] between frames without times, which are poses without a motion
 
@@ -86,15 +86,16 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class PoseFile:
-    """A file of poses (.npz), and what the file does not say of them.
+    """A file of poses (.npz or .csv), and what the file does not say of them.
 
     Raises:
         ArgumentError: A side is unknown or comes twice, or `people` is less than 1.
     """
 
     path: Path
-    sides: tuple[Side, ...] = ("right",)
-    """Which hands the poses are of, in the file's order."""
+    sides: tuple[Side, ...] | None = None
+    """Which hands the poses of an .npz are of, in the file's order, a right one when None; or which of a
+    .csv, which names them, all when None."""
     people: int | None = None
     """People whom the frames are distributed over at random; one for each shard when not given. Not for files
     that say who is in each frame."""
@@ -102,11 +103,12 @@ class PoseFile:
     """Marker layout on the hands, where they wear gloves."""
 
     def __post_init__(self) -> None:
-        for side in self.sides:
+        sides = ("right",) if self.sides is None else self.sides
+        for side in sides:
             if side not in SIDES:
                 raise ArgumentError(choices(side, SIDES, noun="hand"))
-        if not 1 <= len(set(self.sides)) == len(self.sides):
-            raise ArgumentError(f"hands are {' '.join(self.sides) or 'none'}, expected right, left or both")
+        if not 1 <= len(set(sides)) == len(sides):
+            raise ArgumentError(f"hands are {' '.join(sides) or 'none'}, expected right, left or both")
         _check_people(self.people)
 
 
@@ -137,7 +139,7 @@ def source_of(
                 raise ArgumentError(f"{name} belongs to poses of your own; a take and a file have their own")
         if isinstance(source, Take):
             return subject_of_take(source)
-        return Path(source) if isinstance(source, str) else source
+        return _of_file(Path(source)) if isinstance(source, str | Path) else source
     return subject_of_poses(
         source,
         model=model,
@@ -147,6 +149,11 @@ def source_of(
         glove="dense19" if glove is None else glove,
         seed=seed,
     )
+
+
+def _of_file(path: Path) -> Path | PoseFile:
+    """A take's file, or a table of poses."""
+    return PoseFile(path) if path.suffix.lower() == CSV else path
 
 
 def load_subject(source: Source, *, seed: int) -> Subject:
@@ -237,17 +244,17 @@ def subject_of_poses(
 
 
 def _load_poses(file: PoseFile, seed: int) -> Subject:
-    poses = read_pose_file(file.path, len(file.sides))
+    poses, sides = read_pose_file(file.path, file.sides)
     if poses.person is not None and file.people is not None:
         whose = "the hand of one person" if len(poses.shapes or ()) == 1 else "who is in each frame"
         raise CaptureError(f"{file.path}: the file has {whose}; leave out --people")
     record = {
         "sha256": checksum(file.path),
-        "sides": list(file.sides),
+        "sides": list(sides),
         "people": file.people,
         "glove": file.glove,
     }
-    models = tuple(HandModel.named("M", side=side) for side in file.sides)
+    models = tuple(HandModel.named("M", side=side) for side in sides)
     return _posed(
         file.path.name, poses, models, load_layout(file.glove), _cast(poses, file.people, seed), record
     )

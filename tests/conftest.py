@@ -28,9 +28,17 @@ def pytest_configure() -> None:
         )
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Slow tests come first, so that no process waits for the last of another."""
+    """Slow tests come first, so that no process waits for the last of another.
+
+    Tests of a folder go to one process of pytest-xdist: fixtures are then made once, and kernels that only
+    they call are compiled once.
+    """
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(str(item.path.parent.relative_to(ROOT))))
 
 
 @pytest.fixture

@@ -100,6 +100,17 @@ def test_nobody_pays_for_another_packages_imports(packages: tuple[str, ...], hea
     assert run_python(code + f"print(sorted({set(heavy)} & set(sys.modules)))") == "[]\n"
 
 
+def test_labeling_and_tracking_load_only_what_they_need() -> None:
+    code = (
+        "import sys, track.capture_labeling, track.capture_tracking\n"
+        "from train import load_labeler\n"
+        "load_labeler('dense19')\n"
+        "heavy = {'torch', 'mujoco', 'trimesh', 'matplotlib', 'cv2', 'scipy.optimize', 'scipy.spatial'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    assert run_python(code) == "[]\n"
+
+
 def test_a_neighbor_called_train_is_told(tmp_path: Path) -> None:
     (tmp_path / "train.py").write_text("")
     code = f"import sys; sys.path.append({str(ROOT)!r}); import handsim"

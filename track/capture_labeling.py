@@ -1,26 +1,39 @@
-"""Labels of a whole capture, and labeled points as a capture."""
+"""Labels of a whole capture, and labeled points as a capture.
+
+Frames that follow from each other are labeled by tracking them in both directions, other frames alone.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from gloves.captures.capture import Capture
-from gloves.captures.markers import labeled_capture, unlabeled_frames
+from gloves.captures.markers import labeled_capture
 from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
 from handsim.hand.topology import NUM_QPOS
+from track.association.initialization import FEWEST_POINTS
+from track.association.point_linking import change_of_distances
+from track.association.single_frames import label_alone
+from track.both_directions import label_both_ways
+from track.calibration.hand_size import sample_frames
 from track.config import BOTH
-from track.finder.frame_hands import HandFinder
-from track.finder.labeling import label_hands
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
-from track.setup import USUAL_SIZE
+from track.setup import USUAL_SIZE, found_user
+from track.streams.frame_source import StreamedFrame, checked_frames
 from track.user import nominal_user
 from train.glove_labeler import load_labeler
+
+_COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
+_CONTINUOUS: Final = 0.005  # [m] change of the distances in a hand from a frame to the next, at most
+_MOST: Final = 0.5  # share of these pairs that change no more
 
 
 def label_capture(
@@ -32,7 +45,7 @@ def label_capture(
 ) -> Take:
     """Label the hands in every frame of a capture: none, one or two, as `handsim label` does.
 
-    Labels alone: no pose is fitted, so that hands are lost in every frame. `track_capture` finds both.
+    Their size is measured in the capture. The take holds labels alone; `track_capture` gives poses.
 
     Args:
         capture: Points [m], or the path of a marker file or a take; names of markers are not used.
@@ -46,31 +59,28 @@ def label_capture(
 
     Raises:
         ArgumentError: The points are not in meters, or a frame holds more than 512.
-        CaptureError: The capture cannot be read.
+        CaptureError: The capture cannot be read, or most of its points are far from any room.
         LayoutError: The glove is unknown.
         WeightsError: The labeler is unknown, or knows other markers.
     """
     layout = load_layout(glove)
     network = load_labeler(layout, labeler)
     source = capture_of(capture)
-    finder, done = HandFinder(network, layout, rng=np.random.default_rng(0)), 0
-
-    def told(count: int) -> None:
-        nonlocal done
-        done += count
-        if progress is not None:
-            progress(done, source.num_frames)
-
-    frames = label_hands(unlabeled_frames(source), finder, source.rate, told=told)
-    user = nominal_user(layout, USUAL_SIZE, [side for side in BOTH if side in layout.sides])
-    firsts = {side: number * layout.num_markers for number, side in enumerate(user.sides)}
+    frames = checked_frames(source)
+    sides = [side for side in BOTH if side in layout.sides]
+    user = found_user(sample_frames(frames), layout, sides, network)
+    if user is None:
+        user = nominal_user(layout, USUAL_SIZE, sides)
+    told = (lambda count: None) if progress is None else (lambda count: progress(count, len(frames)))
+    if _is_continuous(frames):
+        found = label_both_ways(frames, user, network, told)
+    else:
+        found = label_alone([frame.points for frame in frames], user.hands, network, told)
     present = np.isfinite(source.positions[..., 0])
     labels = np.full(present.shape, -1, dtype=np.int16)
     confidence = np.full(present.shape, np.nan)
-    for row, sure, there, one in zip(labels, confidence, present, frames, strict=True):
-        first = np.where(one.sides > 0, firsts.get("right", -1), firsts.get("left", -1))
-        row[there] = np.where((one.labels >= 0) & (first >= 0), first + one.labels, -1)
-        sure[there] = one.confidence
+    for row, sure, there, one in zip(labels, confidence, present, found, strict=True):
+        row[there], sure[there] = one
     settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
     settings["glove"] = str(glove) if isinstance(glove, str | Path) else layout.name
     no_poses, ids = np.full((source.num_frames, len(user), NUM_QPOS), np.nan), number_runs(present)
@@ -96,3 +106,15 @@ def labeled_points(take: Take, *, sides: bool = True) -> Capture:
     frames = [points[seen] for points, seen in zip(take.points, there, strict=True)]
     rows = [row[seen] for row, seen in zip(labels, there, strict=True)]
     return labeled_capture(frames, rows, names, take.rate)
+
+
+def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
+    """Whether the frames of a capture follow from each other."""
+    pairs = [
+        (one.points, other.points)
+        for one, other in pairwise(frames)
+        if len(one.points) >= FEWEST_POINTS and len(other.points) >= FEWEST_POINTS
+    ]
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED, len(pairs))).astype(int))
+    changes = [change_of_distances(*pairs[number]) for number in chosen]
+    return bool(changes and np.mean([change < _CONTINUOUS for change in changes]) >= _MOST)

@@ -17,7 +17,8 @@ from track.config import TrackerConfig
 
 FARTHEST: Final = 1e3
 """Largest coordinate of a point [m]; no capture volume is larger."""
-_LATEST_TIME: Final = 1e11  # [s]; beyond it a clock of doubles does not move on by a frame
+LATEST_TIME: Final = 1e11
+"""Beyond it a clock of doubles does not move on by a frame [s]."""
 _USUAL_INTERVAL: Final = 1.0 / 120.0  # [s] until a stream has shown its own; usual for optical systems
 _INTERVAL_SMOOTHING: Final = 0.1  # share of the newest interval in the usual one
 _SHORTEST_INTERVAL: Final = 0.1  # of the usual interval, at least between two frames on the tracker's clock
@@ -94,7 +95,7 @@ class Intake:
     def _tick(self, time: float) -> list[str]:
         """Advance the clock; return notes on what was wrong with the time stamp."""
         span = time - self._last
-        if abs(time) < _LATEST_TIME:
+        if abs(time) < LATEST_TIME:
             self._last = time
         else:
             self._clock += self._interval

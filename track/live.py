@@ -2,35 +2,84 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Iterator
-from itertools import chain
 from pathlib import Path
-from time import perf_counter
+from time import monotonic
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from gloves.takes.growing import check_free, growing_path
 from gloves.takes.take import Take
 from handsim.app.interrupts import interrupt_flag
 from handsim.app.messages import LiveStatus
 from track.capture_tracking import OnFrame
+from track.intake import FARTHEST
 from track.recorder import Recorder
 from track.setup import TrackerSetup
 from track.sinks.addresses import SinkGroup
 from track.streams.addresses import open_source
-from track.streams.frame_source import LiveStream, StreamedFrame
+from track.streams.frame_source import StreamedFrame
+from track.streams.live_stream import LiveStream
 from track.tracked_frame import TrackedFrame
 
 _MEASURED: Final = 1.0  # [s] of frames that show enough to measure hands
 _LONGEST_WAIT: Final = 10.0  # [s] for them
+_TOLD: Final = 1.0  # [s] between two lines about frames that are dropped
+_LAGS: Final = 100_000  # newest frames whose lag is kept
+_MANY_FAR: Final = 0.5  # share of the points out of range from which their unit is asked for
 _FOREIGN: Final = "foreign_packets"
-_LEFT_OUT: Final = {
-    "late_frames": "that came late or twice",
+_PACKETS: Final = {"damaged_packets": "damaged", _FOREIGN: "of other senders"}
+"""Counts of packets that do not go on, in words."""
+_FRAMES: Final = {
+    "frames_in_order": "in order",
+    "reordered_frames": "put in order",
+    "doubled_frames": "doubled",
+    "late_frames": "too late",
     "frames_with_wild_times": "with a wild time",
-    "damaged_packets": "damaged",
-    _FOREIGN: "of other senders",
 }
-"""Counts of what does not go on, in words."""
+"""Counts of all frames that came, in words."""
+_OF_THEM: Final = {
+    "dropped_frames": "of them dropped, as they were not kept up with",
+    "frames_after_end": "of them after the end",
+}
+"""Counts of some of them, in words."""
+
+
+class _Now:
+    """How far a stream is kept up with: its rate, lags and what was dropped in the last second."""
+
+    def __init__(self) -> None:
+        self.lags: deque[float] = deque(maxlen=_LAGS)
+        """From the arrival of each frame to its output [s]."""
+        self._begin, self._received, self._dropped = monotonic(), 0, 0
+        self._words = ""
+
+    def add(self, frame: StreamedFrame) -> None:
+        """Take on a frame that has been sent on."""
+        if not frame.silent:
+            self.lags.append(monotonic() - frame.arrived)
+
+    def tick(self, counts: dict[str, int]) -> bool:
+        """Once a second sum up what became of it; returns whether frames were dropped."""
+        now = monotonic()
+        span = now - self._begin
+        if span < _TOLD:
+            return False
+        received = counts["received_frames"] - self._received
+        dropped = counts["dropped_frames"] - self._dropped
+        newest = list(self.lags)[-max(received, 1) :]
+        lag = float(np.median(newest)) if newest else 0.0
+        share = f"{100.0 * dropped / max(received, dropped, 1):.0f} % dropped, " if dropped else ""
+        self._words = f"{received / span:.0f} Hz, {share}{1e3 * lag:.0f} ms behind"
+        self._begin, self._received, self._dropped = now, counts["received_frames"], counts["dropped_frames"]
+        return dropped > 0
+
+    def __str__(self) -> str:
+        """The last second in words; empty before."""
+        return self._words
 
 
 class LiveTake(NamedTuple):
@@ -61,11 +110,12 @@ def measured_setup(
         seconds: How long to wait [s], ten seconds at most.
     """
     if not setup.is_measured:
+        stream.forgive()
         return setup, stream
     first = _first_frames(stream, setup.fewest_points, seconds, status)
     setup = setup.measured([frame for frame in first if len(frame.points) >= setup.fewest_points])
     status.say(f"size of the hands: {setup.user}")
-    return setup, chain(first, stream)
+    return setup, _first_and_others(first, stream)
 
 
 def track_live(
@@ -83,16 +133,23 @@ def track_live(
         address: The stream, see `open_source`.
         out: The take's file; until its end the recording is beside it.
         setup: What the tracker is made of; its hands may be measured in the first second.
-        seconds: How long to record [s]; None for as long as it comes.
+        seconds: How long to record [s], by this machine's clock from the first frame's arrival; None for as
+            long as it comes.
         sinks: Take every frame before it is recorded.
         on_frame: Called with each frame, its time in [s], and what the tracker made of it.
 
     Raises:
         CaptureError: No server answers, fewer than two frames came, or a file cannot be written.
     """
+    check_free(growing_path(out))
+    until = [math.inf]  # [s], when it is over by this machine's clock
+
+    def over() -> bool:
+        return bool(interrupted()) or monotonic() >= until[0]
+
     with (
         interrupt_flag() as interrupted,  # the frames so far are kept
-        open_source(address, ended=interrupted) as stream,
+        open_source(address, ended=over) as stream,
         LiveStatus() as status,
     ):
         setup, frames = measured_setup(stream, setup, status, seconds=seconds)
@@ -102,28 +159,47 @@ def track_live(
             status.say(f"recording to {recorder.part}, which becomes {out} at the end; Ctrl-C ends it")
             status.show("waiting for the first frame")
             try:
-                start = perf_counter()
+                kept_up, asked = _Now(), False
                 for frame in frames:
+                    if seconds is not None:
+                        until[0] = min(until[0], frame.arrived + seconds)
+                    if frame.arrived > until[0]:
+                        break
                     tracked = tracker.step(frame.points, frame.ids, frame.time)
                     sinks.send(frame, tracked)
+                    kept_up.add(frame)
                     recorder.add(frame, tracked)
                     on_frame(frame, tracked)
-                    elapsed = perf_counter() - start if frame.silent else recorder.duration
-                    if seconds is not None and elapsed >= seconds:
-                        break
-                    if frame.silent or status.due:
-                        line = _status_line(frame, tracked, stream.counts, sinks.counts)
-                        status.show(line, now=frame.silent)
+                    dropping = kept_up.tick(stream.counts)
+                    if frame.silent or dropping or status.due:
+                        line = _status_line(frame, tracked, stream.counts, sinks.counts, kept_up)
+                        status.show(line, now=frame.silent or dropping)
+                    if not asked and (doubt := _unit_doubt(stream)):
+                        asked = True
+                        status.say(doubt)
+                stream.end(until[0])
+                counts = stream.counts
                 status.show(f"writing {out}", now=True)
                 take, step = recorder.finish(
-                    stream.counts,
+                    counts,
                     told=lambda: status.show(f"writing {out}; {recorder.part} is kept until then"),
                 )
             except KeyboardInterrupt:
                 status.say(f"the recording is kept in {recorder.part}")
                 recorder.close()
                 raise
-        return LiveTake(take, recorder.num_frames, (*_notes(stream.counts, step), *sinks.notes()))
+        after = counts["frames_in_order"] + counts["reordered_frames"] - counts["dropped_frames"]
+        counts["frames_after_end"] = max(0, after - recorder.num_frames)
+        notes = (*_notes(counts, step, kept_up, stream.order.interval), *sinks.notes())
+        doubt = _unit_doubt(stream)
+        return LiveTake(take, recorder.num_frames, (*notes, doubt) if doubt else notes)
+
+
+def _first_and_others(first: list[StreamedFrame], stream: LiveStream) -> Iterator[StreamedFrame]:
+    """All frames of a stream; those that came while the first ones were looked at are caught up with."""
+    yield from first
+    stream.forgive()
+    yield from stream
 
 
 def _first_frames(
@@ -134,7 +210,7 @@ def _first_frames(
     began = shown = np.inf
     status.show("waiting for hands, to measure their size")
     for frame in stream:
-        now = perf_counter()
+        now = monotonic()
         if frame.silent and frames:
             break
         if not frame.silent:
@@ -147,14 +223,24 @@ def _first_frames(
     return frames
 
 
-def _notes(counts: dict[str, int], step: int) -> tuple[str, ...]:
-    """What is to be told of a stream at its end."""
-    notes = []
-    if counts.get("missing_frames"):
-        notes.append(f"{counts['missing_frames']} frames are missing by their numbers")
-    told = [f"{counts[name]} {what}" for name, what in _LEFT_OUT.items() if counts.get(name)]
-    if told:
-        notes.append(f"packets left out: {', '.join(told)}")
+def _notes(counts: dict[str, int], step: int, now: _Now, interval: float) -> tuple[str, ...]:
+    """What is to be told of a stream at its end; `interval` is from frame to frame [s]."""
+    told = ", ".join(f"{counts[name]} {what}" for name, what in _FRAMES.items())
+    others = ", ".join(f"{counts[name]} {what}" for name, what in _OF_THEM.items() if counts[name])
+    others = f" ({others})" if others else ""
+    notes = [
+        f"{counts['received_frames']} frames received: {told}{others}; {counts['missing_frames']} missing"
+    ]
+    if now.lags:
+        median, most = 1e3 * np.median(now.lags), 1e3 * max(now.lags)
+        notes.append(f"output {median:.0f} ms behind the arrival of frames (median), {most:.0f} ms at most")
+    if counts["missing_at_end"]:
+        lacking = counts["missing_at_end"]
+        quiet = f"no frame came in the last {lacking * interval:.2f} s"
+        notes.append(f"{quiet}, in which {lacking} could have been sent")
+    packets = [f"{counts[name]} {what}" for name, what in _PACKETS.items() if counts.get(name)]
+    if packets:
+        notes.append(f"packets left out: {', '.join(packets)}")
     if counts.get("restarts"):
         notes.append(f"the time of the stream began anew {counts['restarts']} times")
     if step > 1:
@@ -162,8 +248,22 @@ def _notes(counts: dict[str, int], step: int) -> tuple[str, ...]:
     return tuple(notes)
 
 
+def _unit_doubt(stream: LiveStream) -> str:
+    """A question about the unit of a stream whose points lie out of range; empty if they do not."""
+    if stream.far_points <= _MANY_FAR * stream.points or not stream.far_points:
+        return ""
+    return (
+        f"{stream.far_points} of {stream.points} points lie {FARTHEST:.0f} m or more from the origin and are "
+        "left out; are they millimeters? Set the unit of the stream to meters"
+    )
+
+
 def _status_line(
-    frame: StreamedFrame, tracked: TrackedFrame, counts: dict[str, int], dropped: dict[str, int]
+    frame: StreamedFrame,
+    tracked: TrackedFrame,
+    counts: dict[str, int],
+    dropped: dict[str, int],
+    now: _Now,
 ) -> str:
     """Status of a live stream, in one line."""
     if frame.silent:
@@ -172,9 +272,15 @@ def _status_line(
         return "no frames arrive; is the server playing?"
     words = [f"{hand.side} {hand.status.value}" for hand in tracked.hands]
     words += [f"{body.name} {body.status.value}" for body in tracked.bodies]
-    left_out = sum(counts.get(name, 0) for name in _LEFT_OUT if name != _FOREIGN)
+    rms = [hand.rms for hand in tracked.hands if np.isfinite(hand.rms)]
+    words += [f"RMS {1e3 * max(rms):.1f} mm"] if rms else []
+    words += [str(now)] if str(now) else []
+    left_out = sum(
+        counts.get(name, 0) for name in ("late_frames", "frames_with_wild_times", "damaged_packets")
+    )
     for count, what in (
         (counts.get("missing_frames", 0), "missing"),
+        (counts.get("dropped_frames", 0), "dropped"),
         (left_out, "left out"),
         (sum(dropped.values()), "not sent"),
     ):

@@ -30,6 +30,7 @@ from gloves.takes.take import (
 )
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, CaptureError
+from handsim.files.atomic import remove_abandoned
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
@@ -128,6 +129,7 @@ class Recorder:
         out = Path(path)
         if out.suffix.lower() != ".npz":
             raise ArgumentError(f"path is {path}, expected a file name that ends in .npz")
+        remove_abandoned(out)  # of a run that was killed while it finished
         self.part = growing_path(out)
         """The file of the recording."""
         self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies

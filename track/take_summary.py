@@ -1,19 +1,42 @@
-"""Summary of a tracked take, as lines of text, and what in it tells of a mistake."""
+"""Summary of a take, as lines of text, what in it tells of a mistake, and frames that deserve a look."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
 
-from gloves.takes.take import LOST, STATUSES, Take
+from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
+from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.topology import Side
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
 _MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
 _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points
+_CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
+_MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
+
+
+class Doubt(NamedTuple):
+    """Frames that deserve a look."""
+
+    first: int
+    last: int
+    """The last one, which belongs to them."""
+    worst: int
+    """The one to look at."""
+    of: str
+    """The side of a hand, or the name of a label."""
+    why: str
+    """In words."""
+
+    @property
+    def words(self) -> str:
+        """Of what they are, and why."""
+        return f"{self.of} {self.why}"
 
 
 def summarize(take: Take) -> list[str]:
@@ -22,16 +45,16 @@ def summarize(take: Take) -> list[str]:
     for number, side in enumerate(take.sides):
         status, rms = take.status[:, number], take.rms[:, number]
         line = f"{side} hand: {_status_shares(status)}"
-        if np.isfinite(rms).any():
+        if (status != LOST).any():
             missing = take.filled(side)[status != LOST].mean()
-            line += f"; {_median_rms(rms)}, {100 * missing:.1f} % of markers filled in"
+            line += f"; {', '.join([*_median_rms(rms), f'{100 * missing:.1f} % of markers filled in'])}"
         else:
             line += "; it was never found; --hands selects the hands"
         lines.append(line)
     for number, body in enumerate(take.bodies):
-        rms = take.body_rms[:, number]
-        words = _median_rms(rms) if np.isfinite(rms).any() else "it was never found: are these its markers?"
-        lines.append(f"{body.name}: {_status_shares(take.body_status[:, number])}; {words}")
+        status, rms = take.body_status[:, number], take.body_rms[:, number]
+        never = [] if (status != LOST).any() else ["it was never found: are these its markers?"]
+        lines.append("; ".join([f"{body.name}: {_status_shares(status)}", *_median_rms(rms), *never]))
     there = np.isfinite(take.points[..., 0])
     unlabeled = int((there & (take.labels < 0)).sum())
     return [*lines, f"{unlabeled} of {int(there.sum())} points are not markers"]
@@ -39,9 +62,17 @@ def summarize(take: Take) -> list[str]:
 
 def suspicions(take: Take) -> list[str]:
     """What is probably not as the user meant it, as one sentence each with its remedy."""
-    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
     there = np.isfinite(take.points[..., 0])
-    unlabeled = float((take.labels[there] < 0).mean()) if there.any() else 0.0
+    if not there.any():
+        return [f"no point is in any of the {take.num_frames} frames; does the camera system see markers?"]
+    clouds = [points[seen] for points, seen in zip(take.points, there, strict=True)]
+    if all_at_origin(clouds):
+        return [AT_ORIGIN]
+    fault = unit_fault(clouds, only_wide=True)
+    if fault is not None:
+        return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
+    found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
+    unlabeled = float((take.labels[there] < 0).mean())
     if unlabeled > _MOST_UNLABELED:
         found.append(
             f"{100 * unlabeled:.1f} % of the points are not markers of what was tracked; name the glove worn "
@@ -83,5 +114,53 @@ def _status_shares(status: Int[np.ndarray, "T"]) -> str:
     )
 
 
-def _median_rms(rms: Float[np.ndarray, "T"]) -> str:
-    return f"median RMS {1e3 * np.nanmedian(rms):.2f} mm"
+def _median_rms(rms: Float[np.ndarray, "T"]) -> list[str]:
+    """One part of a line; none where no pose was fitted, as of a truth."""
+    return [f"median RMS {1e3 * np.nanmedian(rms):.2f} mm"] if np.isfinite(rms).any() else []
+
+
+def doubts_of(take: Take, most: int | None = _MOST_DOUBTS) -> tuple[Doubt, ...]:
+    """Spans in which a hand is lost or coasts, the longest first, then unsure labels, the worst first.
+
+    A hand that has not been seen yet is not lost.
+
+    Args:
+        take: A tracked take; of a truth there is nothing to doubt.
+        most: The largest number of spans; all when None.
+    """
+    found: list[tuple[float, int, Doubt]] = []
+    for number, side in enumerate(take.sides):
+        status = take.status[:, number]
+        known = np.logical_or.accumulate(status != LOST)
+        for first, last in runs_of(known & ((status == LOST) | (status == COASTING))):
+            state = LOST if (status[first : last + 1] == LOST).any() else COASTING
+            found.append((0.0, last - first, Doubt(first, last, first, side, STATUSES[state])))
+    sure = np.where(take.labels >= 0, take.confidence, 1.0)
+    least = sure.min(axis=1, initial=1.0)
+    for first, last in runs_of(least < _CERTAIN):
+        worst = first + int(least[first : last + 1].argmin())
+        label = take.label_names[take.labels[worst, sure[worst].argmin()]]
+        doubt = Doubt(first, last, worst, label, f"{100 * least[worst]:.0f} %")
+        found.append((float(least[worst]), last - first, doubt))
+    found.sort(key=lambda entry: (entry[0], -entry[1], entry[2].first))
+    return tuple(doubt for *_, doubt in found[:most])
+
+
+def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
+    """The least confidence of a frame's labels; 0 where a hand is coasting or has just been lost.
+
+    NaN in frames without labels.
+    """
+    labeled = take.labels >= 0
+    least: NDArray[np.float64] = np.where(labeled, take.confidence, np.inf).min(axis=1, initial=np.inf)
+    least[np.isinf(least)] = np.nan
+    lost = take.status == LOST
+    just_lost = lost & ~np.concatenate([np.ones_like(lost[:1]), lost[:-1]])
+    least[((take.status == COASTING) | just_lost).any(axis=1)] = 0.0
+    return least
+
+
+def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
+    """The first and the last frame of each unbroken stretch of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

@@ -41,6 +41,10 @@ _DOUBT_SHARE: Final = 0.6  # a track with a smaller share of its markers labeled
 _DOUBT_RMS: Final = 0.003  # [m], biases removed, from which on a track is doubted
 _DOUBT_RADIUS: Final = 0.2  # [m] from the wrist within which points without a label confirm the doubt
 _REPLACEMENT_MARGIN: Final = 20.0  # log-odds by which another pose must be better to replace a doubted track
+_FIRST_WAIT: Final = 0.005  # [s] after a vain attempt to initialize lost hands; less than a frame
+_WAIT_FACTOR: Final = 1.5  # of that time after each vain attempt
+_LONGEST_WAIT: Final = 0.1  # [s]
+_MORE_POINTS: Final = 3  # with which hands are looked for at once
 
 
 class _Outcome(NamedTuple):
@@ -87,6 +91,8 @@ class Tracker:
         self._digits = digit_table(self._states, self._numbering)
         self._initializer = HandInitializer(self._states, asked, config)
         self._review = LabelerReview(asked, len(self.hands), config)
+        self._last_attempt, self._attempt_wait = -np.inf, 0.0  # [s] of looking for lost hands
+        self._attempt_points = 0  # that it looked among
         self._last_sound = np.zeros(len(self.hands))  # [s] when each track was last beyond doubt
 
     def step(
@@ -230,12 +236,26 @@ class Tracker:
         lost = tuple(
             hand for hand, one in enumerate(outcomes) if one.status in (Status.LOST, Status.COASTING)
         )
-        if not lost:
-            return frame, outcomes
         free = frame.free_for(lost)
-        for found in self._initializer.initialize(frame.points[free], lost):
+        if not lost or not self._is_attempt_due(frame.time, len(free)):
+            return frame, outcomes
+        initialized = self._initializer.initialize(frame.points[free], lost)
+        for found in initialized:
             frame, outcomes = self._start(frame, outcomes, found, free)
+        self._attempt_wait = 0.0 if initialized else self._longer_wait()
+        self._last_attempt, self._attempt_points = frame.time, len(free)
         return frame, outcomes
+
+    def _is_attempt_due(self, time: float, num_points: int) -> bool:
+        """Whether lost hands are looked for: less and less often among the same number of points."""
+        return (
+            time >= self._last_attempt + self._attempt_wait
+            or num_points >= self._attempt_points + _MORE_POINTS
+        )
+
+    def _longer_wait(self) -> float:
+        """Time until the next attempt after one in vain [s]."""
+        return min(_WAIT_FACTOR * max(self._attempt_wait, _FIRST_WAIT), _LONGEST_WAIT)
 
     def _replace_doubted(
         self, frame: FrameState, outcomes: tuple[_Outcome, ...]

@@ -120,7 +120,8 @@ class User(Sequence[GloveFit]):
         """Write a hand for other programs, in the flat pose; meters, radians, kilograms.
 
         Args:
-            path: The file: .xml (MuJoCo, with the markers as sites), .urdf, or .glb (rigged skin, y up).
+            path: The file: .xml (MuJoCo, with the markers as sites), .urdf, .osim (OpenSim, with the markers)
+                or .glb (rigged skin, y up).
             side: Which hand; when not given the right hand, or the only one.
             actuators: Position servos in the .xml.
 

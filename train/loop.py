@@ -26,7 +26,7 @@ from train.data.own_corruption import check_corruption
 from train.data.shards import Dataset, load_dataset
 from train.devices.agreement import Agreement, PeerError
 from train.devices.fabric_start import check_devices, start_fabric
-from train.devices.local_processes import Progress, in_local_processes
+from train.devices.local_processes import Progress, Tell, in_local_processes
 from train.devices.world import world_of
 from train.run_result import MOST_HELD_OUT, few, finish_run
 from train.threads import TrainingThreads, check_threads
@@ -46,6 +46,7 @@ def train_labeler(
     *,
     threads: int | None = None,
     progress: Callable[[int, int, float], None] | None = None,
+    told: Callable[[str], None] | None = None,
     save_every: float = 60.0,
     **settings: Any,
 ) -> dict[str, Any]:
@@ -66,6 +67,7 @@ def train_labeler(
         threads: Threads of each process on a CPU; one or all when not given, whichever a few steps show to be
             faster, and one on several devices. Weights differ in their last bits with it.
         progress: Called after every step with samples done, samples expected and the loss.
+        told: Called with what is done beside the steps, such as "pose prior", when it begins.
         save_every: Time between checkpoints [s].
         settings: Settings of `TrainConfig` that differ from `config`: `samples=300_000`; `labeler="cnn"`
             stands for the settings that the paper's network is trained with.
@@ -83,12 +85,14 @@ def train_labeler(
     """
     config, out = _chosen_config(config, settings), _folder(out)
     if config.devices == 1 or world_of().size > 1:
-        return _train(dataset, config, out, threads=threads, progress=progress, save_every=save_every)
+        return _train(
+            dataset, config, out, threads=threads, progress=progress, told=told, save_every=save_every
+        )
     check_threads(threads)
     check_devices(config, config.devices, config.devices)
     checked = load_dataset(dataset)
     job = functools.partial(_train, checked, config, out, threads=threads, save_every=save_every)
-    card: dict[str, Any] = in_local_processes(job, config.devices, progress=progress)
+    card: dict[str, Any] = in_local_processes(job, config.devices, progress=progress, told=told)
     return card
 
 
@@ -113,39 +117,53 @@ def _train(
     *,
     threads: int | None,
     progress: Progress | None,
+    told: Tell | None,
     save_every: float,
 ) -> dict[str, Any]:
     """Train on the device of this process, together with those of the others."""
     fabric = _started(config, out, threads)
+    tell = told if told is not None and fabric.is_global_zero else _say_nothing
     ranks = Agreement(fabric)
     with _curves_closed(fabric), ranks.losses_told():
         with ranks.signals_noted():
+            tell("training set")
             run = _prepare(dataset, config, out, fabric, ranks)
-            chosen = TrainingThreads(_threads(threads, fabric))
+            chosen = TrainingThreads(_threads(threads, fabric), run.try_step)
             with chosen.in_use(), run.kept(out / CHECKPOINT):
-                _do_steps(run, chosen, out / CHECKPOINT, progress, save_every)
+                _do_steps(run, chosen, out / CHECKPOINT, progress, tell, save_every)
         with chosen.in_use(), run.kept(out / CHECKPOINT):
             card: dict[str, Any] = {}
             if fabric.is_global_zero:
-                card = finish_run(run.state, run.rows, run.held_out, run.dataset.manifest, out)
+                card = finish_run(run.state, run.rows, run.held_out, run.dataset.manifest, out, tell)
             return fabric.broadcast(card)
 
 
+def _say_nothing(step: str) -> None:
+    """What is told to where nobody listens."""
+
+
 def _do_steps(
-    run: _Run, chosen: TrainingThreads, checkpoint: Path, progress: Progress | None, save_every: float
+    run: _Run,
+    chosen: TrainingThreads,
+    checkpoint: Path,
+    progress: Progress | None,
+    tell: Tell,
+    save_every: float,
 ) -> None:
     """Do what steps there are to do, and keep the state now and then."""
     state, config = run.state, run.state.config
     saved = time.monotonic()
-    while run.is_unfinished():
+    while run.is_unfinished(tell):
         with chosen.timed_step():
             loss = run.step()
         if progress is not None and state.fabric.is_global_zero:
             progress(min(state.done, config.samples), config.samples, loss)
         if time.monotonic() - saved > save_every:
+            tell("checkpoint")
             state.save(checkpoint)
             saved = time.monotonic()
     run.ranks.agree(lambda: None)  # a signal since the last step ends the run here
+    tell("checkpoint")
     state.save(checkpoint)
 
 
@@ -232,12 +250,13 @@ class _Run:
     rows: MappedRows
     held_out: MappedRows
 
-    def is_unfinished(self) -> bool:
+    def is_unfinished(self, tell: Tell) -> bool:
         """Whether there are steps to do; an evaluation that is due is done first."""
         state, config = self.state, self.state.config
         evaluated = state.history.accuracies[-1][0] if state.history.accuracies else 0
         due = state.done > evaluated and passed(state.done, config, _NUM_EVALUATIONS)
         if due and state.fabric.is_global_zero:
+            tell("held-out frames")
             state.evaluate(few(self.held_out, _CURVE_FRAMES[config.labeler]), self.dataset.marker_names)
         return state.done < config.samples
 
@@ -253,6 +272,11 @@ class _Run:
         if interrupted():
             raise Stopped(interrupted.number)
         return loss
+
+    def try_step(self) -> None:
+        """Do the work of the next step; the state stays as it is."""
+        batch, rng = self._draw()
+        self.state.try_step(batch, rng=rng)
 
     def _draw(self) -> tuple[Batch, np.random.Generator]:
         """The batch of the next step, and the generator that the step goes on with."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,7 +38,12 @@ _SPREADS: Final = (0.002, 0.003, 0.004, 0.006, 0.008, 0.012)  # [m]
 
 
 def finish_run(
-    state: TrainingState, rows: MappedRows, held_out: MappedRows, manifest: Manifest, out: Path
+    state: TrainingState,
+    rows: MappedRows,
+    held_out: MappedRows,
+    manifest: Manifest,
+    out: Path,
+    tell: Callable[[str], None],
 ) -> dict[str, Any]:
     """Evaluate the network, write weights, card and page, and return the card.
 
@@ -48,17 +53,22 @@ def finish_run(
         held_out: What it has not seen.
         manifest: Of the training set.
         out: Folder of the run.
+        tell: Called with the name of each step.
     """
     config, names = state.config, manifest.marker_names
     network = state.averaged()
     if isinstance(network, DeepLabelCNN):
+        tell("costs of the paper's labeler")
         choose_costs(network, names, few(held_out, _COST_FRAMES))
     else:
         assert isinstance(network, SetLabeler)
+        tell("pose prior")
         rng = np.random.default_rng(config.seed)
         network.prior = learn_pose_prior(right_hands(rows, _PRIOR_STRETCH, rng=rng), rng=rng)
+    tell("held-out frames")
     card, report = _card(network, few(held_out, _CARD_FRAMES[config.labeler]), config, manifest)
     card["curve"] = state.history.accuracies
+    tell("weights and report")
     save_network(out, network, card)
     write_run_page(out, card, state.history, report)
     write_model_card(out, card)

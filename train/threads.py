@@ -15,7 +15,7 @@ from typing import Final
 from handsim.errors import ArgumentError
 
 _MOST: Final = 1024
-_STEPS: Final = 2  # of each number of threads whose faster one counts, after one to warm up
+_STEPS: Final = 2  # of each number of threads, the faster of which counts, after one to warm up
 _SLOWER: Final = 1.5  # times of steps, over the usual one, from which on the other number is tried
 _GAIN: Final = 1.15  # by which more threads must be faster to be worth the cores of others
 _labeling: ContextVar[int] = ContextVar("labeling", default=1)
@@ -64,11 +64,12 @@ def torch_threads(count: int) -> Iterator[None]:
 class TrainingThreads:
     """The number of threads that training uses: a given one, or the faster of one and all.
 
-    The steps of the training itself tell: now and then, and as soon as they take longer than they did, the
-    next few are made with the other number, and the faster of both stays.
+    The steps of the training tell how long they take with the chosen number. Now and then, and as soon as
+    they take longer than they did, the other number is tried.
 
     Args:
         given: A number, which then holds.
+        step: Does what a training step does and changes nothing.
         now: Returns the time [s].
     """
 
@@ -78,17 +79,20 @@ class TrainingThreads:
     """Least time between two trials, in times of the trial before; a quarter of it where steps have become
     slower."""
 
-    def __init__(self, given: int | None, *, now: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, given: int | None, step: Callable[[], None], *, now: Callable[[], float] = time.perf_counter
+    ) -> None:
         import torch
 
         check_threads(given)
         self.count = given or 1
-        self._now = now
+        self._step, self._now = step, now
         self._most = torch.get_num_threads()  # what the cores and OMP_NUM_THREADS allow
         self._fixed = given is not None or self._most == 1
-        self._steps: list[float] = []  # times of the steps since the number changed, the first left out
-        self._usual = 0.0  # time of a step with this number; none is known yet
-        self._trial: float | None = None  # time of a step with the other number, while this one is tried
+        self._steps: list[
+            float
+        ] = []  # times of the steps since the number changed; the first may start threads
+        self._usual = 0.0  # time of a step with this number when it was chosen; none is known yet
         self._due = self._soonest = -float("inf")
 
     @contextmanager
@@ -110,29 +114,34 @@ class TrainingThreads:
         _labeling.set(self.count)
         start = self._now()
         yield
-        if not self._fixed:
-            self._learn(self._now() - start)
+        self._steps = [*self._steps[-_STEPS:], self._now() - start]
+        if not self._fixed and len(self._steps) > _STEPS:
+            step = min(self._steps[1:])
+            if self._now() >= (self._soonest if step > _SLOWER * self._usual else self._due):
+                self._try_other(step)
 
-    def _learn(self, took: float) -> None:
-        """Begin a trial of the other number if it is due, or end one."""
-        self._steps.append(took)
-        if len(self._steps) <= _STEPS:  # the first may start threads
-            return
-        step = min(self._steps[-_STEPS:])
-        if self._trial is not None:
-            spent = sum(self._steps)
-            alone, together = (step, self._trial) if self.count == 1 else (self._trial, step)
-            best = self._most if together * _GAIN < alone else 1
-            self._usual, self._trial = alone if best == 1 else together, None
-            self._due = self._now() + max(self.AGAIN, self.SHARE * spent)
-            self._soonest = self._now() + 0.25 * self.SHARE * spent
-            self._use(best)
-        elif self._now() >= (self._soonest if step > _SLOWER * self._usual else self._due):
-            self._trial = step
-            self._use(1 if self.count > 1 else self._most)
+    def _try_other(self, step: float) -> None:
+        """Choose the other number if it is clearly faster than the chosen one, whose steps take `step`."""
+        start = self._now()
+        other = 1 if self.count > 1 else self._most
+        self._time(other)  # the first may start threads
+        tried = self._time(other)
+        for _ in range(_STEPS - 1):
+            if tried < 2.0 * step:  # else a busy machine: no more of these slow steps
+                tried = min(tried, self._time(other))
+        alone, together = (step, tried) if self.count == 1 else (tried, step)
+        best = self._most if together * _GAIN < alone else 1
+        self._usual = together if best > 1 else alone
+        if best != self.count:
+            self.count, self._steps = best, []
+        spent = self._now() - start
+        self._due = self._now() + max(self.AGAIN, self.SHARE * spent)
+        self._soonest = self._now() + 0.25 * self.SHARE * spent
 
-    def _use(self, count: int) -> None:
-        """Use this number from the next step on."""
-        if count != self.count:
-            self._steps = []
-        self.count = count
+    def _time(self, threads: int) -> float:
+        import torch
+
+        torch.set_num_threads(threads)
+        start = self._now()
+        self._step()
+        return self._now() - start

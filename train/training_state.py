@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import time
+import zipfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from handsim.errors import HandSimError, WeightsError
+from handsim.files.arrays import check_members
 from handsim.files.atomic import atomic_write
 from train.config import TrainConfig
 from train.data.batches import Batch, Part
@@ -148,6 +150,9 @@ class TrainingState:
             return
         stored = io.BytesIO(found)  # torch calls some damage an OSError
         try:
+            with zipfile.ZipFile(stored) as archive:
+                check_members(archive, len(found))
+            stored.seek(0)
             content = torch.load(stored, weights_only=True, map_location=self.fabric.device)
             self._check(content)
             self.network.load_state_dict(content["network"])
@@ -162,14 +167,25 @@ class TrainingState:
 
     def _check(self, content: dict[str, Any]) -> None:
         """Raise a ValueError unless a checkpoint's tensors are this run's, finite, and its count is one."""
-        done, mean = content["done"], content["mean"]
+        check_stored(content)
+        done, mean, network = content["done"], content["mean"], content["network"]
         if type(done) is not int or done < 0 or done % self.config.batch:
             raise ValueError("the number of samples is none of this run's")
         for name, tensor in self.mean.items():
-            if mean[name].shape != tensor.shape or mean[name].dtype != tensor.dtype:
-                raise ValueError(f"{name} has another shape")
-            if not (torch.isfinite(mean[name]).all() and torch.isfinite(content["network"][name]).all()):
-                raise ValueError(f"{name} is not finite")
+            for stored in (mean[name], network[name]):
+                if stored.shape != tensor.shape or stored.dtype != tensor.dtype:
+                    raise ValueError(f"{name} has another shape")
+                if not torch.isfinite(stored).all():
+                    raise ValueError(f"{name} is not finite")
+
+    def try_step(self, batch: Batch, *, rng: np.random.Generator) -> None:
+        """Do the work of a step, to time it; the state stays as it is."""
+        kept = {name: tensor.detach().clone() for name, tensor in self.network.state_dict().items()}
+        try:
+            self.fabric.backward(self._loss(batch, rng))
+        finally:
+            self.optimizer.zero_grad()
+            self.network.load_state_dict(kept)  # means of batch normalization move in a forward pass
 
 
 def _optimizer(config: TrainConfig, network: nn.Module) -> torch.optim.Optimizer:
@@ -187,6 +203,20 @@ def _rate(config: TrainConfig, progress: float) -> float:
     if config.schedule == "steps":
         return float(0.1 ** ((progress >= 50 / 75) + (progress >= 70 / 75)))
     return float(min(1.0, progress / 0.01 + 1e-3) * 0.5 * (1.0 + np.cos(np.pi * min(1.0, progress))))
+
+
+def check_stored(content: object, seen: set[int] | None = None) -> None:
+    """Raise a ValueError for a tensor in nested tables that has more entries than are stored of it."""
+    seen = set() if seen is None else seen
+    if id(content) in seen:
+        return
+    seen.add(id(content))
+    if isinstance(content, torch.Tensor):
+        if content.numel() * content.element_size() > content.untyped_storage().nbytes():
+            raise ValueError("a tensor of more entries than are stored")
+    elif isinstance(content, dict | list | tuple):
+        for entry in content.values() if isinstance(content, dict) else content:
+            check_stored(entry, seen)
 
 
 def passed(done: int, config: TrainConfig, parts: int) -> bool:

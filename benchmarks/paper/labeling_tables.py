@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple, Self
 
 import numpy as np
 import tyro
@@ -124,9 +124,10 @@ def table3(glove: str = "dense19", seed: int = 0, save: str | None = None) -> No
         save: Name under which the figures are kept in benchmarks/figures, such as table3.
     """
     takes = _simulate(glove, seed)
-    Console().print(_table3(takes))
-    Console().print(_by_marker(takes))
-    save_figures(save, _table3_figures(takes))
+    measures = {kind: TakeMeasures.of(kind, take) for kind, take in takes.items()}
+    Console().print(_table3(measures))
+    Console().print(_by_marker(measures))
+    save_figures(save, _table3_figures(measures))
 
 
 def table4(
@@ -207,37 +208,22 @@ def _simulate(glove: str, seed: int) -> dict[str, Take]:
         return simulate_takes(glove, seed, lambda: bar.advance(task))
 
 
-def _table3(takes: dict[str, Take]) -> Table:
-    table = Table(title="Table 3: ours, and the paper's in brackets")
-    for column in ("Test set", "#Frame", "#Gap", "AGL", "AMF", "ghosts / labels"):
-        table.add_column(
-            column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"
-        )
-    for kind, take in takes.items():
-        present = take.markers_present()
-        ours, paper = count_gaps(present), TWINS[kind].paper
-        ghosts = int(((take.labels < 0) & np.isfinite(take.points[..., 0])).sum())
-        table.add_row(
-            kind,
-            f"{ours.frames} ({paper.frames})",
-            f"{ours.gaps} ({paper.gaps})",
-            f"{ours.average_length:.2f} ({paper.average_length:.2f})",
-            f"{ours.average_missing:.2f} ({paper.average_missing:.2f})",
-            f"{100 * ghosts / present.size:.2f} % ({100 * TWINS[kind].ghost_ratio:.2f} %)",
-        )
-    return table
+class TakeMeasures(NamedTuple):
+    """What Table 3 and the table of markers tell of one take."""
 
+    pairs: list[list[float]]
+    """Frames, gaps, AGL, AMF, ghosts / labels [%]: ours and the paper's."""
+    missing: list[float]
+    """Share of the frames in which a marker is missing, mean, least and most of the markers [%]; median, p90
+    and p99 of the gaps [frames]."""
 
-def _table3_figures(takes: Mapping[str, Take]) -> Figures:
-    """The figures of Table 3."""
-    kept: Figures = {}
-    columns = "frames, gaps, AGL, AMF, ghosts / labels [%], each with the paper's"
-    missing_columns = "missing, mean, least and most marker [%]; gaps, median, p90, p99 [frames]"
-    for kind, take in takes.items():
-        present, paper, key = take.markers_present(), TWINS[kind].paper, kind.split("-")[-1]
-        key, ours = "single" if kind == "single-hand" else key, count_gaps(present)
+    @classmethod
+    def of(cls, kind: str, take: Take) -> Self:
+        """Those of the twin of one of the paper's captures."""
+        present, paper = take.markers_present(), TWINS[kind].paper
+        ours = count_gaps(present)
         ghosts = int(((take.labels < 0) & np.isfinite(take.points[..., 0])).sum())
-        pairs = [
+        pairs: list[list[float]] = [
             [ours.frames, paper.frames],
             [ours.gaps, paper.gaps],
             [ours.average_length, paper.average_length],
@@ -246,9 +232,31 @@ def _table3_figures(takes: Mapping[str, Take]) -> Figures:
         ]
         share, lengths = 100 * (~present).mean(axis=0), run_lengths(~present)
         quantiles = np.quantile(lengths, [0.5, 0.9, 0.99]) if len(lengths) else np.full(3, np.nan)
-        kept[key] = f"Table 3, {kind}: {columns}", pairs
-        row = [share.mean(), share.min(), share.max(), *quantiles]
-        kept[f"gaps_{key}"] = f"{kind}: {missing_columns}", row
+        return cls(pairs, [share.mean(), share.min(), share.max(), *quantiles])
+
+
+def _table3(measures: Mapping[str, TakeMeasures]) -> Table:
+    columns = ("#Frame", "#Gap", "AGL", "AMF", "ghosts / labels")
+    table = _table("Test set", columns, title="Table 3: ours, and the paper's in brackets")
+    for kind, one in measures.items():
+        forms = ("{:.0f}", "{:.0f}", "{:.2f}", "{:.2f}", "{:.2f} %")
+        cells = (
+            f"{form.format(ours)} ({form.format(paper)})"
+            for form, (ours, paper) in zip(forms, one.pairs, strict=True)
+        )
+        table.add_row(kind, *cells)
+    return table
+
+
+def _table3_figures(measures: Mapping[str, TakeMeasures]) -> Figures:
+    """The figures of Table 3."""
+    kept: Figures = {}
+    columns = "frames, gaps, AGL, AMF, ghosts / labels [%], each with the paper's"
+    missing_columns = "missing, mean, least and most marker [%]; gaps, median, p90, p99 [frames]"
+    for kind, one in measures.items():
+        key = "single" if kind == "single-hand" else kind.split("-")[-1]
+        kept[key] = f"Table 3, {kind}: {columns}", one.pairs
+        kept[f"gaps_{key}"] = f"{kind}: {missing_columns}", one.missing
     return kept
 
 
@@ -275,22 +283,22 @@ def _tests_figures(
     return kept
 
 
-def _by_marker(takes: dict[str, Take]) -> Table:
-    table = Table(title="Missing share and gap lengths per marker")
-    for column in ("Test set", "mean", "least", "most", "median gap", "p90", "p99 [frames]"):
-        table.add_column(
-            column, justify="left" if column == "Test set" else "right", no_wrap=column == "Test set"
-        )
-    for kind, take in takes.items():
-        missing = ~take.markers_present()
-        share, lengths = missing.mean(axis=0), run_lengths(missing)
-        quantiles = np.quantile(lengths, [0.5, 0.9, 0.99]) if len(lengths) else np.full(3, np.nan)
-        table.add_row(
-            kind,
-            *(f"{100 * value:.2f} %" for value in (share.mean(), share.min(), share.max())),
-            *(f"{value:.0f}" for value in quantiles),
-        )
+def _by_marker(measures: Mapping[str, TakeMeasures]) -> Table:
+    columns = ("mean", "least", "most", "median gap", "p90", "p99 [frames]")
+    table = _table("Test set", columns, title="Missing share and gap lengths per marker")
+    for kind, one in measures.items():
+        shares, gaps = one.missing[:3], one.missing[3:]
+        table.add_row(kind, *(f"{value:.2f} %" for value in shares), *(f"{value:.0f}" for value in gaps))
     table.add_row("real finger markers", "2.6-4.9 %", "0.2 %", "12.4 %", *PUBLISHED_GAPS, "320-340")
+    return table
+
+
+def _table(first: str, columns: Iterable[str], *, title: str) -> Table:
+    """A table of numbers, whose first column names the rows."""
+    table = Table(title=title)
+    table.add_column(first, no_wrap=True)
+    for column in columns:
+        table.add_column(column, justify="right")
     return table
 
 
@@ -345,10 +353,7 @@ def measure_tests(
 
 def print_table2(nets: Mapping[str, Mapping[str, Report]], *, title: str) -> Table:
     """Slot accuracy of networks (columns) on test sets (rows), the paper's in brackets."""
-    table = Table(title=title)
-    table.add_column("test \\ net", no_wrap=True)
-    for name in nets:
-        table.add_column(name, justify="right")
+    table = _table("test \\ net", nets, title=title)
     for test in AUGMENTATIONS:
         paper = dict(zip(AUGMENTATIONS, TABLE2[test], strict=True))
         table.add_row(
@@ -362,10 +367,7 @@ def print_tests(
     reports: Mapping[str, Report], paper: Mapping[str, tuple[float, ...]], *, title: str
 ) -> Table:
     """Figures (rows) by test set (columns), the paper's in brackets where it has one."""
-    table = Table(title=title)
-    table.add_column("[%]", no_wrap=True)
-    for test in reports:
-        table.add_column(test, justify="right")
+    table = _table("[%]", reports, title=title)
     for figure, words in FIGURES.items():
         printed = dict(zip(TEST_SETS, paper[figure], strict=True)) if figure in paper else {}
         cells = (_cell(report.figures[figure], printed.get(test)) for test, report in reports.items())

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.captures._text import Tell
-from handsim.errors import CaptureError
+from handsim.errors import CaptureError, shortened
 
 _INTEL, _DEC, _SGI = 84, 85, 86
 INTEGER_DTYPES: Final = {_INTEL: "<i2", _DEC: "<i2", _SGI: ">i2"}
@@ -124,7 +124,7 @@ def _walk(
             break
         at = offset_at + offset
         if at > end:
-            tell(f"the parameter section ends with {name[:40]!r}, which points behind it")
+            tell(f"the parameter section ends with {shortened(name)!r}, which points behind it")
             break
     return groups, found
 

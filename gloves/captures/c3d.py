@@ -16,9 +16,10 @@ import numpy as np
 
 from gloves.captures._c3d_frames import BLOCK, MOST_FRAMES, Header, read_points
 from gloves.captures._c3d_parameters import Parameters
-from gloves.captures._text import Tell, meters_per, positive_rate, warn
+from gloves.captures._text import Tell, meters_per, warn
 from gloves.captures.capture import Capture
-from handsim.errors import CaptureError
+from gloves.captures.frame_times import StatedTimes, check_same_rate, timed_positions
+from handsim.errors import CaptureError, shortened
 
 if TYPE_CHECKING:
     import ezc3d
@@ -42,15 +43,15 @@ def read_c3d(data: bytes, tell: Tell = warn) -> Capture:
     header = Header.parse(data, parameters.processor)
     points = read_points(data, parameters, header, tell)
     rate = parameters.number("POINT", "RATE", default=header.rate)
+    check_same_rate("POINT:RATE", rate, "the header's rate", header.rate)
     units = next(iter(parameters.strings("POINT", "UNITS")), "")
     if not units:
         tell("the file states no POINT:UNITS, read as millimeters, which most programs write")
     missing = points[..., 3] < 0.0
     positions = points[..., :3] * meters_per(units or "mm")
     positions[missing] = np.nan
-    return Capture(
-        _labels(parameters, points.shape[1]), positions, positive_rate(repr(rate), name="POINT:RATE")
-    )
+    timed = timed_positions(positions, StatedTimes(repr(rate), "POINT:RATE"), tell)
+    return Capture(_labels(parameters, points.shape[1]), *timed)
 
 
 def write_c3d(path: Path, capture: Capture) -> None:
@@ -66,7 +67,7 @@ def write_c3d(path: Path, capture: Capture) -> None:
     for name in capture.names:
         if len(name.encode()) > _MOST_LABEL_BYTES:
             raise CaptureError(
-                f"marker name '{name[:40]}...' is longer than the {_MOST_LABEL_BYTES} bytes of a label"
+                f"marker name '{shortened(name)}' is longer than the {_MOST_LABEL_BYTES} bytes of a label"
             )
     # ezc3d adds '.c3d' to any other ending, '.C3D' too.
     written = path if path.suffix == ".c3d" else path.with_name(f"{path.name}.c3d")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from gloves.captures.frame_times import check_rate
 from handsim.errors import CaptureError
 
 
@@ -15,7 +16,8 @@ class Capture:
     """Trajectories of a marker file: at least one frame and one trajectory.
 
     Raises:
-        CaptureError: The arrays do not fit together, a position is infinite, or the rate is not positive.
+        CaptureError: The arrays do not fit together, a position is infinite, or the rate is not from 1 to
+            5,000 Hz.
     """
 
     names: tuple[str, ...]
@@ -39,8 +41,7 @@ class Capture:
             )
         if np.isinf(positions).any():
             raise CaptureError("positions hold infinite values, expected finite numbers or NaN")
-        if not 0.0 < self.rate < np.inf:
-            raise CaptureError(f"the rate is {self.rate:g} Hz, expected a positive number")
+        check_rate(self.rate)
         positions[np.isnan(positions).any(axis=-1)] = np.nan  # two coordinates do not make a point
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "names", tuple(self.names))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import codecs
 import warnings
 from pathlib import Path
 from typing import Final
 
-from gloves.captures._text import Tell, split_lines
+from gloves.captures._text import Tell, separator_behind, split_lines
 from gloves.captures.c3d import read_c3d, write_c3d
 from gloves.captures.capture import Capture
 from gloves.captures.markers import unlabeled_frames
 from gloves.captures.motive_csv import MOTIVE_BEGIN, read_motive_csv, write_motive_csv
-from gloves.captures.plausibility import unit_fault, zeros_as_missing
+from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault, zeros_as_missing
 from gloves.captures.qtm_tsv import read_qtm_tsv
 from gloves.captures.trc import read_trc, write_trc
 from gloves.captures.vicon_csv import read_vicon_csv, vicon_sections
@@ -24,7 +23,7 @@ from handsim.files.inputs import read_bytes
 
 def _read_csv(data: bytes, tell: Tell) -> Capture:
     """A CSV by its content, since Motive's and Vicon's have the same suffix."""
-    if data.removeprefix(codecs.BOM_UTF8).startswith(MOTIVE_BEGIN):
+    if separator_behind([MOTIVE_BEGIN], split_lines(data[:_BEGIN])[0][0]) is not None:
         return read_motive_csv(data, tell)
     if vicon_sections(split_lines(data)[0]):
         return read_vicon_csv(data, tell)
@@ -34,6 +33,7 @@ def _read_csv(data: bytes, tell: Tell) -> Capture:
     )
 
 
+_BEGIN: Final = 200  # bytes that show which program wrote a CSV
 _READERS: Final = {".trc": read_trc, ".c3d": read_c3d, ".csv": _read_csv, ".tsv": read_qtm_tsv}
 _TEXT_WRITERS: Final = {".trc": write_trc, ".csv": write_motive_csv}
 READABLE: Final = tuple(_READERS)
@@ -89,7 +89,10 @@ def _checked(path: Path, capture: Capture) -> Capture:
             HandSimWarning,
             stacklevel=3,
         )
-    fault = unit_fault(unlabeled_frames(capture))
+    clouds = unlabeled_frames(capture)
+    if all_at_origin(clouds):
+        raise CaptureError(f"{path}: {AT_ORIGIN}, expected positions of markers")
+    fault = unit_fault(clouds)
     if fault is not None:
         raise CaptureError(
             f"{path}: by the unit of length that the file states, {fault.found}; correct that unit, probably "

@@ -16,18 +16,21 @@ import numpy as np
 
 from gloves.captures._text import (
     Tell,
-    csv_cells,
+    header_cells,
     meters_per,
     parse_table,
-    positive_rate,
+    plain_lines,
+    separator_behind,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
+from gloves.captures.frame_times import StatedTimes, timed_positions
 from handsim.errors import CaptureError
 
 _MOST_HEADER_LINES: Final = 20
-MOTIVE_BEGIN: Final = b"Format Version,"
+MOTIVE_BEGIN: Final = b"Format Version"
+_COUNT: Final = "Total Exported Frames"
 _AXES: Final = ["X", "Y", "Z"]
 _TYPES: Final = {"Marker", "Rigid Body", "Rigid Body Marker", "Bone", "Bone Marker"}
 
@@ -36,19 +39,21 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The markers, labeled or not, in the bytes of a Motive CSV; rigid bodies and bones are left out.
 
     Args:
-        data: The file.
-        tell: Called with a sentence where the file states no unit of length.
+        data: The file; its cells are separated by commas, semicolons or tabs.
+        tell: Called with a sentence where the file states no unit of length, or frames are missing.
 
     Raises:
-        CaptureError: Not a Motive export, without marker columns, cut, or with a cell that is not a number.
+        CaptureError: Not a Motive export, without marker columns, cut, with a cell that is not a number, or
+            with rate, times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
-    if not lines[0].startswith(MOTIVE_BEGIN):
+    separator = separator_behind([MOTIVE_BEGIN], lines[0])
+    if separator is None:
         raise CaptureError("not a Motive CSV export: line 1 does not begin with 'Format Version'")
-    rows = [csv_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
+    lines = plain_lines(lines, separator)
+    rows = [header_cells(line, number) for number, line in enumerate(lines[:_MOST_HEADER_LINES], 1)]
     stated = dict(zip(rows[0][::2], rows[0][1::2], strict=False))
     rate_key = "Export Frame Rate" if stated.get("Export Frame Rate") else "Capture Frame Rate"
-    rate = positive_rate(stated.get(rate_key, ""), name=rate_key)
     if not stated.get("Length Units"):
         tell("line 1 states no Length Units, read as meters, which Motive writes unless told otherwise")
     scale = meters_per(stated.get("Length Units") or "Meters")
@@ -64,14 +69,21 @@ def read_motive_csv(data: bytes, tell: Tell = warn) -> Capture:
         lines,
         start=end + 1,
         ended=ended,
-        delimiter=b",",
         num_columns=len(axes),
         column_name=lambda column: f"{names[column]} {axes[column]}".strip(),
         text_columns=frozenset(index for index, axis in enumerate(axes) if axis.lower() == "timecode"),
     )
     positions = table[:, np.array(columns)[:, None] + np.arange(3)]
     labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns, 1))
-    return Capture(labels, positions * scale, rate)
+    times = StatedTimes(
+        stated.get(rate_key, ""),
+        rate_key,
+        numbers=table[:, 0],
+        times=table[:, 1] if axes[1].lower().startswith("time (") or axes[1].lower() == "time" else None,
+        count=stated.get(_COUNT, ""),
+        count_name=_COUNT,
+    )
+    return Capture(labels, *timed_positions(positions * scale, times, tell))
 
 
 def write_motive_csv(path: Path, capture: Capture, *, title: str) -> None:

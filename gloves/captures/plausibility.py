@@ -17,6 +17,8 @@ from handsim.kernels.kernel import kernel
 
 MAX_SPAN: Final = 30.0
 """Largest median span of clouds that are in meters [m]; a hand in millimeters would span more."""
+AT_ORIGIN: Final = "all points are at the origin, (0, 0, 0)"
+"""What is wrong with such clouds."""
 _MIN_SPAN: Final = 0.02  # [m]: smallest median span; a fist with five markers spans three times as much
 _MAX_SPACING: Final = 1.5  # [m]: largest median distance of a point from the nearest other one
 _MIN_POINTS: Final = 5  # from which a cloud shows its unit; fewer points may all be strays
@@ -88,6 +90,11 @@ def _nearest_squared(cloud: Float[np.ndarray, "N 3"]) -> NDArray[np.float64]:
     return nearest
 
 
+def all_at_origin(clouds: Sequence[Float[np.ndarray, "N 3"]]) -> bool:
+    """Whether there are several points, and each of them is at exactly (0, 0, 0)."""
+    return sum(map(len, clouds)) > 1 and not any(cloud.any() for cloud in clouds)
+
+
 def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = False) -> None:
     """Refuse clouds that are not in meters.
 
@@ -96,8 +103,10 @@ def check_unit(clouds: Sequence[Float[np.ndarray, "N 3"]], *, only_wide: bool = 
         only_wide: See `unit_fault`.
 
     Raises:
-        ArgumentError: They cannot be, see `unit_fault`.
+        ArgumentError: They cannot be, see `unit_fault`, or all points are at the origin.
     """
+    if all_at_origin(clouds):
+        raise ArgumentError(f"{AT_ORIGIN}, expected positions in meters")
     fault = unit_fault(clouds, only_wide=only_wide)
     if fault is not None:
         raise ArgumentError(f"{fault.found}, expected a hand in meters{fault.hint}")

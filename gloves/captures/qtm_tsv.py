@@ -13,18 +13,21 @@ from typing import Final
 from gloves.captures._text import (
     MOST_CELLS,
     Tell,
+    cell_number,
     header_cells,
     meters_per,
     parse_table,
-    positive_rate,
+    plain_lines,
+    separator_behind,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
-from handsim.errors import CaptureError
+from gloves.captures.frame_times import StatedTimes, timed_positions
+from handsim.errors import CaptureError, shortened
 
-_BEGINS: Final = (b"NO_OF_FRAMES\t", b"FILE_VERSION\t")
-_KEY: Final = re.compile(rb"[A-Z][A-Z0-9_]*(\t|$)")
+_BEGINS: Final = (b"NO_OF_FRAMES", b"FILE_VERSION")
+_KEY: Final = re.compile(rb"(?!NULL\t)[A-Z][A-Z0-9_]*(\t|$)")
 _LEADING: Final = ("frame", "time")
 _MOST_DIGITS: Final = 12  # of a count
 _UNIT: Final = "mm"  # the only one that QTM writes
@@ -35,30 +38,31 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
 
     Args:
         data: The file.
-        tell: Called with a sentence where there are more frames than stated.
+        tell: Called with a sentence where frames are missing, or there are more than stated.
 
     Raises:
         CaptureError: Not such an export, of other data, cut, or with a cell that is not a number.
     """
     lines, ended = split_lines(data)
-    if not lines[0].startswith(_BEGINS):
+    separator = separator_behind(_BEGINS, lines[0])
+    if separator is None:
         raise CaptureError(
             "not a Qualisys TSV export: line 1 does not begin with 'NO_OF_FRAMES' or 'FILE_VERSION'"
         )
+    lines = plain_lines(lines, separator, wider=True)
     start = next((index for index, line in enumerate(lines) if not _KEY.match(line)), len(lines))
     if start == len(lines) and not ended:
         raise CaptureError("the header is cut: no line of column names or numbers follows it")
     stated = {
         cells[0]: cells[1:]
         for number, line in enumerate(lines[:start], 1)
-        for cells in [header_cells(line, b"\t", number)]
+        for cells in [header_cells(line, number)]
     }
     included = _first(stated, "DATA_INCLUDED") or "3D"
     if included != "3D":
-        raise CaptureError(f"DATA_INCLUDED is '{included[:40]}', expected '3D'; export the 3D data")
+        raise CaptureError(f"DATA_INCLUDED is '{shortened(included)}', expected '3D'; export the 3D data")
     if "MARKER_NAMES" not in stated:
         raise CaptureError("the header states no MARKER_NAMES")
-    rate = positive_rate(_first(stated, "FREQUENCY"), name="FREQUENCY")
     names = _names(stated)
     start, leading = _begin_of_rows(lines, start, 3 * len(names))
 
@@ -72,13 +76,19 @@ def read_qtm_tsv(data: bytes, tell: Tell = warn) -> Capture:
         lines,
         start=start,
         ended=ended,
-        delimiter=b"\t",
         num_columns=leading + 3 * len(names),
         column_name=column_name,
     )
-    _check_count(_first(stated, "NO_OF_FRAMES"), len(table), tell)
-    positions = table[:, leading:].reshape(len(table), len(names), 3)
-    return Capture(names, positions * meters_per(_UNIT), rate)
+    positions = table[:, leading:].reshape(len(table), len(names), 3) * meters_per(_UNIT)
+    times = StatedTimes(
+        _first(stated, "FREQUENCY"),
+        "FREQUENCY",
+        numbers=table[:, 0] if leading > 0 else None,
+        times=table[:, 1] if leading > 1 else None,
+        count=_first(stated, "NO_OF_FRAMES"),
+        count_name="NO_OF_FRAMES",
+    )
+    return Capture(names, *timed_positions(positions, times, tell))
 
 
 def _first(stated: dict[str, list[str]], key: str) -> str:
@@ -113,11 +123,11 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
         start += 1
     if start == len(lines):
         raise CaptureError("no frames: nothing follows the header")
-    cells = header_cells(lines[start], b"\t", start + 1)
+    cells = header_cells(lines[start], start + 1)
     if cells[0].lower() == _LEADING[0]:
         return start + 1, 2 if cells[1:2] and cells[1].lower() == _LEADING[1] else 1
     try:
-        float(cells[0] or "nan")
+        cell_number(cells[0])
     except ValueError:  # names of columns, without frame and time
         return start + 1, 0
     while cells and not cells[-1]:
@@ -128,12 +138,3 @@ def _begin_of_rows(lines: list[bytes], start: int, width: int) -> tuple[int, int
             f"line {start + 1} has {len(cells)} cells, expected {width}, or {width + 2} with frame and time"
         )
     return start, leading
-
-
-def _check_count(stated: str, found: int, tell: Tell) -> None:
-    """Whether there are as many frames as the header states."""
-    count = int(stated[:_MOST_DIGITS]) if stated.isdecimal() else found
-    if count > found:
-        raise CaptureError(f"truncated: NO_OF_FRAMES is {count}, and {found} frames are there")
-    if count < found:
-        tell(f"NO_OF_FRAMES is {count}, and {found} frames are there; all are read")

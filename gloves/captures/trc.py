@@ -1,8 +1,7 @@
 """TRC, the tab-separated text of marker trajectories.
 
 Five header lines (file type, keys, their values, marker names, axes), then one line per frame: number, time,
-and three cells per marker. Frame counts and frame numbers are often wrong in practice, so only names, units,
-rate and the rows themselves are used. Rows may hold more trajectories than line 4 names.
+and three cells per marker. Rows may hold more trajectories than line 4 names.
 """
 
 from __future__ import annotations
@@ -11,24 +10,26 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
 
 from gloves.captures._text import (
+    TAB,
     Tell,
     check_width,
     header_cells,
     meters_per,
     parse_table,
-    positive_rate,
+    plain_lines,
+    separator_behind,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
+from gloves.captures.frame_times import StatedTimes, timed_positions
 from handsim.errors import CaptureError
 
+_BEGIN: Final = b"PathFileType"
 _HEADER_LINES: Final = 5
 _LEADING: Final = 2  # frame number and time
-_UNEVEN: Final = 0.1  # of the step between two frames, by which times may differ that were rounded
 _NO_MARKERS: Final = "no markers: line 4 should read 'Frame#', 'Time', then the marker names"
 _KEYS: Final = (
     "DataRate",
@@ -46,29 +47,31 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
     """The capture in the bytes of a TRC file.
 
     Args:
-        data: The file. Cells are separated by tabs, or by commas where the first line is.
-        tell: Called with a sentence for what is suspicious: a rate that only the column of times states.
+        data: The file. Cells are separated by tabs, or by commas or semicolons where the first line is.
+        tell: Called with a sentence for what is suspicious: missing frames, or a rate that only the column of
+            times states.
 
     Raises:
-        CaptureError: Not a TRC, header or last row cut, unknown units, or a cell that is not a number.
+        CaptureError: Not a TRC, header or last row cut, unknown units, a cell that is not a number, or rate,
+            times and numbers that contradict each other.
     """
     lines, ended = split_lines(data)
-    if not lines[0].lstrip().startswith(b"PathFileType"):
+    if not lines[0].lstrip(b' \t"').startswith(_BEGIN):
         raise CaptureError("not a TRC file: line 1 does not begin with 'PathFileType'")
+    lines = plain_lines(lines, separator_behind([_BEGIN], lines[0]) or TAB, wider=True)
     # A header line counts only with its line end: what precedes a cut may be incomplete.
     whole = len(lines) if ended else len(lines) - 1
     if whole < _HEADER_LINES:
         raise CaptureError(f"the header is cut: expected {_HEADER_LINES} whole lines, got {whole}")
-    delimiter = b"," if lines[0].lstrip().startswith(b"PathFileType,") else b"\t"
     keys, values, titles, axes = (
-        header_cells(line, delimiter, number) for number, line in enumerate(lines[1:_HEADER_LINES], 2)
+        header_cells(line, number) for number, line in enumerate(lines[1:_HEADER_LINES], 2)
     )
     stated = _stated(keys, values)
     if not stated.get("units"):
         raise CaptureError("the header (lines 2 and 3) states no Units")
     scale = meters_per(stated["units"])
     names = _marker_names(titles, sum(bool(cell) for cell in axes))
-    names += _unnamed(lines[_HEADER_LINES:], len(names), delimiter)
+    names += _unnamed(lines[_HEADER_LINES:], len(names))
 
     def column_name(column: int) -> str:
         if column < _LEADING:
@@ -80,16 +83,27 @@ def read_trc(data: bytes, tell: Tell = warn) -> Capture:
         lines,
         start=_HEADER_LINES,
         ended=ended,
-        delimiter=delimiter,
         num_columns=_LEADING + 3 * len(names),
         column_name=column_name,
     )
-    rate = _rate(stated.get("datarate", ""), table[:, 1], tell)
-    return Capture(names, table[:, _LEADING:].reshape(len(table), len(names), 3) * scale, rate)
+    positions = table[:, _LEADING:].reshape(len(table), len(names), 3) * scale
+    times = StatedTimes(
+        stated.get("datarate", ""),
+        "DataRate",
+        numbers=table[:, 0],
+        times=table[:, 1],
+        count=stated.get("numframes", ""),
+        count_name="NumFrames",
+        count_is_reliable=False,
+    )
+    return Capture(names, *timed_positions(positions, times, tell))
 
 
 def write_trc(path: Path, capture: Capture, *, title: str) -> None:
     """Write millimeters with five decimals; a marker that was not seen gets three blank cells.
+
+    A tab ends the rows, and the two header lines above them, as in the files of Cortex: OpenSim does not
+    count a blank cell at the very end of a row, and refuses a row whose last marker is missing without it.
 
     Args:
         path: Where to write.
@@ -106,10 +120,10 @@ def write_trc(path: Path, capture: Capture, *, title: str) -> None:
         f"PathFileType\t4\t(X/Y/Z)\t{title}",
         "\t".join(_KEYS),
         "\t".join(values),
-        "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", ""))]),
-        "\t\t" + "\t".join(f"X{number}\tY{number}\tZ{number}" for number in range(1, num_markers + 1)),
+        "\t".join(["Frame#", "Time", *(cell for name in capture.names for cell in (name, "", "")), ""]),
+        "\t\t" + "".join(f"X{number}\tY{number}\tZ{number}\t" for number in range(1, num_markers + 1)),
     )
-    row_format = "%d\t%.6f" + "\t%.5f" * (3 * num_markers)
+    row_format = "%d\t%.6f\t" + "%.5f\t" * (3 * num_markers)
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(header) + "\n\n")
         for frame, row in enumerate(capture.positions.reshape(num_frames, -1) * 1e3):
@@ -145,14 +159,14 @@ def _marker_names(titles: list[str], num_axes: int) -> tuple[str, ...]:
     return names
 
 
-def _unnamed(rows: list[bytes], num_named: int, delimiter: bytes) -> tuple[str, ...]:
+def _unnamed(rows: list[bytes], num_named: int) -> tuple[str, ...]:
     """Names '*n' for the trajectories that rows hold behind those of line 4, as Cortex writes them.
 
     Raises:
         CaptureError: There is no trajectory at all, or a row has cells that are not three per trajectory.
     """
     expected = _LEADING + 3 * num_named
-    widths = [row.rstrip(b" \t" + delimiter).count(delimiter) + 1 for row in rows]
+    widths = [row.rstrip(b" \t").count(TAB) + 1 for row in rows]
     width = max(widths, default=0)
     extra = max(0, width - expected)
     check_width(width, _HEADER_LINES + 1 + (widths.index(width) if widths else 0))
@@ -161,19 +175,6 @@ def _unnamed(rows: list[bytes], num_named: int, delimiter: bytes) -> tuple[str, 
             f"line {_HEADER_LINES + 1 + widths.index(width)} has {width} cells, expected {expected}, or "
             "three more for each trajectory without a name"
         )
-    if not num_named and not extra and any(row.strip(b" \t" + delimiter) for row in rows):
+    if not num_named and not extra and any(row.strip(b" \t") for row in rows):
         raise CaptureError(_NO_MARKERS)
     return tuple(f"*{num_named + number}" for number in range(1, extra // 3 + 1))
-
-
-def _rate(text: str, times: Float[np.ndarray, "T"], tell: Tell) -> float:
-    """The frame rate [Hz] that the header states, or else the one of evenly spaced times [s]."""
-    try:
-        return positive_rate(text, name="DataRate")
-    except CaptureError:
-        steps = np.diff(times)
-        if len(steps) < 2 or not (steps > 0.0).all() or np.ptp(steps) > _UNEVEN * steps.mean():
-            raise
-    rate = float(1.0 / steps.mean())
-    tell(f"DataRate is '{text}', expected a positive number; by the column of times it is {rate:.6g} Hz")
-    return rate

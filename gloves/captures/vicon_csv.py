@@ -14,15 +14,16 @@ from jaxtyping import Float, Int
 
 from gloves.captures._text import (
     Tell,
-    csv_cells,
+    header_cells,
     meters_per,
     parse_table,
-    positive_rate,
+    plain_lines,
     split_lines,
     warn,
 )
 from gloves.captures.capture import Capture
-from handsim.errors import CaptureError
+from gloves.captures.frame_times import StatedTimes, timed_positions
+from handsim.errors import CaptureError, shortened
 
 _TITLE: Final = "Trajectories"
 _SECTIONS: Final = (_TITLE, "Devices", "Model Outputs", "Joints", "Segments")
@@ -48,8 +49,8 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     """The trajectories in the bytes of a Vicon CSV, labeled or not.
 
     Args:
-        data: The file; its cells are separated by commas or semicolons.
-        tell: Called with a sentence where no unit of length is stated.
+        data: The file; its cells are separated by commas, semicolons or tabs.
+        tell: Called with a sentence where no unit of length is stated, or frames are missing.
 
     Raises:
         CaptureError: Not such an export, without trajectories, cut, or with a cell that is not a number.
@@ -65,23 +66,23 @@ def read_vicon_csv(data: bytes, tell: Tell = warn) -> Capture:
     end = next((row for row in range(at, len(lines)) if not lines[row].strip(_BLANKS)), len(lines))
     if end < at + 4 or (end == at + 4 == len(lines) and not ended):
         raise CaptureError("the header is cut: expected rate, names and axes behind the line 'Trajectories'")
-    delimiter = ";" if lines[at + 3].count(b";") > lines[at + 3].count(b",") else ","
-    rates, names, axes = (csv_cells(lines[row], row + 1, delimiter) for row in range(at + 1, at + 4))
-    rate = positive_rate(rates[0], name="the rate of the trajectories")
+    separator = max(b",", b";", b"\t", key=lines[at + 3].count)
+    lines = [*lines[:at], *plain_lines(lines[at:end], separator, first=at + 1), *lines[end:]]
+    rates, names, axes = (header_cells(lines[row], row + 1) for row in range(at + 1, at + 4))
     columns = _marker_columns(axes, at + 4)
-    start, scales = _scales(lines[:end], at + 4, delimiter, columns, tell)
+    start, scales = _scales(lines[:end], at + 4, columns, tell)
     names += [""] * (len(axes) - len(names))
     table = parse_table(
         lines[:end],
         start=start,
         ended=ended or end < len(lines),
-        delimiter=delimiter.encode(),
         num_columns=len(axes),
         column_name=lambda column: f"{_name_of(names, column)} {axes[column]}".strip(),
     )
     positions = table[:, columns[:, None] + np.arange(3)] * scales[:, None]
     labels = tuple(names[column] or f"*{number}" for number, column in enumerate(columns.tolist(), 1))
-    return Capture(labels, positions, rate)
+    times = StatedTimes(rates[0], "the rate of the trajectories", numbers=table[:, 0])
+    return Capture(labels, *timed_positions(positions, times, tell))
 
 
 def _marker_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
@@ -91,7 +92,7 @@ def _marker_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
         CaptureError: The row does not begin as one of axes does, or names none.
     """
     if axes[0].lower() not in _FIRST_CELLS:
-        raise CaptureError(f"line {number} begins with '{axes[0][:40]}', expected 'Frame'")
+        raise CaptureError(f"line {number} begins with '{shortened(axes[0])}', expected 'Frame'")
     columns = [index for index in range(len(axes) - 2) if axes[index : index + 3] == _AXES]
     if not columns:
         raise CaptureError(f"no markers: line {number} has no axes X, Y, Z")
@@ -99,10 +100,10 @@ def _marker_columns(axes: list[str], number: int) -> Int[np.ndarray, "N"]:
 
 
 def _scales(
-    lines: list[bytes], row: int, delimiter: str, columns: Int[np.ndarray, "N"], tell: Tell
+    lines: list[bytes], row: int, columns: Int[np.ndarray, "N"], tell: Tell
 ) -> tuple[int, Float[np.ndarray, "N"]]:
     """Index of the first row of numbers, and meters per unit of each trajectory."""
-    cells = csv_cells(lines[row], row + 1, delimiter) if row < len(lines) else []
+    cells = header_cells(lines[row], row + 1) if row < len(lines) else []
     if cells and cells[0]:  # a frame's number
         tell("the file states no unit of length, read as millimeters, which Vicon's programs write")
         return row, np.full(len(columns), meters_per("mm"))

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-import tokenize
 import warnings
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -15,7 +12,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from gloves.takes.growing import GrownArchive, growing_path, is_growing
-from handsim.errors import CaptureError, HandSimError, HandSimWarning
+from handsim.errors import CaptureError, HandSimError, HandSimWarning, shortened
 from handsim.files.arrays import read_npz
 from handsim.files.atomic import atomic_write
 from handsim.files.inputs import check_regular
@@ -27,8 +24,8 @@ SCHEMA: Final = 3
 _KINDS: Final = ("take", "tracked take")
 """Kinds in headers: the first of takes, the other of takes as trackers wrote them before schema 3."""
 _DAMAGE: Final = (
-    HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, EOFError,
-    RuntimeError, SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+    HandSimError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RuntimeError,
+    SyntaxError,
 )  # fmt: skip
 """Exceptions that reading a damaged file may raise."""
 
@@ -63,15 +60,15 @@ def read_archive(
     """
     path = Path(path)
     header, arrays = _read(path)
-    kind = header.get("kind", _KINDS[0])
-    if kind not in _KINDS:
-        raise CaptureError(f"{path}: a {kind}, expected a take")
-    if "schema" not in header:
+    kind, schema = header.get("kind", _KINDS[0]), header.get("schema")
+    if not isinstance(kind, str) or not isinstance(schema, int):
         raise CaptureError(_damaged(path))
-    if header["schema"] != SCHEMA or kind != _KINDS[0]:
+    if kind not in _KINDS:
+        raise CaptureError(f"{path}: a {shortened(kind)}, expected a take")
+    if schema != SCHEMA or kind != _KINDS[0]:
         raise CaptureError(
-            f"{path}: a {kind} of schema {header['schema']}, expected a take of schema {SCHEMA}; simulate or "
-            "track it again with this version of handsim"
+            f"{path}: a {kind} of schema {shortened(str(schema))}, expected a take of schema {SCHEMA}; "
+            "simulate or track it again with this version of handsim"
         )
     try:
         return unpack(header, arrays)

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from gloves.takes.columns import Column
 from handsim.errors import CaptureError
-from handsim.files.atomic import atomic_write
+from handsim.files.arrays import check_npy_header
+from handsim.files.atomic import atomic_write, make_folder_of
 
 SUFFIX: Final = ".part"
 """Added to the name of the archive."""
@@ -47,6 +48,15 @@ _COUNTS: Final = Column("counts", "<u4", ("T",))  # points of each frame
 def growing_path(archive: Path) -> Path:
     """Where an archive grows until it is finished."""
     return archive.with_name(archive.name + SUFFIX)
+
+
+def check_free(path: Path) -> None:
+    """Refuse to record to a file that exists: a recording that was cut off is never overwritten."""
+    if os.path.lexists(path):
+        raise CaptureError(
+            f"{path} exists: a recording that was cut off, or one that is still running; give it another "
+            "name or remove it, or name another output"
+        )
 
 
 class GrowingArchive:
@@ -77,14 +87,12 @@ class GrowingArchive:
         self._waiting: list[list[bytes]] = [[] for _ in self._columns]
         self._frames = self._points = self._block = 0
         self._due = math.inf
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder_of(path)
         try:
             self._file = open(path, "xb", buffering=0)
-        except FileExistsError as error:
-            raise CaptureError(
-                f"{path} exists: a recording that was cut off, or one that is still running; give it another "
-                "name or remove it, or name another output"
-            ) from error
+        except FileExistsError:
+            check_free(path)
+            raise
         text = {**header, "arrays": list(arrays), "columns": [column._asdict() for column in columns]}
         parts = [json.dumps(text).encode(), *(_pack_array(array) for array in arrays.values())]
         self._write(_MAGIC + b"".join(_SIZE.pack(len(part)) + part for part in parts))
@@ -328,13 +336,12 @@ def _pack_array(array: NDArray[Any]) -> bytes:
 
 
 def _unpack_array(content: bytes) -> NDArray[Any]:
-    """An array of the .npy format, whose size is that of its bytes."""
+    """An array of the .npy format, whose size is that of its bytes; raises a ValueError if it is not."""
     buffer = io.BytesIO(content)
-    np.lib.format.read_magic(buffer)
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(buffer)
-    if dtype.hasobject or fortran:
-        raise ValueError("objects")
-    return np.frombuffer(content, dtype, offset=buffer.tell()).reshape(shape)
+    check_npy_header(buffer, len(content))
+    buffer.seek(0)
+    array: NDArray[Any] = np.lib.format.read_array(buffer, allow_pickle=False)
+    return array
 
 
 def _column(stored: Mapping[str, Any]) -> Column:

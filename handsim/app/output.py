@@ -16,7 +16,7 @@ from typing import Any, Final
 from upath import UPath
 
 from handsim.app.workers import Job
-from handsim.errors import ArgumentError, HandSimError
+from handsim.errors import ArgumentError, HandSimError, shortened
 from handsim.files.atomic import remove_abandoned, remove_leftovers, temporary_beside
 from handsim.files.inputs import checksum
 from handsim.files.json_files import claim
@@ -39,7 +39,7 @@ def place_of(out: str | Place) -> Place:
     """
     if isinstance(out, Path) or (isinstance(out, str) and "://" not in out):
         return Path(out)
-    wrong = f"the address is '{str(out)[:200]}', expected"
+    wrong = f"the address is '{shortened(str(out), 200)}', expected"
     if not isinstance(out, str | UPath):
         raise ArgumentError(f"{wrong} a folder, or one like s3://bucket/prefix")
     protocol, _, path = str(out).partition("://")

@@ -29,6 +29,12 @@ figcaption, .note { font-size: .92rem; margin-top: .4rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .35rem .9rem .35rem 0; border-bottom: 1px solid var(--line); text-align: right; }
 th:first-child, td:first-child { text-align: left; padding-right: 2.5rem; }
+@media print {
+  :root { color-scheme: light; --ink: #23272f; --soft: #5b6270; --paper: #ffffff; --line: #d9dde3; }
+  @page { margin: 14mm; }
+  body { max-width: none; padding: 0; font-size: .8rem; }
+  h2, h2 + p, tr:first-child { break-after: avoid; } figure, tr { break-inside: avoid; }
+}
 """
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,8 +23,10 @@ from rich.progress import (
 )
 from rich.text import Text
 
+_COUNTS: Final = re.compile(r"[\d.,]+")
 EVERY: Final = 10.0
 """Time between two lines where there is no terminal [s]."""
+_PERIOD: Final = 600.0  # [s] that speeds and the time left are means over
 
 
 @contextmanager
@@ -38,13 +41,46 @@ def progress_bar(unit: str) -> Iterator[tuple[Progress, TaskID]]:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(
+        *columns,
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        speed_estimate_period=_PERIOD,
+    ) as bar:
         task = bar.add_task("", total=1)
         if console.is_terminal:
             yield bar, task
         else:
             with _lines(console, bar.tasks[0], unit):
                 yield bar, task
+
+
+@contextmanager
+def named_steps(first: str) -> Iterator[Callable[[str], None]]:
+    """Names steps whose length is not known, on standard error: on a terminal the running one, else all.
+
+    A step's name may hold counts; without a terminal it is a new line only now and then.
+
+    Args:
+        first: Name of the first step.
+    """
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with console.status(first) as status:
+            yield status.update
+        return
+    last, due = "", 0.0
+
+    def tell(step: str) -> None:
+        nonlocal last, due
+        name, now = _COUNTS.sub("", step), time.monotonic()
+        if name != last or now >= due:
+            last, due = name, now + EVERY
+            console.print(step, soft_wrap=True, markup=False, highlight=False)
+
+    tell(first)
+    yield tell
 
 
 def print_above(bar: Progress) -> Callable[[str], None]:
@@ -82,12 +118,18 @@ def _line(task: Task, unit: str, seconds: float) -> str:
         done = f"working on {unit}"
     else:
         done = f"{task.completed:,.0f} of {total:,.0f} {unit}"
-    clock = f"{seconds // 3600:.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
-    return ", ".join(part for part in (done, task.description, speed, clock) if part)
+    clock = _clock(seconds)
+    rest = task.time_remaining
+    left = f"{_clock(rest)} left" if rest else ""
+    return ", ".join(part for part in (done, task.description, speed, clock, left) if part)
+
+
+def _clock(seconds: float) -> str:
+    return f"{seconds // 3600:.0f}:{seconds % 3600 // 60:02.0f}:{seconds % 60:02.0f}"
 
 
 class _Speed(ProgressColumn):
-    """Recent speed in units per second; blank until there is something to measure."""
+    """Mean speed in units per second; blank until there is something to measure."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()

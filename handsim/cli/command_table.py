@@ -35,6 +35,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "simulate": ("handsim.cli.simulate:simulate", "Simulate a capture of hands, with its truth."),
     "calibrate": ("handsim.cli.calibrate:calibrate", "Fit hands and gloves to a user, from a capture."),
     "track": ("handsim.cli.track:track", "Follow hands through a marker capture or a live stream."),
+    "report": (
+        "handsim.cli.report:report",
+        "Write a page on a take: joint angles, range of motion, gaps, residuals, doubtful frames.",
+    ),
     "replay": ("handsim.cli.replay:replay", "Play a capture as a NatNet server, to try a live set-up."),
     "view": ("handsim.cli.view:view", "Show a file or a live tracker in the browser."),
     "body": ("handsim.cli.body:body", "Write a rigid body's markers as a file, to track it with."),

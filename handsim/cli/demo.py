@@ -12,6 +12,7 @@ from rich.text import Text
 
 from handsim.app.messages import print_line
 from handsim.app.page import write_page
+from handsim.app.progress import named_steps
 from handsim.errors import ArgumentError
 
 
@@ -28,13 +29,11 @@ def demo(out: Path = Path("demo"), seed: int = 0, num_frames: int = 2000) -> Non
     if seed < 0:
         raise ArgumentError(f"seed is {seed}, expected 0 or more")
     out.mkdir(parents=True, exist_ok=True)
-    console, progress = Console(), Console(stderr=True)
-    with tempfile.TemporaryDirectory(prefix=".work-", dir=out) as work, progress.status("starting") as status:
+    console = Console()
+    with tempfile.TemporaryDirectory(prefix=".work-", dir=out) as work, named_steps("starting") as step:
         from handsim.cli.demo_sections import GLOVE, demo_sections
 
-        sections = list(
-            demo_sections(out, Path(work), seed=seed, num_frames=num_frames, report=status.update)
-        )
+        sections = list(demo_sections(out, Path(work), seed=seed, num_frames=num_frames, report=step))
     figures = sections[-1]
     _print_table(console, figures.table, title=f"{num_frames} generated frames, glove {GLOVE}")
     page = out / "index.html"

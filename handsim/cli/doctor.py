@@ -66,9 +66,9 @@ def doctor() -> int:
     Returns:
         0 when everything that the commands need is there, else 1.
     """
-    from rich.console import Console
+    from handsim.app.progress import named_steps
 
-    with Console(stderr=True).status("drawing a picture and looking for a GPU"):
+    with named_steps("drawing a picture and looking for a GPU"):
         findings = examine()
     _print_report(findings)
     return int(any(finding.needed and finding.remedy for finding in findings))
@@ -185,11 +185,11 @@ def check_kernel_cache() -> Finding:
 
 def check_learned_gloves() -> Finding:
     """Where the labelers of gloves that were learned are kept, and how many there are."""
-    from platformdirs import user_cache_dir
-
-    folder = Path(user_cache_dir("handsim", appauthor=False)) / "gloves"
-    count = len(list(folder.glob("*.safetensors")))
-    return Finding("learned gloves", f"{count} in {folder}")
+    try:
+        from train.labelers.storage import learned_folder, learned_gloves
+    except ImportError:  # a dependency is missing, which is told above
+        return Finding("learned gloves", "unknown")
+    return Finding("learned gloves", f"{len(learned_gloves())} in {learned_folder()}")
 
 
 def check_room() -> Iterator[Finding]:

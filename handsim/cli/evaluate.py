@@ -57,15 +57,15 @@ def evaluate(
     network = load_labeler(glove, labeler)
     corruption, rng = Corruption(occlude, ghosts), np.random.default_rng(seed)
     report = evaluate_labeler(network, captures, corruption, every=every, rng=rng)
-    print_figures(
-        {"share": report.figures}, title=f"{report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
-    )
     by_marker = dict(zip(network.marker_names, map(float, report.slot_accuracy_by_marker), strict=True))
-    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
-    print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))
     if json is not None:
         drawn = {"glove": glove, "occlude": occlude, "ghosts": ghosts, "every": every, "seed": seed}
         # JSON has no NaN, which stands where there was nothing to count.
         figures = {name: None if np.isnan(value) else value for name, value in report.figures.items()}
         found = {"frames": report.num_frames, "figures": figures, "numbers": report.numbers}
         save_json(json, {**drawn, **found, "slot_accuracy_by_marker": by_marker})
+    print_figures(
+        {"share": report.figures}, title=f"{report.num_frames} frames, occlude {occlude}, ghosts {ghosts}"
+    )
+    worst = sorted(by_marker, key=by_marker.__getitem__)[:3]
+    print_line("worst markers: " + ", ".join(f"{name} {100 * by_marker[name]:.2f} %" for name in worst))

@@ -24,7 +24,8 @@ def export(
             (.json); or a labeler, by the name of a glove with a shipped one or the folder of a trained one.
         out: The file. Of a take .glb (skinned and animated), .bvh, .usda or .usdc, .csv or .parquet (joint
             angles and positions), .trc (joint positions), .mot (joint angles for OpenSim) or .openxr.json;
-            of a user .xml (MuJoCo), .urdf or .glb; of a labeler .onnx, which labels without torch.
+            of a user .xml (MuJoCo), .urdf, .osim (OpenSim) or .glb; of a labeler .onnx, which labels without
+            torch.
         fps: Frames per second of the file, such as 30 or 60 for a game; those of the take when not given.
         up: The axis of the take that points up; y for captures of Motive's default.
     """

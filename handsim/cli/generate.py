@@ -6,16 +6,18 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import tyro
-from rich.console import Console
 
+from gloves.layout import load_layout
 from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
 from handsim.app.output import place_of
-from handsim.app.progress import print_above, progress_bar
+from handsim.app.progress import named_steps, print_above, progress_bar
+from handsim.hand.topology import SIDES
 from train.data.shards import Dataset
 from train.reports.dataset_page import write_report
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.generation import make_dataset
+from train.simulation.room_settings import SimulatedKind
 from train.simulation.takes import simulate_take
 
 _TAKE_FRAMES: Final = 1200  # of the continuous take for the report's gaps
@@ -56,6 +58,9 @@ def generate(
 def _report(config: DatasetConfig, out: Path) -> Path:
     """Write the page of plots."""
     # Not in make_dataset: a set is complete without its report, whose bytes depend on matplotlib.
-    with Console(stderr=True).status("drawing the report"):
-        take = simulate_take("hand-hand", num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
+    with named_steps("drawing the report"):
+        kind: SimulatedKind = (
+            "hand-hand" if len(load_layout(config.glove).sides) == len(SIDES) else "single-hand"
+        )
+        take = simulate_take(kind, num_frames=_TAKE_FRAMES, glove=config.glove, rig=config.rig)
         return write_report(Dataset(out), present=take.markers_present(), rate=take.rate)

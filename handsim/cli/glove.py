@@ -24,6 +24,7 @@ from gloves.layout import (
     starter_layout,
 )
 from handsim.app.messages import print_line
+from handsim.app.progress import named_steps
 from handsim.errors import ArgumentError, LayoutError
 from handsim.files.atomic import atomic_write
 from handsim.files.outputs import check_outputs
@@ -72,9 +73,9 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
         glove: A shipped name or the path of a .toml file.
     """
     layout = load_layout(glove)
-    table = Table(
-        "", "name", "bone", title=Text(f"{layout.name}: {layout.num_markers} markers"), title_justify="left"
-    )
+    table = Table(box=None, pad_edge=False)
+    for column in ("", "name", "bone"):
+        table.add_column(column, no_wrap=True)
     for column in ("along", "around [deg]", "across", "stalk [mm]"):
         table.add_column(Text(column), justify="right")
     for number, marker in enumerate(layout.markers):
@@ -83,6 +84,7 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
         height = f"{1e3 * marker.height:.1f}" if marker.height else ""
         along = f"{marker.along:.2f}"
         table.add_row(str(number), Text(marker.name), marker.bone, along, around, across, height)
+    print_line(f"{layout.name}: {layout.num_markers} markers")
     console = Console()
     console.print(table)
     console.print(
@@ -204,11 +206,11 @@ def score_glove(
     from train.glove_labeler import load_labeler
 
     rng = np.random.default_rng(seed)
-    with Console(stderr=True).status("simulating hands") as status:
+    with named_steps("simulating hands") as step:
         hands, seen = _hands(motion, layout, cameras, frames, seed, rng)
-        status.update("learning the layout, about a minute the first time")
+        step("learning the layout, about a minute the first time")
         known = learned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
-        status.update("labeling")
+        step("labeling")
         score = score_layout(layout, hands, known, rng=rng)
     _tell(score)
     for number, sentence in enumerate(advice(score), 1):
@@ -292,12 +294,12 @@ def improve_glove(
     check_outputs([glove, rig], [out])
     from track.glove_advice.improvement import Improvement
 
-    with Console(stderr=True).status("putting the glove on") as status:
+    with named_steps("putting the glove on") as step:
         search = Improvement(layout, cameras, keep, rng=np.random.default_rng(seed))
         before = search.worth
         search.resize(count)
-        search.search(60.0 * minutes, lambda worth: status.update(_worth_line(worth)))
-        status.update("dropping one marker at a time, to compare")
+        search.search(60.0 * minutes, lambda worth: step(_worth_line(worth)))
+        step("dropping one marker at a time, to compare")
         fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
     found = search.layout
     save_layout(out, found)

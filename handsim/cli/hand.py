@@ -1,4 +1,4 @@
-"""The command `handsim hand`: a hand for other programs, as a MuJoCo model, a URDF or a mesh."""
+"""The command `handsim hand`: a hand for other programs, as a MuJoCo or OpenSim model, a URDF or a mesh."""
 
 from __future__ import annotations
 
@@ -29,46 +29,55 @@ def hand(
     glove: str | None = None,
     actuators: bool = False,
 ) -> None:
-    """Write a hand as a MuJoCo model, a URDF or a rigged mesh, and its skin as a plain mesh.
+    """Write a hand as a MuJoCo or OpenSim model, a URDF or a rigged mesh, and its skin as a plain mesh.
 
     Args:
-        out: The hand: .xml (MuJoCo: free joint, twenty hinges, capsules), .urdf, or .glb (its skin with bones
-            and weights, y up); meters, radians, kilograms.
+        out: The hand: .xml (MuJoCo: free joint, twenty hinges, capsules), .urdf, .osim (OpenSim: the
+            coordinates of the .mot of handsim export), or .glb (its skin with bones and weights, y up);
+            meters, radians, kilograms.
         size: Size of the hand, M when neither it nor a file is given.
         side: Which hand; the right one, or the only one of a file, when not given.
         shape: A user's file of `handsim calibrate`, for that user's hand instead of a size.
         take: A take of `handsim track` or `handsim simulate`, for a hand in it instead of a size.
         mesh: File for the skin in the flat pose, .glb, .obj, .ply or .stl; in meters, in the wrist's frame.
-        glove: Marker layout whose markers become sites of the .xml: a shipped name or a .toml file. Hands of
-            a file have the sites of their own markers.
+        glove: Marker layout whose markers become sites of the .xml or markers of the .osim: a shipped name
+            or a .toml file. Hands of a file have their own markers.
         actuators: Position servos in the .xml, whose controls are angles within the joints' ranges.
     """
     from gloves.fit import GloveFit
-    from gloves.hand_files import ENDINGS, MESH_ENDINGS, write_hand, write_skin
+    from gloves.hand_files import ENDINGS, MESH_ENDINGS, WITH_MARKERS, write_hand, write_skin
 
     suffix = out.suffix.lower()
     if suffix not in ENDINGS:
         raise ArgumentError(f"--out is {out}, expected a file name that ends in {', '.join(ENDINGS)}")
     if mesh is not None and mesh.suffix.lower() not in MESH_ENDINGS:
         raise ArgumentError(f"--mesh is {mesh}, expected a file name that ends in {', '.join(MESH_ENDINGS)}")
-    if suffix != ".xml" and (actuators or glove is not None):
-        option = "--actuators" if actuators else "--glove"
-        raise ArgumentError(f"given {option} and --out {out}, expected an --out that ends in .xml with it")
+    for option, given, endings in (
+        ("--actuators", actuators, (".xml",)),
+        ("--glove", glove is not None, WITH_MARKERS),
+    ):
+        if given and suffix not in endings:
+            wanted = " or ".join(endings)
+            raise ArgumentError(
+                f"given {option} and --out {out}, expected an --out that ends in {wanted} with it"
+            )
     if mesh is not None and mesh.resolve() == out.resolve():
         raise ArgumentError(f"--out and --mesh are both {out}, expected two files")
     check_outputs([glove, shape, take], (out, mesh))
     chosen, words = _chosen_hand(size, side, shape, take, glove)
     model = chosen.model if isinstance(chosen, GloveFit) else chosen
     write_hand(out, chosen, actuators=actuators)
+    if mesh is not None:
+        write_skin(mesh, model)
     markers = chosen.layout.num_markers if isinstance(chosen, GloveFit) else 0
     extras = {
         ".xml": f"{markers} marker sites" + f", {NUM_JOINTS} servos" * actuators,
         ".urdf": f"{NUM_JOINTS} joints",
+        ".osim": f"{markers} markers",
         ".glb": "rigged skin",
     }
     print_line(f"{out}: {model.shape.side} hand {words}, {extras[suffix]}")
     if mesh is not None:
-        write_skin(mesh, model)
         surface = model.surface
         counts = f"{len(surface.vertices)} vertices, {len(surface.faces)} triangles"
         print_line(f"{mesh}: its skin, {counts}")

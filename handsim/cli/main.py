@@ -20,7 +20,7 @@ from handsim.app.interrupts import Stopped, signals_raise
 from handsim.app.messages import told_warnings
 from handsim.cli.command_table import COMMANDS, load
 from handsim.cli.presets import PresetCommand
-from handsim.errors import HandSimError, choices
+from handsim.errors import SENTENCE, HandSimError, choices, shortened
 
 _BROKEN_PIPE: Final = 141  # 128 and the number of SIGPIPE, as other tools end
 
@@ -111,7 +111,7 @@ def _complain(line: str) -> None:
 
 def _unexpected(program: str, error: Exception) -> str:
     """The sentence of the last resort, with the file that the traceback is in."""
-    what = f"unexpected {type(error).__name__}: {_one_line(error)[:200]}"
+    what = f"unexpected {type(error).__name__}: {shortened(_one_line(error), 200)}"
     trace = traceback.format_exc()
     try:
         prefix = program.replace(" ", "-") + "-"
@@ -147,7 +147,7 @@ _SYSTEM_SENTENCES: Final = {
 
 
 def _one_line(error: Exception) -> str:
-    return " ".join(str(error).splitlines()) or type(error).__name__
+    return shortened(" ".join(str(error).splitlines()), SENTENCE) or type(error).__name__
 
 
 def _abandon_stdout() -> None:

@@ -1,4 +1,4 @@
-"""Options that several commands share: whose hands are tracked."""
+"""Options that several commands share: whose hands are tracked, and into which file."""
 
 from __future__ import annotations
 
@@ -12,6 +12,28 @@ from track.config import BOTH, Size
 
 if TYPE_CHECKING:
     from track.setup import AnyHands
+
+
+def check_take_file(out: Path, *, live: bool) -> None:
+    """Refuse a file for a take that is named otherwise, or whose take a recording would replace.
+
+    Args:
+        out: The option --out.
+        live: Whether a stream is recorded; corrections would fit no other recording.
+
+    Raises:
+        ArgumentError: The name does not end as a take's, or somebody corrected the take there.
+    """
+    from gloves.takes.corrections import corrections_path
+    from gloves.takes.take import SUFFIX
+
+    if out.suffix.lower() != ".npz" or out.name.endswith(SUFFIX):
+        raise ArgumentError(f"--out is {out}, expected a file name that ends in .npz and not in {SUFFIX}")
+    corrections = corrections_path(out)
+    if live and corrections.exists():
+        raise ArgumentError(
+            f"{corrections} corrects the take that --live would replace, expected another --out than {out}"
+        )
 
 
 def chosen_hands(

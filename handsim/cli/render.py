@@ -12,7 +12,7 @@ from rich.console import Console
 
 from handsim.app.cluster import chosen_workers
 from handsim.app.messages import print_line
-from handsim.app.output import place_of
+from handsim.app.output import Place, place_of
 from handsim.app.progress import print_above, progress_bar
 from handsim.errors import HandSimError, choices
 from handsim.files.outputs import check_outputs
@@ -21,12 +21,13 @@ from render.cameras.viewpoints import Placement, ViewConfig
 from render.config import RenderConfig
 from render.formats.merging import merge_renderings
 from render.painting.painter import PainterChoice
+from render.pose_file import CSV
 from render.scenery.backgrounds import KINDS, BackgroundConfig, BackgroundKind
 from render.scenery.photographs import photo_files
 from render.sensors.depth_noise import SENSORS, DepthNoiseConfig
 from render.sensors.exposure import ExposureConfig
 from render.sensors.shutter import ShutterConfig
-from render.session import SHEET, left_out_frames, render_take
+from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
 from render.skin.look import ALL_TONES, TONES, named_tones
 from render.subject import PoseFile
 
@@ -34,7 +35,7 @@ _NO_SENSOR: Final = "none"
 _AUTO_SENSOR: Final = "auto"
 _DEFAULT: Final = RenderConfig()
 _VIEW: Final = ViewConfig()
-_AS_IN_VIEW: Final = ("placement", "camera", "views", "distance", "rig", "cameras")
+_AS_IN_VIEW: Final = ("placement", "camera", "views", "share", "distance", "rig", "cameras")
 _AS_IN_CONFIG: Final = ("passes", "dress", "vary", "painter", "every", "frames_per_shard", "seed")
 
 
@@ -43,14 +44,19 @@ class RenderOptions:
     """`RenderConfig` as the options of the command name it."""
 
     placement: Placement = _VIEW.placement
-    """Position of the cameras. still: in front of the hands. orbit: around them. head: at the user's eyes.
-    anywhere: at another position in every frame. rig: at the cameras of a rig."""
+    """Position of the cameras. still: in front of the hands, following them only where they leave the
+    picture. orbit: around them. head: at the user's eyes. anywhere: at another position in every frame.
+    rig: at the cameras of a rig, turned to the hands, with lenses as long as it takes."""
     camera: str = _VIEW.camera
     """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
     views: int = _VIEW.views
     """Number of cameras; a rig has its own number."""
-    distance: tuple[float, float] = _VIEW.distance
-    """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
+    share: float = _VIEW.share
+    """Share of the picture's height that a hand's longer side has, or a little more; less where all hands
+    of a frame do not fit into the picture otherwise."""
+    distance: tuple[float, float] | None = _VIEW.distance
+    """Instead of the share, nearest and farthest distance from the center of the hands [m], drawn
+    uniformly."""
     rig: str = _VIEW.rig
     """Rig for the placement rig: a shipped name or the path of a .toml file."""
     cameras: str | None = None
@@ -70,8 +76,8 @@ class RenderOptions:
     vary: Literal["shard", "frame"] = _DEFAULT.vary
     """Whether light and background change with every shard or with every frame."""
     depth_sensor: tuple[str, ...] = (_AUTO_SENSOR,)
-    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only, or auto: d435 for
-    the placement head and for --cameras, where hands may be too near for a kinect2; that elsewhere."""
+    """Depth sensors: kinect1, d435, kinect2, azure_kinect, or none for perfect depth only, or auto: d435,
+    and kinect2, which needs half a meter, for the placement rig and from --distance 0.6 on."""
     color_sensor: bool = True
     """Whether noisy colors are written beside the perfect ones."""
     motion_blur: bool = False
@@ -107,7 +113,7 @@ def render(
     *,
     out: Annotated[str, tyro.conf.arg(metavar="PATH")],
     poses: Path | None = None,
-    hands: tuple[Side, ...] = ("right",),
+    hands: tuple[Side, ...] | None = None,
     people: int | None = None,
     glove: str = "dense19",
     merge: tuple[Path, ...] = (),
@@ -122,16 +128,19 @@ def render(
     folder of several.
 
     Args:
-        take: A tracked take (.npz), or the truth of a simulated one (.truth.npz).
+        take: A tracked take (.npz), the truth of a simulated one (.truth.npz), or a .csv of handsim export.
         out: Folder for the pictures, their annotations and contact_sheet.png; or a folder of an object store,
             as s3://bucket/prefix (docs/object_stores.md).
-        poses: Poses of your own (.npz) instead of a take; docs/rendering.md has the arrays.
-        hands: Whose poses these are, in the file's order: right, left, or both.
+        poses: Poses of your own (.npz, or .csv as handsim export writes it) instead of a take;
+            docs/rendering.md has the arrays and columns.
+        hands: Whose poses an .npz has, in its order: right (when not given), left, or both. A .csv names its
+            hands, and all are drawn when not given.
         people: Number of people that they are distributed over; one for each shard when not given.
         glove: Their marker layout with --dress glove: a shipped name or the path of a .toml file.
         merge: Folders of other renderings to be copied into one, with keys and ids of their own.
         options: What to draw.
-        format: File formats: webdataset, coco, freihand, interhand, exr, png; several go into folders.
+        format: File formats: webdataset, coco, yolo, freihand, interhand, exr, png; several go into
+            folders.
         workers: Processes; all cores when not given.
         cluster: Where else to draw shards: tcp://host:port of a Dask scheduler, its file (.json), or local;
             docs/cluster.md.
@@ -145,39 +154,65 @@ def render(
         count = merge_renderings(merge, place)
         print_line(f"{out}: {count} shards of {len(merge)} renderings")
         return
-    if poses is None:
-        if (hands, people, glove) != (("right",), None, "dense19"):
-            raise HandSimError("--hands, --people and --glove belong to --poses; a take has its own")
-        source: Path | PoseFile = cast("Path", take)
-    else:
-        source = PoseFile(poses, hands, people, glove)
+    source = _source(take, poses, hands, people, glove)
     check_outputs((take, poses, options.cameras), (place if isinstance(place, Path) else None,))
     config = options.config()
     start = time.perf_counter()
     if options.photos is not None:
         _print_left_out(options.photos)
+    told: list[tuple[int, int]] = []
     with (
         progress_bar("images") as (bar, task),
         chosen_workers(cluster, workers, print_above(bar)) as chosen,
     ):
+
+        def show(done: int, total: int) -> None:
+            told.append((done, total))
+            doing = "drawing" if done < total else "writing the annotations and the contact sheet"
+            bar.update(task, completed=done, total=total, description=doing)
+
         count = render_take(
             source,
             place,
             format,
             config,
             workers=chosen,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=show,
         )
     seconds = time.perf_counter() - start
+    _print_lacking(out, place)
+    if told and told[0][0] == told[0][1]:
+        print_line(f"{out}: complete already, with all of its {count} images")
+    else:
+        print_line(f"{out}: {count} images in {seconds:.0f} s, {count / seconds:.1f} a second")
+    if {"rgb", "depth"} & set(config.passes):
+        print_line(f"{place}/{SHEET}: some of them at one glance")
+
+
+def _source(
+    take: Path | None, poses: Path | None, hands: tuple[Side, ...] | None, people: int | None, glove: str
+) -> Path | PoseFile:
+    """What is drawn: a take, or poses of one's own."""
+    if take is not None and take.suffix.lower() == CSV:
+        take, poses = None, take
+    if poses is not None:
+        return PoseFile(poses, hands, people, glove)
+    if (hands, people, glove) != (None, None, "dense19"):
+        raise HandSimError("--hands, --people and --glove belong to --poses; a take has its own")
+    return cast("Path", take)
+
+
+def _print_lacking(out: str, place: Place) -> None:
+    """Say which frames were left out, and which pictures lack a hand."""
     lost = left_out_frames(place)
     if lost:
         print_line(
             f"{out}: frames left out: {len(lost)} (the first: {lost[0]}), where a camera would be inside a "
             "hand or an object"
         )
-    print_line(f"{out}: {count} images in {seconds:.0f} s")
-    if {"rgb", "depth"} & set(config.passes):
-        print_line(f"{place}/{SHEET}: some of them at one glance")
+    cut = cut_off_pictures(place)
+    if cut:
+        print_line(f"{out}: images that lack a hand of their frame: {len(cut)} (the first: {cut[0]})")
 
 
 def _tone_ranges(tones: tuple[str, ...]) -> tuple[float, ...]:

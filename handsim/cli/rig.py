@@ -15,6 +15,7 @@ from rich.text import Text
 
 from gloves.layout import load_layout
 from handsim.app.messages import print_line
+from handsim.app.progress import named_steps
 from handsim.errors import ArgumentError, RigError
 from handsim.files.atomic import atomic_write
 from handsim.files.json_files import save_json
@@ -216,9 +217,9 @@ def score_rig_file(
     from train.rig_advice.rig_page import COLUMNS_TOLD, camera_table, work_table, write_rig_page
     from train.rig_advice.rig_score import score_rig, sentences
 
-    with Console(stderr=True).status("simulating hands") as status:
+    with named_steps("simulating hands") as step:
         work, middle, told = _work(take, glove, center, sides, frames, seed)
-        status.update("forecasting")
+        step("forecasting")
         score = score_rig(cameras, work, middle, sides, seed=seed)
     _print(work_table(score))
     _print(camera_table(score))
@@ -275,10 +276,10 @@ def plan_rig(
     from train.rig_advice.plan import plan
 
     camera = _camera(size, field_of_view) if hung is None else hung.cameras[0]
-    with Console(stderr=True).status("simulating hands") as status:
+    with named_steps("simulating hands") as step:
         planned = plan(
             cameras, _checked_sides("--room", room), mounts, load_layout(glove), middle, sides,
-            camera, hung, name=out.stem, told=status.update, seed=seed,
+            camera, hung, name=out.stem, told=step, seed=seed,
         )  # fmt: skip
     table = Table("camera", box=None, pad_edge=False)
     table.add_column(Text("position [m]"), justify="right")

@@ -92,13 +92,14 @@ def track(
         if capture is not None:
             tracked = _track_file(capture, out, glove, chosen, chosen_size, labeler, body, sinks, on_frame)
         else:
-            _check_no_corrections(out)
             setup = TrackerSetup.of(glove, chosen, chosen_size, labeler, body, TrackerConfig())
             with Console(stderr=True).status("getting ready"):
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
     if labeled is not None:
         write_capture(labeled, labeled_points(tracked.take if tracked.is_whole else load_take(out)))
+    if shape is not None and glove is None:
+        print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
     _tell(out, tracked, float(np.median(times)))
 
 
@@ -156,7 +157,7 @@ def _check_options(
     capture: Path | None, live: str | None, seconds: float | None, out: Path, labeled: Path | None
 ) -> None:
     from gloves.captures.formats import WRITABLE, check_suffix
-    from gloves.takes.take import SUFFIX
+    from handsim.cli.options import check_take_file
 
     if (capture is None) == (live is None):
         given = (
@@ -167,18 +168,6 @@ def _check_options(
         raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
     if seconds is not None and not 0.0 < seconds < np.inf:
         raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
-    if out.suffix.lower() != ".npz" or out.name.endswith(SUFFIX):
-        raise ArgumentError(f"--out is {out}, expected a file name that ends in .npz and not in {SUFFIX}")
+    check_take_file(out, live=live is not None)
     if labeled is not None:
         check_suffix(labeled, WRITABLE)
-
-
-def _check_no_corrections(out: Path) -> None:
-    """Refuse to replace a take that somebody corrected by another recording."""
-    from gloves.takes.corrections import corrections_path
-
-    path = corrections_path(out)
-    if path.exists():
-        raise ArgumentError(
-            f"{path} corrects the take that --live would replace, expected another --out than {out}"
-        )

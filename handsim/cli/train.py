@@ -55,7 +55,10 @@ def _train(
             def report(done: int, total: int, loss: float) -> None:
                 bar.update(task, completed=done, total=total, description=f"loss {loss:.3f}")
 
-            card = train_labeler(dataset, out, config, threads=threads, progress=report)
+            def name_step(step: str) -> None:
+                bar.update(task, description=step, refresh=True)
+
+            card = train_labeler(dataset, out, config, threads=threads, progress=report, told=name_step)
     except PeerError as error:  # another process has told it
         raise SystemExit(1) from error
     print_figures(card["held_out_simulated"], title="Held-out simulated frames")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,10 +46,12 @@ def view(
 
     Args:
         file: A marker layout or camera rig (.toml, or a shipped name), a training set's folder, a capture
-            (.trc, .c3d or .csv), a tracked take or a simulated take's truth (.npz), or a user's file (.json).
+            (.trc, .c3d, .csv or .tsv), a tracked take or a simulated take's truth (.npz), or a user's file
+            (.json).
         host: Address to serve the page at; only this machine reaches the default. There is no password.
         port: Port to serve the page at; the first free one from 8080 on when not given.
-        out: File for a layout that was changed; a new name beside the layout when not given.
+        out: File for a layout that was changed, a new name beside the layout when not given; or for the take
+            of a live tracker (.npz), which is not recorded when not given.
         rig: Cameras to show with a capture, a take or a stream: a shipped name or the path of a .toml file.
         live: Stream to track instead of a file: natnet://host, qtm://host or module:name.
         glove: Marker layout of a live tracker; that of --shape, or dense19, when not given.
@@ -61,7 +63,7 @@ def view(
         labeler: Folder of a trained labeler for a live tracker, or an exported .onnx file.
         video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
     """
-    from handsim.cli.options import chosen_hands
+    from handsim.cli.options import check_take_file, chosen_hands
     from track.setup import USUAL_SIZE, TrackerSetup
     from track.viewer.contents import open_content
 
@@ -72,9 +74,10 @@ def view(
         if video is not None:
             raise ArgumentError(f"--video is {video}, but a live view is not drawn; see handsim track")
         if out is not None:
-            raise ArgumentError(f"--out is {out}, but nothing of a live view is saved; see handsim track")
+            check_take_file(out, live=True)
+            check_outputs((shape, glove, labeler, rig, *body), (out,))
         setup = TrackerSetup.of(glove, *chosen_hands(shape, hands, size), labeler, body, TrackerConfig())
-        _view_live(live, setup, host, port, rig)
+        _view_live(live, setup, host, port, rig, out)
         return
     content = open_content(
         str(file), out=out, size=USUAL_SIZE if size is None or size == "auto" else size, rig=rig
@@ -110,10 +113,13 @@ def _draw(name: str, content: Content, video: Path) -> None:
     print_line(f"{video}: {count} pictures of {name} ({content.kind})")
 
 
-def _view_live(url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None) -> None:
-    """Track a stream and show it until a signal or the stream ends it."""
+def _view_live(
+    url: str, setup: TrackerSetup, host: str, port: int | None, rig: str | None, out: Path | None
+) -> None:
+    """Track a stream and show it until a signal or the stream ends it; record it where `out` is given."""
     from handsim.space.cameras import load_rig
     from track.live import measured_setup
+    from track.recorder import Recorder
     from track.setup import warm_up
     from track.streams.addresses import open_source
     from track.viewer.live_view import LiveView
@@ -130,9 +136,16 @@ def _view_live(url: str, setup: TrackerSetup, host: str, port: int | None, rig: 
         with LiveStatus() as status:
             setup, frames = measured_setup(stream, setup, status)
         tracker = setup.tracker()
-        with closing(LiveView(server, tracker, cameras)) as live_view:
+        recording = Recorder(out, tracker, {"capture": url, **setup.settings}) if out is not None else None
+        with recording or nullcontext(), closing(LiveView(server, tracker, cameras)) as live_view:
             for frame in frames:
                 tracked = tracker.step(frame.points, frame.ids, frame.time)
+                if recording is not None:
+                    recording.add(frame, tracked)
                 if not frame.silent:
                     live_view.offer(frame, tracked)
+            if recording is not None:
+                recording.finish(stream.counts)
         print_line(f"{live_view.frames} frames tracked, {live_view.pictures} of them shown")
+        if recording is not None:
+            print_line(f"{out}: {recording.num_frames} frames")

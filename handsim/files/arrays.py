@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import lzma
 import math
+import tokenize
 import zipfile
+import zlib
 from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
 
-_MOST_MEMBERS: Final = 100
+_MOST_MEMBERS: Final = 10_000
 _MOST_DIMENSIONS: Final = 8
 _ALWAYS: Final = 1 << 28  # bytes that any archive may hold
 _LARGEST_RATIO: Final = 20  # of the bytes in memory to those of the file beyond that
+_DAMAGE: Final = (
+    AttributeError, EOFError, IndexError, KeyError, OverflowError, RuntimeError, SyntaxError, TypeError,
+    tokenize.TokenError, lzma.LZMAError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What the libraries raise for a damaged archive, beside a ValueError."""
 
 
 def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
@@ -24,23 +32,30 @@ def read_npz(path: Path) -> dict[str, np.ndarray[Any, Any]]:
     Raises:
         ValueError: Not an archive of plain arrays, a header that does not fit its bytes, or far more bytes
             than such a file may hold.
-        OSError, zipfile.BadZipFile, zlib.error, RuntimeError, EOFError: It cannot be read.
+        OSError: It cannot be read.
     """
-    with zipfile.ZipFile(path) as archive:
-        members = archive.infolist()
-        size, most = sum(member.file_size for member in members), _most_bytes(path.stat().st_size)
-        if len(members) > _MOST_MEMBERS or size > most:
-            raise ValueError(f"{len(members)} arrays of {size} bytes, expected at most {most} bytes")
-        for member in members:
-            with archive.open(member) as file:
-                check_npy_header(file, member.file_size)
-    with np.load(path, allow_pickle=False) as stored:
-        return {name: stored[name] for name in stored.files}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            check_members(archive, path.stat().st_size)
+            for member in archive.infolist():
+                with archive.open(member) as file:
+                    check_npy_header(file, member.file_size)
+        with np.load(path, allow_pickle=False) as stored:
+            return {name: stored[name] for name in stored.files}
+    except OSError as error:
+        if error.errno is None:  # of a decompressor
+            raise ValueError("damaged") from error
+        raise
+    except _DAMAGE as error:
+        raise ValueError("damaged") from error
 
 
-def _most_bytes(size: int) -> int:
-    """Bytes that a file of this size may take in memory."""
-    return max(_ALWAYS, _LARGEST_RATIO * size)
+def check_members(archive: zipfile.ZipFile, size: int) -> None:
+    """Raise a ValueError if an archive holds far more than a file of its size [bytes] may."""
+    members = archive.infolist()
+    held, most = sum(member.file_size for member in members), max(_ALWAYS, _LARGEST_RATIO * size)
+    if len(members) > _MOST_MEMBERS or held > most:
+        raise ValueError(f"{len(members)} members of {held} bytes, expected at most {most} bytes")
 
 
 def check_npy_header(file: IO[bytes], size: int) -> tuple[tuple[int, ...], np.dtype[Any]]:

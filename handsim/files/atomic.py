@@ -15,10 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from handsim.errors import HandSimError
+from handsim.errors import HandSimError, shortened
 from handsim.files.inputs import read_bytes
 
 _MOST_TOML: Final = 1 << 18  # bytes; a layout of 60 markers has 6000
+_INTEGER_BITS: Final = 63
 _DOTTED: Final = re.compile(r"""(?:\.\s{0,9}[\w"'-]+\s{0,9}){20}""")  # tomllib takes hours for very long ones
 
 
@@ -33,7 +34,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
     removed first.
 
     Args:
-        path: Where the finished file shall be; an existing file there is replaced.
+        path: Where the finished file shall be; an existing file there is replaced, of a link the file that
+            it points to.
 
     Yields:
         The path to write to.
@@ -59,12 +61,12 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
     Raises:
         OSError: As `atomic_write`.
     """
-    finals = [Path(path) for path in paths]
+    finals = [Path(os.path.realpath(path)) if os.path.islink(path) else Path(path) for path in paths]
     for final in finals:
         # Renaming onto a device (/dev/null) would replace it; a folder would be noticed only after the work.
         if final.exists() and not final.is_file():
             raise FileExistsError(errno.EEXIST, "not a regular file, so it is not replaced", str(final))
-        final.parent.mkdir(parents=True, exist_ok=True)
+        make_folder_of(final)
         remove_abandoned(final)
     temporaries = [temporary_beside(final) for final in finals]
     modes = [_usual_mode(*pair) for pair in zip(temporaries, finals, strict=True)]
@@ -84,6 +86,18 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         if isinstance(error, OSError) and str(error.filename) in names:  # nobody knows the temporary name
             error.filename = names[str(error.filename)]
         raise
+
+
+def make_folder_of(path: Path) -> None:
+    """Make the folders that are missing on the way to a file.
+
+    Raises:
+        OSError: One cannot be made, or there is a file in its place.
+    """
+    for folder in path.parents:
+        if folder.exists() and not folder.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, f"{folder} is a file, not a folder", str(folder))
+    path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def temporary_beside(path: Path) -> Path:
@@ -167,11 +181,23 @@ def read_toml(path: Path, *, error: type[HandSimError]) -> dict[str, Any]:
         text = data.decode("utf-8")
         deep = _DOTTED.search(text)
         if deep is not None:
-            raise ValueError(f"the key {deep[0][:20]!r}... has too many parts")
-        return tomllib.loads(text)
+            raise tomllib.TOMLDecodeError(f"the key {shortened(deep[0])!r} has too many parts")
+        table = tomllib.loads(text)
+        if _has_long_integer(table):
+            raise OverflowError
+        return table
     except UnicodeDecodeError as cause:
         raise error(f"{path}: not a TOML file: it is not UTF-8 text") from cause
-    except ValueError as cause:
+    except tomllib.TOMLDecodeError as cause:
         raise error(f"{path}: not a TOML file: {cause}") from cause
+    except (ValueError, OverflowError) as cause:  # Python reads no more than some thousand digits
+        raise error(f"{path}: not a TOML file: an integer of more than 64 bits") from cause
     except RecursionError as cause:
         raise error(f"{path}: not a TOML file: brackets are nested too deep") from cause
+
+
+def _has_long_integer(value: object) -> bool:
+    """Whether an integer beyond the 64 bits of TOML is in a table, which Python would take."""
+    if isinstance(value, dict | list):
+        return any(map(_has_long_integer, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, int) and value.bit_length() > _INTEGER_BITS

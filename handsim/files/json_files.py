@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from handsim.errors import DatasetError, HandSimError
+from handsim.errors import DatasetError, HandSimError, shortened
 from handsim.files.atomic import atomic_write, remove_leftovers
 from handsim.files.inputs import read_bytes
 
@@ -136,8 +136,7 @@ def _told(differing: Collection[str], found: dict[str, Any], expected: dict[str,
 
 
 def _shown(settings: dict[str, Any], key: str) -> str:
-    text = json.dumps(settings[key], ensure_ascii=False) if key in settings else _MISSING
-    return text if len(text) <= 40 else text[:40] + "..."
+    return shortened(json.dumps(settings[key], ensure_ascii=False)) if key in settings else _MISSING
 
 
 def _hint(grows: str, differing: Collection[str]) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError, choices
+from handsim.errors import HandSimError, choices, shortened
 
 _LARGEST: Final = 1e9  # in any unit; keeps out NaN, infinity and integers beyond float
 
@@ -75,8 +75,7 @@ def number_list(owner: str, value: object) -> tuple[float, ...]:
 
 def shown(value: object) -> str:
     """A value as a sentence shows it, cut where it is long."""
-    text = json.dumps(value, default=str, ensure_ascii=False)
-    return text if len(text) <= 40 else text[:40] + "..."
+    return shortened(json.dumps(value, default=str, ensure_ascii=False))
 
 
 def quoted(text: str) -> str:

@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.model import HandModel, join_qpos
-from handsim.hand.topology import DIGITS, NUM_JOINTS, PALM, bones_of
+from handsim.hand.model import HandModel
+from handsim.hand.shape import HandShape
+from handsim.hand.topology import DIGITS, PALM, bones_of
 
 _PARTS: Final = (("CMC", "MCP", "IP", "tip"), *[("MCP", "PIP", "DIP", "tip")] * 4)
 KEYPOINT_NAMES: Final[tuple[str, ...]] = (
@@ -21,6 +22,11 @@ KEYPOINT_NAMES: Final[tuple[str, ...]] = (
     *(f"{digit}_{part}" for digit, parts in zip(DIGITS, _PARTS, strict=True) for part in parts),
 )
 NUM_KEYPOINTS: Final = len(KEYPOINT_NAMES)
+KEYPOINT_BONES: Final[tuple[int, ...]] = (
+    PALM,
+    *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1])),
+)
+"""Index in `BONES` of the bone that carries each keypoint: the one that begins there, or of a tip ends."""
 KEYPOINT_DIGITS: Final[tuple[int, ...]] = (-1, *np.repeat(np.arange(len(DIGITS)), 4).tolist())
 """Digit of each keypoint, -1 for the wrist."""
 SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
@@ -29,7 +35,7 @@ SKELETON: Final[tuple[tuple[int, int], ...]] = tuple(
     for part in range(4)
 )
 """Pairs of keypoints that are joined by a line."""
-_ACROSS, _ALONG = 0.004, 0.035  # [m] around and along a joint's normal, within which skin is its own
+_WRIST: Final = 1.3  # thickness of the wrist, in thicknesses of the palm
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
@@ -53,22 +59,7 @@ def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[n
     return points
 
 
-def keypoint_flesh(model: HandModel) -> Float[np.ndarray, "21"]:
-    """How deep each keypoint lies in the flat hand, below its back or its palm, whichever is more [m].
-
-    A tip lies on the skin, but counts as deep as its digit's last joint: its pulp is in front of it in most
-    views.
-
-    Args:
-        model: The hand.
-    """
-    qpos = join_qpos(np.zeros((1, NUM_JOINTS)))
-    keypoints, skin = hand_keypoints(model, qpos)[0], model.skin(qpos)[0]
-    bones = [PALM, *(bone for digit in DIGITS for bone in (*bones_of(digit), bones_of(digit)[-1]))]
-    rotations = model.forward_kinematics(qpos)[0, bones, :3, :3]
-    local = np.einsum("kvi,kij->kvj", skin - keypoints[:, None], rotations)
-    height = np.abs(local[..., 2])
-    own = (np.linalg.norm(local[..., :2], axis=-1) < _ACROSS) & (height < _ALONG)
-    flesh: NDArray[np.float64] = np.where(own, height, 0.0).max(axis=1)
-    flesh[4::4] = flesh[3::4]
-    return flesh
+def keypoint_thickness(shape: HandShape) -> Float[np.ndarray, "21"]:
+    """Thickness of the hand at each keypoint: of the wrist, or of the finger there [m]."""
+    fingers = 2.0 * shape.radii
+    return np.array([_WRIST * shape.palm_thickness, *fingers.ravel()])

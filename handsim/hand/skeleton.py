@@ -43,6 +43,7 @@ def build_skeleton(shape: HandShape) -> Skeleton:
     offsets, rotations = np.zeros((NUM_BONES, 3)), np.tile(np.eye(3), (NUM_BONES, 1, 1))
     lengths = np.zeros(NUM_BONES)
     lengths[0] = shape.knuckles[2, 0]
+    digits = euler_matrix(shape.base_angles)
     for number, bone in enumerate(BONES):
         if bone.digit < 0:
             continue
@@ -50,7 +51,7 @@ def build_skeleton(shape: HandShape) -> Skeleton:
         lengths[number] = shape.bone_lengths[bone.digit, index]
         if index == 0:
             offsets[number] = shape.knuckles[bone.digit]
-            rotations[number] = euler_matrix(shape.base_angles[bone.digit])
+            rotations[number] = digits[bone.digit]
         else:
             offsets[number, 0] = shape.bone_lengths[bone.digit, index - 1]
     axes = np.array([joint.axis for joint in JOINTS])

@@ -56,12 +56,12 @@ def _add_link(root: ET.Element, model: HandModel, bone: int, name: str, share: f
     link = ET.SubElement(root, "link", name=name)
     compiled, body = model.mj_model, bone + 1  # the world is body 0
     inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=_text(compiled.body_ipos[body]), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=_number(share * compiled.body_mass[body]))
+    ET.SubElement(inertial, "origin", xyz=vector_text(compiled.body_ipos[body]), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=number_text(share * compiled.body_mass[body]))
     axes = quaternion_matrix(compiled.body_iquat[body])
     moments = share * axes @ np.diag(compiled.body_inertia[body]) @ axes.T
     entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
-    ET.SubElement(inertial, "inertia", {key: _number(moments[at]) for key, at in entries.items()})
+    ET.SubElement(inertial, "inertia", {key: number_text(moments[at]) for key, at in entries.items()})
     if name != BONE_NAMES[bone]:
         return
     capsules = model.capsules
@@ -79,14 +79,16 @@ def _add_capsule(
     along = (end - start) / length
     pitch, yaw = np.arccos(along[2]), np.arctan2(along[1], along[0])
     shapes = (
-        ("cylinder", {"radius": _number(radius), "length": _number(length)}, 0.5 * (start + end)),
-        ("sphere", {"radius": _number(radius)}, start),
-        ("sphere", {"radius": _number(radius)}, end),
+        ("cylinder", {"radius": number_text(radius), "length": number_text(length)}, 0.5 * (start + end)),
+        ("sphere", {"radius": number_text(radius)}, start),
+        ("sphere", {"radius": number_text(radius)}, end),
     )
     for shape, sizes, center in shapes:
         part = ET.SubElement(link, kind)
-        turn = f"0 {_number(pitch)} {_number(yaw)}" if shape == "cylinder" else "0 0 0"  # z along the axis
-        ET.SubElement(part, "origin", xyz=_text(center), rpy=turn)
+        turn = (
+            f"0 {number_text(pitch)} {number_text(yaw)}" if shape == "cylinder" else "0 0 0"
+        )  # z along the axis
+        ET.SubElement(part, "origin", xyz=vector_text(center), rpy=turn)
         ET.SubElement(ET.SubElement(part, "geometry"), shape, sizes)
         if kind == "visual":
             ET.SubElement(part, "material", name="skin")
@@ -103,17 +105,19 @@ def _add_joint(
     element = ET.SubElement(root, "joint", name=JOINTS[joint].name, type="revolute")
     ET.SubElement(element, "parent", link=parent)
     ET.SubElement(element, "child", link=child)
-    ET.SubElement(element, "origin", xyz=_text(place), rpy=_text(turn))
-    ET.SubElement(element, "axis", xyz=_text(skeleton.axes[joint]))
+    ET.SubElement(element, "origin", xyz=vector_text(place), rpy=vector_text(turn))
+    ET.SubElement(element, "axis", xyz=vector_text(skeleton.axes[joint]))
     low, high = skeleton.ranges[joint]
     limits = {"lower": low, "upper": high, "effort": _MOST_TORQUE, "velocity": _MOST_SPEED}
-    ET.SubElement(element, "limit", {key: _number(value) for key, value in limits.items()})
+    ET.SubElement(element, "limit", {key: number_text(value) for key, value in limits.items()})
     ET.SubElement(element, "dynamics", damping="0.01", friction="0")
 
 
-def _text(vector: Float[np.ndarray, "3"]) -> str:
-    return " ".join(_number(value) for value in vector)
+def vector_text(vector: Float[np.ndarray, "K"]) -> str:
+    """Numbers with blanks between them."""
+    return " ".join(number_text(value) for value in vector)
 
 
-def _number(value: float) -> str:
+def number_text(value: float) -> str:
+    """A number with twelve digits; zero has no sign."""
     return f"{float(value) + 0.0:.12g}"

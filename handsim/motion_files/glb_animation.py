@@ -1,8 +1,10 @@
 """Hands and things as glTF 2.0 (.glb): skins, skeletons and their motion.
 
-Axes: y up, meters. At the top stand the palm of each hand with its other bones below it, named `right_palm`,
-`right_index_proximal` ..., its skin, and the things. Each bone has a key per frame. What has no pose in some
-frames has the scale 0 there, which every reader shows as nothing; its other keys stay as they were.
+Axes: y up, meters. At the top stand a node for each hand, `right_skeleton`, with its palm and the other bones
+below it, named `right_palm`, `right_index_proximal` ..., its skin `right_hand`, and the things. The node over
+the palm lets programs see two skeletons in two hands: Blender puts bones with nothing above them into one.
+Each bone has a key per frame. What has no pose in some frames has the scale 0 there, which every reader shows
+as nothing; its other keys stay as they were.
 """
 
 from __future__ import annotations
@@ -22,6 +24,9 @@ from handsim.motion_files.glb_buffer import GlbBuffer
 from handsim.motion_files.local_poses import CHILDREN, local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals, split_vertices
 from handsim.motion_files.motion import (
+    SKIN,
+    THING,
+    Material,
     Motion,
     PosedBody,
     PosedHand,
@@ -33,22 +38,7 @@ from handsim.motion_files.motion import (
 )
 from handsim.space.transforms import UpAxis
 
-_SKIN, _THING = 0, 1  # materials
-_MATERIALS: Final = [
-    {
-        "name": name,
-        "pbrMetallicRoughness": {
-            "baseColorFactor": color,
-            "metallicFactor": 0.0,
-            "roughnessFactor": roughness,
-        },
-        "doubleSided": False,
-    }
-    for name, color, roughness in (
-        ("skin", [0.66, 0.38, 0.28, 1.0], 0.65),
-        ("thing", [0.16, 0.2, 0.26, 1.0], 0.5),
-    )
-]
+_MATERIALS: Final = (SKIN, THING)
 
 
 def write_glb(path: Path, motion: Motion, up: UpAxis = "z") -> None:
@@ -98,7 +88,18 @@ class _Scene:
             "nodes": self._nodes,
             "meshes": self._meshes,
             "skins": self._skins,
-            "materials": _MATERIALS,
+            "materials": [
+                {
+                    "name": material.name,
+                    "pbrMetallicRoughness": {
+                        "baseColorFactor": [*material.color, 1.0],
+                        "metallicFactor": 0.0,
+                        "roughnessFactor": material.roughness,
+                    },
+                    "doubleSided": False,
+                }
+                for material in _MATERIALS
+            ],
         }
         if self._channels:
             document["animations"] = [
@@ -110,7 +111,8 @@ class _Scene:
         qpos = hand.qpos
         positions, rotations = qpos[:, :3] @ self._turn.T, hand.model.forward_kinematics(qpos)[..., :3, :3]
         quaternions = smooth_quaternions(local_rotations(self._turn @ rotations))
-        first = len(self._nodes)
+        root, first = len(self._nodes), len(self._nodes) + 1
+        self._nodes.append({"name": f"{hand.side}_skeleton", "children": [first + PALM]})
         for bone in range(NUM_BONES):
             node: dict[str, Any] = {
                 "name": f"{hand.side}_{BONE_NAMES[bone]}",
@@ -127,7 +129,7 @@ class _Scene:
             {
                 "name": f"{hand.side}_skeleton",
                 "joints": list(range(first, first + NUM_BONES)),
-                "skeleton": first,
+                "skeleton": root,
                 "inverseBindMatrices": self._buffer.add(
                     np.linalg.inv(hand.model.rest_transforms).astype("<f4")
                 ),
@@ -135,7 +137,7 @@ class _Scene:
         )
         self._meshes.append(self._skin_mesh(hand.model, f"{hand.side}_hand"))
         # At the top, as the bones: readers ignore the transform of a skinned mesh, and warn where it has one.
-        self._top += [first, len(self._nodes)]
+        self._top += [root, len(self._nodes)]
         self._nodes.append(
             {"name": f"{hand.side}_hand", "mesh": len(self._meshes) - 1, "skin": len(self._skins) - 1}
         )
@@ -152,7 +154,7 @@ class _Scene:
             ),
             "WEIGHTS_0": add(surface.bone_weights.astype("<f4"), target="vertices"),
         }
-        return {"name": name, "primitives": [self._primitive(attributes, surface.faces, _SKIN)]}
+        return {"name": name, "primitives": [self._primitive(attributes, surface.faces, SKIN)]}
 
     def _add_thing(self, thing: PosedBody) -> None:
         poses = thing.T_world_body
@@ -174,7 +176,7 @@ class _Scene:
                 ),
                 "NORMAL": self._buffer.add(outward.astype("<f4"), target="vertices"),
             }
-            primitive = self._primitive(attributes, faces, _THING)
+            primitive = self._primitive(attributes, faces, THING)
             self._meshes.append({"name": thing.name, "primitives": [primitive]})
         self._nodes.append(node)
         self._top.append(number)
@@ -182,9 +184,11 @@ class _Scene:
         self._animate(number, "translation", positions)
         self._hide(number, thing.present)
 
-    def _primitive(self, attributes: dict[str, int], faces: NDArray[Any], material: int) -> dict[str, Any]:
+    def _primitive(
+        self, attributes: dict[str, int], faces: NDArray[Any], material: Material
+    ) -> dict[str, Any]:
         indices = self._buffer.add(faces.ravel().astype("<u4"), target="indices")
-        return {"attributes": attributes, "indices": indices, "material": material}
+        return {"attributes": attributes, "indices": indices, "material": _MATERIALS.index(material)}
 
     def _animate(self, node: int, path: str, values: NDArray[np.float64]) -> None:
         """A key in every frame, with straight motion between them."""

@@ -5,26 +5,99 @@ Where a hand has no pose, its row is there and its numbers are missing: empty in
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Float
 
-from handsim.errors import HandSimError
+from handsim.errors import CaptureError, HandSimError, choices
 from handsim.files.atomic import atomic_write
+from handsim.files.inputs import read_bytes
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
-from handsim.hand.topology import JOINT_NAMES
+from handsim.hand.topology import JOINT_NAMES, SIDES, Side
 from handsim.motion_files.motion import Motion, PosedHand, posed_hands
 from handsim.space.transforms import UpAxis
 
-NUMBERS: Final[tuple[str, ...]] = (
+_FIRST: Final = ("frame", "time_s", "hand")
+_QPOS: Final = (
     *(f"wrist_{axis}_m" for axis in "xyz"),
     *(f"wrist_q{part}" for part in "wxyz"),
     *(f"{joint}_rad" for joint in JOINT_NAMES),
+)
+NUMBERS: Final[tuple[str, ...]] = (
+    *_QPOS,
     *(f"{keypoint}_{axis}_m" for keypoint in KEYPOINT_NAMES[1:] for axis in "xyz"),
 )
 """Columns after `frame`, `time_s` and `hand`: the world's positions and the wrist's quaternion, angles."""
+
+
+class JointTable(NamedTuple):
+    """The poses of a table."""
+
+    sides: tuple[Side, ...]
+    """Whose they are, in the order in which the table names the hands first."""
+    times: Float[np.ndarray, "T"]
+    """Time of each frame [s]."""
+    qpos: Float[np.ndarray, "T H 27"]
+    """Wrist position [m], wrist orientation (wxyz), joint angles [rad]; NaN without a pose."""
+
+
+def read_joint_csv(path: Path) -> JointTable:
+    """The poses in a .csv of `write_joint_csv`, or in another with its columns of frame, time, hand and qpos.
+
+    Further columns, such as the positions of joints, are passed over; columns may come in any order.
+
+    Args:
+        path: A .csv file.
+
+    Raises:
+        CaptureError: The file cannot be read, lacks a column, or a cell is not what its column holds.
+    """
+    text = read_bytes(path, error=CaptureError).decode("utf-8-sig", "replace")
+    lines = csv.reader(text.splitlines())
+    try:
+        titles = [title.strip() for title in next(lines, [])]
+        wanted = [*_FIRST, *_QPOS]
+        missing = [name for name in wanted if name not in titles]
+        if missing:
+            raise CaptureError(
+                f"{path}: no column '{missing[0]}'; of a .csv are read {', '.join(_FIRST)}, {_QPOS[0]} to "
+                f"{_QPOS[6]} and the joint angles {_QPOS[7]} to {_QPOS[-1]}, as handsim export writes them"
+            )
+        columns = [titles.index(name) for name in wanted]
+        rows = [(lines.line_num, [row[column].strip() for column in columns]) for row in lines if any(row)]
+    except (csv.Error, IndexError) as error:
+        raise CaptureError(f"{path}: line {lines.line_num} cannot be read: {error}") from error
+    if not rows:
+        raise CaptureError(f"{path}: no frames: nothing follows the line of titles")
+    return _table(path, rows)
+
+
+def _table(path: Path, rows: list[tuple[int, list[str]]]) -> JointTable:
+    """Rows of the columns `_FIRST` and `_QPOS` with the numbers of their lines, by frame and hand."""
+    frames: dict[str, int] = {}
+    sides: dict[str, int] = {}
+    for number, (frame, _, side, *_) in rows:
+        if side not in SIDES:
+            raise CaptureError(f"{path}: line {number}: {choices(side, SIDES, noun='hand')}")
+        frames.setdefault(frame, len(frames))
+        sides.setdefault(side, len(sides))
+    times = np.full(len(frames), np.nan)
+    qpos = np.full((len(frames), len(sides), len(_QPOS)), np.nan)
+    filled = np.zeros(qpos.shape[:2], dtype=np.bool_)
+    for number, (frame, time, side, *cells) in rows:
+        place = frames[frame], sides[side]
+        if filled[place]:
+            raise CaptureError(f"{path}: line {number} has frame {frame} of the {side} hand again")
+        filled[place] = True
+        try:
+            times[place[0]] = float(time)
+            qpos[place] = [float(cell) if cell else np.nan for cell in cells]
+        except ValueError as error:
+            raise CaptureError(f"{path}: line {number}: {error}") from error
+    return JointTable(cast("tuple[Side, ...]", tuple(sides)), times, qpos)
 
 
 def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
@@ -42,7 +115,7 @@ def write_joint_csv(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     tables = [_numbers(hand) for hand in hands]
     row_format = ",%.9g" * len(NUMBERS)
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(",".join(["frame", "time_s", "hand", *NUMBERS]) + "\n")
+        file.write(",".join([*_FIRST, *NUMBERS]) + "\n")
         for frame, time in enumerate(motion.times.tolist()):
             for hand, table in zip(hands, tables, strict=True):
                 row = table[frame]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,6 +13,19 @@ from handsim.hand.model import HandModel
 from handsim.hand.topology import Side
 from handsim.space.objects import RigidObject
 from handsim.space.transforms import UpAxis, pose_matrices
+
+
+class Material(NamedTuple):
+    """What a surface looks like in files with materials."""
+
+    name: str
+    color: tuple[float, float, float]
+    """Linear light, in [0, 1]."""
+    roughness: float
+
+
+SKIN: Final = Material("skin", (0.66, 0.38, 0.28), 0.65)
+THING: Final = Material("thing", (0.16, 0.2, 0.26), 0.5)
 
 
 class HasModel(Protocol):

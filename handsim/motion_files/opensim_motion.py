@@ -14,9 +14,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.files.atomic import atomic_write
-from handsim.hand.topology import JOINT_NAMES
+from handsim.hand.osim import coordinate_names
 from handsim.motion_files.motion import Motion, PosedHand, posed_hands, seconds_of
-from handsim.space.transforms import UpAxis, euler_angles, quaternion_matrix
+from handsim.space.transforms import UpAxis, body_fixed_angles, quaternion_matrix
 
 
 def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
@@ -32,8 +32,7 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
     """
     hands = tuple(posed_hands(motion))
     table = np.concatenate([seconds_of(motion)[:, None], *(_coordinates(hand) for hand in hands)], axis=1)
-    wrist = [f"wrist_{kind}{axis}" for kind in "tr" for axis in "xyz"]
-    names = ["time", *(f"{hand.side}_{name}" for hand in hands for name in (*wrist, *JOINT_NAMES))]
+    names = ["time", *(name for hand in hands for name in coordinate_names(hand.side))]
     header = [
         path.stem,
         "version=1",
@@ -51,9 +50,7 @@ def write_mot(path: Path, motion: Motion, up: UpAxis = "z") -> None:
 def _coordinates(hand: PosedHand) -> Float[np.ndarray, "T 26"]:
     """Position of the wrist [m], its rotations and the joint angles [deg]; NaN without a pose."""
     qpos = hand.qpos
-    # Rx Ry Rz is the inverse of Rz Ry Rx with the opposite angles.
-    inverse = np.swapaxes(quaternion_matrix(qpos[:, 3:7]), -1, -2)
-    turns = np.unwrap(-euler_angles(inverse)[:, ::-1], axis=0)
+    turns = np.unwrap(body_fixed_angles(quaternion_matrix(qpos[:, 3:7])), axis=0)
     angles = np.rad2deg(np.concatenate([turns, qpos[:, 7:]], axis=1))
     coordinates: NDArray[np.float64] = np.concatenate([qpos[:, :3], angles], axis=1)
     coordinates[~hand.present] = np.nan

@@ -1,8 +1,9 @@
 """Hands and things as OpenUSD with UsdSkel, .usda (text) and .usdc (binary), by the package usd-core.
 
-`/hands/right` is a SkelRoot with `skin`, `skeleton` and `motion`; `/hands/things/pen` an Xform with its mesh.
-Lengths are meters, the up axis is the take's, a time code is a frame at the take's rate. What has no pose in
-some frames is invisible there.
+`/hands/right` is a SkelRoot with its skin `right_hand`, `right_skeleton` and `right_motion`;
+`/hands/things/pen` an Xform with its mesh; each has its material. Names have the side in them, since programs
+show the last part of a path alone. Lengths are meters, the up axis is the take's, a time code is a frame at
+the take's rate. What has no pose in some frames is invisible there.
 """
 
 from __future__ import annotations
@@ -18,10 +19,13 @@ from handsim.errors import HandSimError
 from handsim.files.atomic import atomic_write
 from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.skin.surface import vertex_normals
-from handsim.hand.topology import BONES, NUM_BONES, PALM
+from handsim.hand.topology import BONES, NUM_BONES, PALM, Side
 from handsim.motion_files.local_poses import local_rotations, smooth_quaternions
 from handsim.motion_files.mesh_normals import corner_normals
 from handsim.motion_files.motion import (
+    SKIN,
+    THING,
+    Material,
     Motion,
     PosedBody,
     PosedHand,
@@ -32,8 +36,6 @@ from handsim.motion_files.motion import (
 )
 from handsim.space.transforms import UpAxis
 
-_SKIN_COLOR: Final = (0.66, 0.38, 0.28)
-_THING_COLOR: Final = (0.16, 0.2, 0.26)
 _AROUND: Final = 0.03  # [m] of skin around keypoints
 
 
@@ -71,11 +73,12 @@ def write_usd(path: Path, motion: Motion, up: UpAxis = "z") -> None:
             raise HandSimError(f"{path}: usd-core could not write it")
 
 
-def joint_paths() -> list[str]:
-    """The bones as UsdSkel names them: each with its parents, `palm/index_proximal/index_middle`."""
+def joint_paths(side: Side) -> list[str]:
+    """The bones as UsdSkel names them: each with its parents, `right_palm/right_index_proximal`."""
     paths: list[str] = []
     for bone in BONES:
-        paths.append(bone.name if bone.parent < 0 else f"{paths[bone.parent]}/{bone.name}")
+        name = f"{side}_{bone.name}"
+        paths.append(name if bone.parent < 0 else f"{paths[bone.parent]}/{name}")
     return paths
 
 
@@ -84,7 +87,7 @@ def _add_hand(stage: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
 
     path = f"/hands/{hand.side}"
     root = UsdSkel.Root.Define(stage, path)
-    skeleton = UsdSkel.Skeleton.Define(stage, f"{path}/skeleton")
+    skeleton = UsdSkel.Skeleton.Define(stage, f"{path}/{hand.side}_skeleton")
     rest = hand.model.rest_transforms
     local = np.stack(
         [
@@ -92,12 +95,12 @@ def _add_hand(stage: Any, hand: PosedHand, codes: NDArray[np.float64]) -> None:
             for n, bone in enumerate(BONES)
         ]
     )
-    skeleton.CreateJointsAttr(joint_paths())
+    skeleton.CreateJointsAttr(joint_paths(hand.side))
     skeleton.CreateBindTransformsAttr(Vt.Matrix4dArray([Gf.Matrix4d(one.T.tolist()) for one in rest]))
     skeleton.CreateRestTransformsAttr(Vt.Matrix4dArray([Gf.Matrix4d(one.T.tolist()) for one in local]))
-    motion = UsdSkel.Animation.Define(stage, f"{path}/motion")
+    motion = UsdSkel.Animation.Define(stage, f"{path}/{hand.side}_motion")
     UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets([motion.GetPath()])
-    _add_skin(stage, hand, f"{path}/skin", skeleton)
+    _add_skin(stage, hand, f"{path}/{hand.side}_hand", skeleton)
     _add_motion(motion, hand, codes)
     _set_visibility(root, hand.present, codes)
     keypoints = hand_keypoints(hand.model, hand.qpos)
@@ -112,7 +115,7 @@ def _add_skin(stage: Any, hand: PosedHand, path: str, skeleton: Any) -> None:
     from pxr import Gf, UsdGeom, UsdSkel, Vt
 
     surface = hand.model.surface
-    mesh = _add_mesh(stage, path, surface.vertices, surface.faces, _SKIN_COLOR)
+    mesh = _add_mesh(stage, path, surface.vertices, surface.faces, SKIN)
     normals = vertex_normals(surface.vertices, surface.faces)
     mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
@@ -133,7 +136,7 @@ def _add_motion(motion: Any, hand: PosedHand, codes: NDArray[np.float64]) -> Non
     rotations = smooth_quaternions(local_rotations(hand.model.forward_kinematics(qpos)[..., :3, :3]))
     translations = np.tile(hand.model.skeleton.offsets, (len(qpos), 1, 1))
     translations[:, PALM] = qpos[:, :3]
-    motion.CreateJointsAttr(joint_paths())
+    motion.CreateJointsAttr(joint_paths(hand.side))
     motion.CreateScalesAttr(Vt.Vec3hArray.FromNumpy(np.ones((NUM_BONES, 3), dtype=np.float16)))
     # usd-core takes quaternions from arrays with the real part last.
     imaginary_first = np.roll(rotations, -1, axis=-1).astype(np.float32)
@@ -162,7 +165,7 @@ def _add_thing(stage: Any, thing: PosedBody, number: int, codes: NDArray[np.floa
         turn.Set(Gf.Quatf(*quaternion), code)
     _set_visibility(body, thing.present, codes)
     if thing.shape is not None:
-        mesh = _add_mesh(stage, f"{path}/mesh", thing.shape.vertices, thing.shape.faces, _THING_COLOR)
+        mesh = _add_mesh(stage, f"{path}/mesh", thing.shape.vertices, thing.shape.faces, THING)
         normals = corner_normals(thing.shape.vertices, thing.shape.faces).reshape(-1, 3)
         mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
         mesh.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
@@ -173,10 +176,10 @@ def _add_mesh(
     path: str,
     vertices: Float[np.ndarray, "V 3"],
     faces: NDArray[Any],
-    color: tuple[float, float, float],
+    material: Material,
 ) -> Any:
-    """Triangles of one color, not subdivided."""
-    from pxr import Gf, UsdGeom, Vt
+    """Triangles of one material, not subdivided."""
+    from pxr import Gf, UsdGeom, UsdShade, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, path)
     points = vertices.astype(np.float32)
@@ -185,8 +188,24 @@ def _add_mesh(
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([points.min(axis=0), points.max(axis=0)])))
-    mesh.CreateDisplayColorAttr([Gf.Vec3f(*color)])
+    mesh.CreateDisplayColorAttr([Gf.Vec3f(*material.color)])  # for programs that look at no material
+    beside = f"{path.rpartition('/')[0]}/{material.name}"
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_add_material(stage, beside, material))
     return mesh
+
+
+def _add_material(stage: Any, path: str, material: Material) -> Any:
+    """A material by USD's own shader."""
+    from pxr import Gf, Sdf, UsdShade
+
+    made, shader = UsdShade.Material.Define(stage, path), UsdShade.Shader.Define(stage, f"{path}/surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    kinds = Sdf.ValueTypeNames
+    shader.CreateInput("diffuseColor", kinds.Color3f).Set(Gf.Vec3f(*material.color))
+    shader.CreateInput("roughness", kinds.Float).Set(material.roughness)
+    shader.CreateInput("metallic", kinds.Float).Set(0.0)
+    made.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    return made
 
 
 def _set_visibility(prim: Any, present: NDArray[np.bool_], codes: NDArray[np.float64]) -> None:

@@ -86,6 +86,12 @@ class Camera:
         """The same camera with another pose [m]."""
         return dataclasses.replace(self, T_world_camera=T_world_camera)
 
+    def part(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of a part of the picture [px]."""
+        K = self.K.copy()
+        K[:2, 2] -= left, top
+        return dataclasses.replace(self, size=(width, height), K=K)
+
     def local(self, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """World points in the camera's axes [m]."""
         local: NDArray[np.float64] = (points - self.T_world_camera[:3, 3]) @ self.T_world_camera[:3, :3]

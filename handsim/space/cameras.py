@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,6 +106,11 @@ class CameraRig:
     def record(self) -> dict[str, Any]:
         """The rig as a JSON record, which `as_rig` reads."""
         return {"name": self.name, "cameras": [one.record() for one in self.cameras]}
+
+    def digest(self) -> str:
+        """Beginning of the SHA-256 of its record to nine decimals: whether a name still means this rig."""
+        rounded = json.loads(json.dumps(self.record()), parse_float=lambda text: round(float(text), 9) + 0.0)
+        return hashlib.sha256(json.dumps(rounded, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def list_rigs() -> tuple[str, ...]:

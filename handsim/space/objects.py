@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from handsim._checks import check_array
-from handsim.errors import ArgumentError, ObjectError, choices
+from handsim.errors import ArgumentError, ObjectError, choices, shortened
 from handsim.files.inputs import check_regular
 from handsim.space import solids as object_solids
 from handsim.space.solids import Part
@@ -166,7 +166,9 @@ def _close(mesh: Any, path: Path) -> Part:
             mesh.invert()
         hull = object_solids.hull_part(mesh.vertices) if closed else None
     except Exception as error:  # odd triangles fail in many ways
-        raise ObjectError(f"{path}: not a closed surface ({' '.join(str(error).split())[:80]})") from error
+        raise ObjectError(
+            f"{path}: not a closed surface ({shortened(' '.join(str(error).split()), 80)})"
+        ) from error
     if hull is None:
         raise ObjectError(f"{path}: the mesh is not watertight; close its holes, so that it has an inside")
     return hull

@@ -70,11 +70,12 @@ def vector_quaternions(vectors: Float[np.ndarray, "T 3"]) -> NDArray[np.float64]
     return quaternions
 
 
-def euler_matrix(angles: Float[np.ndarray, "3"]) -> NDArray[np.float64]:
-    """Rotation Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
+def euler_matrix(angles: Float[np.ndarray, "*batch 3"]) -> NDArray[np.float64]:
+    """Rotations Rz(a0) Ry(a1) Rx(a2) of three angles [rad]: yaw, pitch, roll."""
+    yaw, pitch, roll = np.moveaxis(np.asarray(angles), -1, 0)
     x, y, z = np.eye(3)
     matrix: NDArray[np.float64] = (
-        axis_angle_matrix(z, angles[0]) @ axis_angle_matrix(y, angles[1]) @ axis_angle_matrix(x, angles[2])
+        axis_angle_matrix(z, yaw) @ axis_angle_matrix(y, pitch) @ axis_angle_matrix(x, roll)
     )
     return matrix
 
@@ -92,6 +93,12 @@ def euler_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
     sine, cosine = np.where(locked[:, None], fixed, free).T
     angles: NDArray[np.float64] = np.stack([yaw, pitch, np.arctan2(sine, cosine)], axis=1)
     return angles
+
+
+def body_fixed_angles(rotations: Float[np.ndarray, "T 3 3"]) -> NDArray[np.float64]:
+    """Angles (T, 3) [rad] about x, y and z of the body, in turn, that make these rotations: Rx Ry Rz."""
+    # Rx Ry Rz is the inverse of Rz Ry Rx with the opposite angles.
+    return -euler_angles(np.swapaxes(rotations, -1, -2))[:, ::-1]
 
 
 def random_quaternions(count: int, *, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -6,38 +6,44 @@ Paths are computed once for a whole take, from the motion of its hands, so that 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from gloves.takes.take import Take
+from handsim._checks import check_number
 from handsim.errors import ArgumentError, HandSimWarning, RigError, choices
 from handsim.hand.keypoints import hand_keypoints
 from handsim.space.camera import Camera, look_at, preset
 from handsim.space.cameras import load_rig
 from handsim.space.rig_formats.any_file import load_cameras
 from handsim.space.transforms import quaternion_matrix
+from render.cameras.framing import Framing, looking, poses_at
 
 Placement = Literal["still", "orbit", "head", "anywhere", "rig"]
 PLACEMENTS: Final[tuple[Placement, ...]] = ("still", "orbit", "head", "anywhere", "rig")
 _CHUNK: Final = 2048  # frames whose keypoints are projected at once
-_HAND_CENTER: Final = 0.08  # [m] from the wrist to the center of the hand
 _EYES: Final = (0.32, 0.38)  # [m] of the head's camera behind and above the hands
 _HEAD_CLEARANCE: Final = np.deg2rad(50.0)  # between a head's line of sight and a forearm, at least
-_HEAD_DELAY: Final = 1.0  # [s] over which a head follows the hands
 _ORBIT_PERIOD: Final = 12.0  # [s] of one revolution of a camera in orbit
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
-_TRIES: Final = 20
+_TRIES: Final = 60
+_CLOSER: Final = 1.35  # largest share of a hand over `ViewConfig.share`
+_STILL_ENOUGH: Final = 1.05  # distance over that of the share up to which a camera stays where it is
 _SKIN_CLEARANCE: Final = 0.08  # [m] between a camera around hands and the nearest keypoint, at least
 _FREE: Final = 0.8  # of the room around hands in a picture, which they are shifted within
 _ROUNDS: Final = 8
+_NEARLY_ALL: Final = 0.97  # of the frames: what a lens of one length shows whole
+_PLACES: Final = 8  # in front of the hands that are tried
+_ASIDE: Final = np.deg2rad(50.0)  # farther from the front, at most
+_HIDDEN: Final = 10.0  # what a view from behind an arm counts as, times the distance of the share
+_ARM: Final = 0.5  # [m] of a forearm that views keep clear of
+_ARM_DISTANCE: Final = 0.2  # [m] between its middle and a camera, at least
 _ARM_CLEARANCE: Final = np.deg2rad(35.0)  # between a view and a forearm, at least
 
 
@@ -50,14 +56,19 @@ class ViewConfig:
     """
 
     placement: Placement = "still"
-    """Position of the cameras. still: in front of the hands. orbit: around them. head: at the user's eyes.
-    anywhere: at another position in every frame. rig: at the cameras of a rig."""
+    """Position of the cameras. still: in front of the hands, following them only where they leave the
+    picture. orbit: around them. head: at the user's eyes. anywhere: at another position in every frame.
+    rig: at the cameras of a rig, turned to the hands, with lenses as long as it takes."""
     camera: str = "vga"
     """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
     views: int = 1
     """Number of cameras; a rig has its own number."""
-    distance: tuple[float, float] = (0.55, 0.9)
-    """Nearest and farthest distance from the center of the hands [m], drawn uniformly."""
+    share: float = 1.0 / 3.0
+    """Share of the picture's height that a hand's longer side has, or a little more; less where all hands of
+    a frame do not fit into the picture otherwise. Cameras at the eyes keep their distance."""
+    distance: tuple[float, float] | None = None
+    """Instead of the share, nearest and farthest distance from the center of the hands [m], drawn
+    uniformly."""
     rig: str = "six"
     """Rig for the placement rig: a shipped name or the path of a .toml file."""
     cameras: str | tuple[Camera, ...] | None = None
@@ -76,7 +87,8 @@ class ViewConfig:
             raise ArgumentError(choices(self.placement, PLACEMENTS, noun="placement"))
         if self.views < 1:
             raise ArgumentError(f"{self.views} views, expected at least 1")
-        if not 0.05 <= self.distance[0] <= self.distance[1] <= 20.0:
+        check_number("share", self.share, 0.01, 1.0)
+        if self.distance is not None and not 0.05 <= self.distance[0] <= self.distance[1] <= 20.0:
             raise ArgumentError(
                 f"distances are {self.distance}, expected two of 0.05 to 20 m, the shorter first"
             )
@@ -103,16 +115,22 @@ class Viewpoints:
             own = config.cameras
             self._cameras = load_cameras(own) if isinstance(own, str) else own
             self._poses = _kept([camera.T_world_camera for camera in self._cameras], take)
+            self._centers = hand_centers(take)
         else:
-            self._poses = _PATHS[config.placement](config, take, rng)
-            named = (dataclasses.replace(preset(config.camera), name=f"view{n}") for n in itertools.count())
-            self._cameras = tuple(itertools.islice(named, len(self._poses)))
-        self._centers = hand_centers(take)
+            framing = Framing(take)
+            cameras, poses = zip(*_PATHS[config.placement](config, take, framing, rng), strict=True)
+            self._cameras = tuple(dataclasses.replace(one, name=f"view{n}") for n, one in enumerate(cameras))
+            self._poses, self._centers = list(poses), framing.centers
 
     @property
     def num_cameras(self) -> int:
         """Number of cameras."""
         return len(self._poses)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the first camera's pictures [px]."""
+        return self._cameras[0].size
 
     def positions(self) -> Float[np.ndarray, "P 3"]:
         """All positions of the cameras, and of the hands' centers, over the whole take [m]."""
@@ -124,14 +142,8 @@ class Viewpoints:
 
 
 def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
-    """Center of the hands of each frame [m]; interpolated linearly over frames without hands."""
-    middles = take.qpos[..., :3] + _HAND_CENTER * _along(take)
-    there = np.isfinite(middles[..., :1])
-    counts = there.sum(axis=1)
-    centers = np.where(there, middles, 0.0).sum(axis=1) / np.maximum(counts, 1)
-    known = np.flatnonzero(counts[:, 0])
-    frames = np.arange(len(centers))
-    return np.stack([np.interp(frames, known, centers[known, axis]) for axis in range(3)], axis=1)
+    """Middle of the box around the hands of each frame [m]; interpolated over frames without hands."""
+    return Framing(take).centers
 
 
 def _along(take: Take) -> NDArray[np.float64]:
@@ -152,40 +164,82 @@ def _spherical(azimuth: float, elevation: float) -> NDArray[np.float64]:
     )
 
 
-def _middle(take: Take) -> NDArray[np.float64]:
-    middle: NDArray[np.float64] = np.median(hand_centers(take), axis=0)
-    return middle
+_Path = tuple[Camera, NDArray[np.float64]]
+"""A camera and its poses (T, 4, 4)."""
 
 
-def _still(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    """In front of the user; several cameras form a fan."""
-    middle, user = _middle(take), _towards_user(take)
+def _still(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
+    """In front of the user; several cameras form a fan.
+
+    Hands that are far apart are large only from a side, or from above: other places are tried then.
+    """
+    user = _towards_user(take)
     front = np.arctan2(-user[1], -user[0])
     spread = np.deg2rad(40.0) * (np.arange(config.views) - 0.5 * (config.views - 1))
     paths = []
     for azimuth in spread:
-        direction = _spherical(front + azimuth + rng.uniform(-0.15, 0.15), rng.uniform(0.1, 0.6))
-        pose = look_at(middle + rng.uniform(*config.distance) * direction, middle)
-        paths.append(np.broadcast_to(pose, (take.num_frames, 4, 4)))
+        tried = []
+        for wider in np.linspace(0.0, 1.0, 1 if config.distance else _PLACES):
+            aside = rng.uniform(0.15 * (1.0 - wider), 0.15 + _ASIDE * wider) * rng.choice([-1.0, 1.0])
+            direction = _spherical(front + azimuth + aside, rng.uniform(0.1, 0.6 + 0.4 * wider))
+            directions = np.tile(direction, (take.num_frames, 1))
+            tried.append(_followed(config, framing, directions, rng))
+            if tried[-1][0] <= _STILL_ENOUGH:
+                break
+        paths.append(min(tried, key=lambda one: one[0])[1])
     return paths
 
 
-def _orbit(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    middle, paths = _middle(take), []
+def _orbit(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
+    paths = []
     for number in range(config.views):
         start = rng.uniform(-np.pi, np.pi) + 2.0 * np.pi * number / config.views
-        elevation, distance = rng.uniform(0.0, 0.8), rng.uniform(*config.distance)
+        elevation = rng.uniform(0.0, 0.8)
         azimuths = start + 2.0 * np.pi * (take.times - take.times[0]) / _ORBIT_PERIOD
-        positions = [middle + distance * _spherical(azimuth, elevation) for azimuth in azimuths]
-        paths.append(np.array([look_at(position, middle) for position in positions]))
+        level = np.cos(elevation) * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
+        directions = np.column_stack([level, np.full(len(level), np.sin(elevation))])
+        paths.append(_followed(config, framing, directions, rng)[1])
     return paths
 
 
-def _head(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
+def _followed(
+    config: ViewConfig, framing: Framing, directions: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[float, _Path]:
+    """A camera in these directions (T, 3) of the hands that shows them all, and moves as little as it can.
+
+    Before it comes how much farther away it is than the share takes (the median).
+    """
+    camera, rotations = preset(config.camera), looking(directions)
+    kept = np.broadcast_to(framing.middle(), directions.shape)
+    enough = framing.shortest(camera, kept, rotations).max()
+    if config.distance is None:
+        side = float(np.nanmedian(framing.sides(rotations)))
+        farthest = _distance_of(camera, side, config.share)
+        usual = farthest / float(rng.uniform(1.0, _CLOSER))
+    else:
+        farthest = usual = float(rng.uniform(*config.distance))
+    if enough <= _STILL_ENOUGH * farthest:
+        centers, distances = kept, np.full(len(kept), usual if config.distance else max(usual, enough))
+    else:
+        centers = framing.followed()
+        distances = np.full(len(centers), usual)
+        if config.distance is None:
+            shortest = framing.shortest(camera, centers, rotations)
+            distances = framing.held(np.maximum(shortest, usual))
+    path = camera, poses_at(centers + distances[:, None] * directions, rotations)
+    return float(np.median(distances)) / farthest, path
+
+
+def _distance_of(
+    camera: Camera, side: NDArray[np.float64] | float, share: NDArray[np.float64] | float
+) -> Any:
+    """Distance [m] at which something as long as this [m] has this share of the picture's height."""
+    return camera.K[1, 1] * side / (share * camera.size[1])
+
+
+def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
     """At the eyes, following the hands with a delay; several cameras are side by side, as two eyes are."""
-    centers = uniform_filter1d(
-        hand_centers(take), max(1, round(_HEAD_DELAY * take.rate)), axis=0, mode="nearest"
-    )
+    centers = framing.followed()
     user = _towards_user(take)
     back, up = _EYES[0] + rng.uniform(-0.05, 0.05), _EYES[1] + rng.uniform(-0.05, 0.05)
     direction = _past_forearms(take, back * user + [0.0, 0.0, up])
@@ -194,7 +248,9 @@ def _head(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDAr
     for number in range(config.views):
         eyes = centers + direction
         eyes += 0.064 * (number - 0.5 * (config.views - 1)) * aside
-        paths.append(np.array([look_at(eye, center) for eye, center in zip(eyes, centers, strict=True)]))
+        away = eyes - centers
+        directions = away / np.linalg.norm(away, axis=1, keepdims=True)
+        paths.append((preset(config.camera), poses_at(eyes, looking(directions))))
     return paths
 
 
@@ -215,34 +271,77 @@ def _past_forearms(take: Take, offset: NDArray[np.float64]) -> NDArray[np.float6
     return length * direction
 
 
-def _anywhere(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    centers, paths = hand_centers(take), []
+def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
+    centers, paths, camera = framing.centers, [], preset(config.camera)
     for _ in range(config.views):
-        positions = np.empty_like(centers)
+        best, chosen = np.full(take.num_frames, np.inf), np.tile([0.0, 0.0, 1.0], (take.num_frames, 1))
+        distances = np.ones(take.num_frames)
+        closer = rng.uniform(1.0, _CLOSER, take.num_frames)
         remaining = np.arange(take.num_frames)
         for _ in range(_TRIES):
-            azimuths = rng.uniform(-np.pi, np.pi, len(remaining))
-            rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), len(remaining)))
-            distance = rng.uniform(*config.distance, len(remaining))
-            directions = [_spherical(*one) for one in zip(azimuths, rise, strict=True)]
-            positions[remaining] = centers[remaining] + distance[:, None] * np.array(directions)
-            remaining = remaining[_behind_arms(take, positions)[remaining]]
+            count, middles = len(remaining), centers[remaining]
+            azimuths = rng.uniform(-np.pi, np.pi, count)
+            rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), count))
+            level = np.cos(rise)[:, None] * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
+            directions = np.column_stack([level, np.sin(rise)])
+            rotations = looking(directions)
+            if config.distance is None:
+                usual = _distance_of(camera, framing.sides(rotations, remaining), config.share)
+                shortest = framing.shortest(camera, middles, rotations, remaining)
+                distance = np.maximum(usual / closer[remaining], shortest)
+                bad = np.maximum(np.nan_to_num(distance / usual, nan=1.0), _STILL_ENOUGH)
+            else:
+                distance, bad = rng.uniform(*config.distance, count), np.ones(count)
+            bad = bad + _HIDDEN * _behind_arms(take.qpos[remaining], middles + distance[:, None] * directions)
+            better = bad < best[remaining]
+            rows = remaining[better]
+            best[rows], chosen[rows], distances[rows] = bad[better], directions[better], distance[better]
+            remaining = remaining[best[remaining] > _STILL_ENOUGH]
             if not len(remaining):
                 break
-        paths.append(np.array([look_at(*pair) for pair in zip(positions, centers, strict=True)]))
+        distances = np.where(np.isfinite(distances), distances, 1.0)  # of frames without hands
+        paths.append((camera, poses_at(centers + distances[:, None] * chosen, looking(chosen))))
     return paths
 
 
-def _behind_arms(take: Take, positions: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether each frame's position (T, 3) [m] is behind a forearm, from where little but the arm is seen."""
-    away = positions[:, None] - take.qpos[..., :3]
-    cosines = -(away * _along(take)).sum(axis=-1) / np.linalg.norm(away, axis=-1)
-    behind: NDArray[np.bool_] = (cosines > np.cos(_ARM_CLEARANCE)).any(axis=1)
-    return behind  # NaN, where there is no hand, never is
+def _behind_arms(qpos: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether each frame's position (T, 3) [m] is behind a forearm, where little else is seen, or beside one.
+
+    NaN, where there is no hand, never is.
+    """
+    away = np.nan_to_num(positions)[:, None] - qpos[..., :3]
+    along = quaternion_matrix(qpos[..., 3:7])[..., 0]
+    back = -(away * along).sum(axis=-1)
+    behind = back > np.cos(_ARM_CLEARANCE) * np.linalg.norm(away, axis=-1)
+    beside = np.linalg.norm(away + np.clip(back, 0.0, _ARM)[..., None] * along, axis=-1) < _ARM_DISTANCE
+    hidden: NDArray[np.bool_] = (behind | beside).any(axis=1)
+    return hidden
 
 
-def _rig(config: ViewConfig, take: Take, rng: np.random.Generator) -> list[NDArray[np.float64]]:
-    return _kept(load_rig(config.rig).T_world_camera, take)
+def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
+    """At the cameras of a rig, with the lens that the share takes, or one that shows nearly all hands."""
+    middle, paths = framing.middle(), []
+    for T_world_camera in load_rig(config.rig).T_world_camera:
+        camera, position = preset(config.camera), T_world_camera[:3, 3]
+        for centers in (np.broadcast_to(middle, framing.centers.shape), framing.followed()):
+            away = position - centers
+            distances = np.linalg.norm(away, axis=1)
+            rotations = looking(away / distances[:, None])
+            if camera.lens.kind != "pinhole":
+                break
+            share = config.share * rng.uniform(1.0, _CLOSER)
+            side = float(np.nanmedian(framing.sides(rotations) / distances))
+            wanted = 1.0 / _distance_of(camera, side, share)
+            longest = distances / framing.shortest(camera, centers, rotations).clip(1e-6)
+            zoom = min(wanted, float(np.quantile(longest, 1.0 - _NEARLY_ALL)))
+            if zoom >= wanted / _STILL_ENOUGH:
+                break
+        if camera.lens.kind == "pinhole":
+            K = camera.K.copy()
+            K[[0, 1], [0, 1]] *= zoom
+            camera = dataclasses.replace(camera, K=K)
+        paths.append((camera, poses_at(np.broadcast_to(position, away.shape), rotations)))
+    return paths
 
 
 def _kept(poses: Iterable[NDArray[np.float64]], take: Take) -> list[NDArray[np.float64]]:

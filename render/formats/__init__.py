@@ -3,7 +3,7 @@
 - png_depth: pictures as PNG and JPEG bytes; depth as 16-bit PNG with its unit.
 - exr: all pictures of a frame in one OpenEXR file.
 - shards: shards on disk, tars or folders, each written as a whole.
-- folder_writers: the formats png, exr, coco and interhand.
+- folder_writers: the formats png, exr, coco, yolo and interhand.
 - clip_writer: the format webdataset, clips in tars.
 - freihand_writer: the format freihand.
 - writer: the writers by name of their format.

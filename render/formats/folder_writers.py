@@ -1,13 +1,19 @@
-"""Formats with one folder of pictures per shard, named after their frames: png, exr, coco, interhand."""
+"""Formats with folders of pictures per shard, named after their frames: png, exr, coco, yolo, interhand.
+
+Photographs lie in `images/shard-00000`, and nothing else that is a picture: programs train on whatever they
+find there. Depth, ids and normals have folders of the same names beside it, `depth/shard-00000`.
+"""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from handsim.errors import HandSimError
-from render.formats.annotations import coco, hands_json, interhand
+from render.formats.annotations import coco, hands_json, interhand, yolo
 from render.formats.annotations.common import to_json, without_colors
 from render.formats.exr import write_exr
 from render.formats.png_depth import encode_pictures
@@ -23,13 +29,26 @@ from render.formats.shards import (
 )
 from render.frames import RenderedFrame
 
+_IMAGES: Final = "images"
+PICTURES: Final = ("depth", "depth_ideal", "normals", "ids")
+"""Kinds of pictures beside the photographs, each of which has a folder."""
+_LABELS: Final = "labels"
+BESIDE: Final = (*PICTURES, _LABELS)
+"""Folders that may stand beside that of the photographs."""
+
 
 class FolderWriter:
-    """One folder per shard: pictures named after their frames, and an index of records."""
+    """For each shard a folder of pictures, which are named after frames, with an index of records.
 
-    def __init__(self, folder: Path, inside: str = ".") -> None:
-        self.folder = folder
-        self.pictures = folder / inside
+    Args:
+        folder: Where all is.
+        inside: The folder of photographs in it.
+        part: A folder in that one, and in those beside it, which holds the shards.
+    """
+
+    def __init__(self, folder: Path, *, inside: str = _IMAGES, part: str = ".") -> None:
+        self.folder, self.part = folder, part
+        self.pictures = folder / inside / part
 
     def done(self) -> frozenset[int]:
         """Shards that are complete."""
@@ -41,9 +60,27 @@ class FolderWriter:
         Raises:
             HandSimError: The format cannot hold these frames, or the disk takes no more.
         """
-        folder = self.pictures / shard_name(shard)
-        with one_sentence(self.folder, f"writing shard {shard}"), new_folder(folder) as temporary:
-            save_index(temporary, list(self._add_all(temporary, frames, folder.name)))
+        with one_sentence(self.folder, f"writing shard {shard}"), self.new_shard(shard) as temporary:
+            save_index(temporary, list(self._add_all(temporary, frames, shard_name(shard))))
+
+    @contextmanager
+    def new_shard(self, shard: int) -> Iterator[Path]:
+        """A temporary folder that becomes a shard when the block ends well; those in it go beside it.
+
+        Photographs take their names last: a shard that is there is whole.
+        """
+        with new_folder(self.pictures / shard_name(shard)) as temporary:
+            yield temporary
+            for kind, place in self.beside(shard).items():
+                if place.exists():
+                    shutil.rmtree(place)
+                if (temporary / kind).is_dir():
+                    place.parent.mkdir(parents=True, exist_ok=True)
+                    (temporary / kind).replace(place)
+
+    def beside(self, shard: int) -> dict[str, Path]:
+        """Where a shard's depth, ids and so on are, if there are any."""
+        return {kind: self.folder / kind / self.part / shard_name(shard) for kind in BESIDE}
 
     def finish(self) -> None:
         """Nothing to merge, unless a format overrides this."""
@@ -60,21 +97,40 @@ class FolderWriter:
         """Write one frame into a shard's folder of that name."""
         raise NotImplementedError
 
+    def _add_pictures(
+        self, folder: Path, frame: RenderedFrame, name: str, *, lossless: bool = False
+    ) -> dict[str, str]:
+        """Write a frame's pictures and return where those beside the photograph will be, from `folder` on."""
+        files = {}
+        for suffix, content in encode_pictures(frame, lossless=lossless).items():
+            kind, _, ending = suffix.strip(".").rpartition(".")
+            _write(folder / kind / f"{frame.key}.{ending}", content)
+            if kind:
+                files[f"{kind}_file"] = (Path(kind) / self.part / name / f"{frame.key}.{ending}").as_posix()
+        return files
+
     def _records(self) -> Iterator[dict[str, Any]]:
         return load_indexes(self.pictures, sorted(self.done()))
 
 
 class PngWriter(FolderWriter):
-    """`shard-00000/KEY.png`, the other pictures of a frame, and `KEY.json` with everything known of it."""
+    """`images/shard-00000/KEY.png`, `depth/shard-00000/KEY.png` ..., and `KEY.json` beside the photograph.
+
+    The JSON has everything that is known of the frame.
+    """
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        _write_pictures(folder, frame, lossless=True)
-        (folder / f"{frame.key}.json").write_text(to_json(hands_json.frame_record(frame)) + "\n", "utf-8")
+        files = self._add_pictures(folder, frame, name, lossless=True)
+        record = hands_json.frame_record(frame) | files
+        (folder / f"{frame.key}.json").write_text(to_json(record) + "\n", "utf-8")
         return {"key": frame.key, "number": frame.number, "camera": frame.camera.name}
 
 
 class ExrWriter(FolderWriter):
     """`shard-00000/KEY.exr` with all pictures, and `KEY.json` with all that is known of the frame."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, inside=".")
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
         write_exr(folder / f"{frame.key}.exr", frame)
@@ -83,15 +139,12 @@ class ExrWriter(FolderWriter):
 
 
 class CocoWriter(FolderWriter):
-    """`images/shard-00000/KEY.jpg`, and `annotations.json` beside `images`."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, "images")
+    """`images/shard-00000/KEY.jpg`, `depth/shard-00000/KEY.png` ..., and `annotations.json` beside them."""
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        record = coco.picture_record(frame, f"{name}/{frame.key}.jpg")
         _need_colors(frame, "coco")
-        _write_pictures(folder, frame, lossless=False)
+        record = coco.picture_record(frame, f"{name}/{frame.key}.jpg")
+        record["image"] |= self._add_pictures(folder, frame, name)
         return record
 
     def finish(self) -> None:
@@ -108,16 +161,35 @@ class CocoWriter(FolderWriter):
             save_text(self.folder / "annotations.json", _coco_file(numbered, [coco.CATEGORY]))
 
 
+class YoloWriter(CocoWriter):
+    """COCO's folder with `labels/shard-00000/KEY.txt`, and `data.yaml`, which ultralytics trains from."""
+
+    def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
+        record = super()._add(folder, frame, name)
+        _write(folder / _LABELS / f"{frame.key}.txt", yolo.label_lines(frame).encode())
+        return record
+
+    def finish(self) -> None:
+        """Write `annotations.json` and `data.yaml`.
+
+        Raises:
+            HandSimError: A shard is damaged, or the disk takes no more.
+        """
+        super().finish()
+        with one_sentence(self.folder, "writing data.yaml"):
+            save_text(self.folder / "data.yaml", [yolo.data_yaml()])
+
+
 class InterhandWriter(FolderWriter):
     """`images/train/shard-00000/KEY.jpg`, and InterHand2.6M's JSON files in `annotations/train`."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder, f"images/{interhand.SPLIT}")
+        super().__init__(folder, part=interhand.SPLIT)
 
     def _add(self, folder: Path, frame: RenderedFrame, name: str) -> dict[str, Any]:
-        record = interhand.picture_record(frame, f"{name}/{frame.key}.jpg")
         _need_colors(frame, "interhand")
-        _write_pictures(folder, frame, lossless=False)
+        record = interhand.picture_record(frame, f"{name}/{frame.key}.jpg")
+        record["image"] |= self._add_pictures(folder, frame, name)
         return record
 
     def finish(self) -> None:
@@ -148,9 +220,9 @@ class InterhandWriter(FolderWriter):
             save_text(annotations / "skeleton.txt", [interhand.skeleton_lines()])
 
 
-def _write_pictures(folder: Path, frame: RenderedFrame, *, lossless: bool) -> None:
-    for suffix, content in encode_pictures(frame, lossless=lossless).items():
-        (folder / f"{frame.key}{suffix}").write_bytes(content)
+def _write(path: Path, content: bytes) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
 
 
 def _need_colors(frame: RenderedFrame, name: str) -> None:

@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import tarfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,10 +15,10 @@ from handsim.files.capacity import check_free
 from handsim.files.json_files import load_json, save_json
 from render.formats.annotations.common import to_json
 from render.formats.clip_writer import TAR
+from render.formats.folder_writers import PICTURES, FolderWriter
 from render.formats.shards import (
     INDEX,
     load_index,
-    new_folder,
     new_tar,
     one_sentence,
     save_index,
@@ -28,8 +28,7 @@ from render.formats.writer import open_writer
 
 CONFIG: Final = "render.json"
 """Settings of a rendering, in its folder."""
-_MERGEABLE: Final = ("webdataset", "coco", "exr", "png")
-_INSIDE: Final = {"coco": "images"}
+_MERGEABLE: Final = ("webdataset", "coco", "yolo", "exr", "png")
 _LARGEST: Final = 1 << 30  # bytes of a picture's file
 _SAMPLE: Final = re.compile(r"(\d+)(\..+)")
 
@@ -104,13 +103,19 @@ def _merge_format(
 ) -> int:
     """Copy all shards of one format, and return their number."""
     number, offset = 0, 0
-    inside = _INSIDE.get(name, ".")
+    target = open_writer(name, _folder(out, formats, name))
     for folder, count in zip(folders, frames, strict=True):
-        source = _folder(folder, formats, name)
-        for shard in sorted(open_writer(name, source).done()):
-            start, end = source / inside / shard_name(shard), _folder(out, formats, name) / inside
-            with one_sentence(out, f"copying {start}"):
-                _COPY[name](start, end / shard_name(number), offset)
+        source = open_writer(name, _folder(folder, formats, name))
+        for shard in sorted(source.done()):
+            with one_sentence(out, f"copying shard {shard} of {folder}"):
+                if isinstance(source, FolderWriter) and isinstance(target, FolderWriter):
+                    _copy_folder(source, shard, target, number, offset)
+                else:
+                    start, end = (
+                        _folder(one, formats, name) / f"{shard_name(which)}{TAR}"
+                        for one, which in ((folder, shard), (out, number))
+                    )
+                    _copy_tar(start, end, offset)
             number += 1
         offset += count
     if not number:
@@ -119,7 +124,6 @@ def _merge_format(
 
 
 def _copy_tar(start: Path, end: Path, offset: int) -> None:
-    start, end = start.with_name(start.name + TAR), end.with_name(end.name + TAR)
     try:
         with tarfile.open(start, "r:") as source, new_tar(end) as target:
             for entry in source:
@@ -141,57 +145,49 @@ def _renumbered(name: str, content: bytes, offset: int) -> tuple[str, bytes]:
     return f"{int(sample[1]) + offset:06d}{sample[2]}", content
 
 
-def _copy_folder(start: Path, end: Path, offset: int) -> None:
-    """A shard of the formats png and exr: files named after keys, and an index of keys."""
+def _copy_folder(source: FolderWriter, shard: int, target: FolderWriter, number: int, offset: int) -> None:
+    """A shard of a format with folders: files that are named after keys, and an index of records."""
+    start, places = source.pictures / shard_name(shard), source.beside(shard)
     records = []
-    with new_folder(end) as temporary:
-        for record, files in _keyed(start, lambda record: str(record["key"])):
-            number = int(record["number"]) + offset
-            key = f"{record['camera']}_{number:06d}"
-            for suffix, file in files.items():
+    with target.new_shard(number) as temporary:
+        for record, files in _keyed(start, places):
+            image = record.get("image", record)  # the formats with an image's record number frames in it
+            field = "frame" if "image" in record else "number"
+            frame = int(image[field]) + offset
+            key = f"{image['camera']}_{frame:06d}"
+            named = {
+                f"{kind}_file": f"{kind}/{shard_name(number)}/{key}{suffix}"
+                for kind, suffix in files
+                if kind in PICTURES
+            }
+            image[field] = frame
+            if "image" in record:
+                image |= {"file_name": f"{shard_name(number)}/{key}.jpg", **named}
+            else:
+                image["key"] = key
+            for (kind, suffix), file in files.items():
+                (temporary / kind).mkdir(exist_ok=True)
                 if suffix == ".json":
-                    content = {**load_json(file), "number": number}
+                    content = load_json(file) | {"number": frame} | named
                     (temporary / f"{key}.json").write_text(to_json(content) + "\n", "utf-8")
                 else:
-                    shutil.copyfile(file, temporary / f"{key}{suffix}")
-            records.append({**record, "key": key, "number": number})
-        save_index(temporary, records)
-
-
-def _copy_coco(start: Path, end: Path, offset: int) -> None:
-    records = []
-    with new_folder(end) as temporary:
-        for record, files in _keyed(start, lambda record: Path(record["image"]["file_name"]).stem):
-            image = record["image"]
-            number = int(image["frame"]) + offset
-            key = f"{image['camera']}_{number:06d}"
-            for suffix, file in files.items():
-                shutil.copyfile(file, temporary / f"{key}{suffix}")
-            named = {**image, "file_name": f"{end.name}/{key}.jpg", "frame": number}
-            records.append({**record, "image": named})
+                    shutil.copyfile(file, temporary / kind / f"{key}{suffix}")
+            records.append(record)
         save_index(temporary, records)
 
 
 def _keyed(
-    start: Path, key_of: Callable[[dict[str, Any]], str]
-) -> Iterator[tuple[dict[str, Any], dict[str, Path]]]:
-    """Records of a shard, and the files of each by what follows the key in their names."""
-    files: dict[str, dict[str, Path]] = {}
-    for path in sorted(start.iterdir()):
-        key, _, _ = path.name.partition(".")
-        if path.name != INDEX:
-            files.setdefault(key, {})[path.name.removeprefix(key)] = path
+    start: Path, places: Mapping[str, Path]
+) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], Path]]]:
+    """Records of a shard, and the files of each by the folder that they are in and their endings."""
+    files: dict[str, dict[tuple[str, str], Path]] = {}
+    for kind, place in {"": start, **places}.items():
+        for path in sorted(place.iterdir()) if place.is_dir() else ():
+            if path.is_file() and path.name != INDEX:
+                files.setdefault(path.stem, {})[kind, path.suffix] = path
     for record in load_index(start):
         try:
-            key = key_of(record)
+            key = Path(record["image"]["file_name"]).stem if "image" in record else str(record["key"])
             yield record, files[key]
         except (KeyError, TypeError, ValueError) as error:
             raise DatasetError(f"{start}: its index does not fit its files; render it again") from error
-
-
-_COPY: Final[dict[str, Callable[[Path, Path, int], None]]] = {
-    "webdataset": _copy_tar,
-    "coco": _copy_coco,
-    "exr": _copy_folder,
-    "png": _copy_folder,
-}

@@ -17,6 +17,7 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import DatasetError, HandSimError
+from handsim.kernels.kernel import kernel
 from render.formats.annotations.common import as_sensed
 from render.frames import Pictures, RenderedFrame
 
@@ -53,12 +54,22 @@ def encode_depth(depth: Float32[np.ndarray, "H W"], *, meters_per_unit: float = 
     """
     if not 0.0 < meters_per_unit < np.inf:
         raise HandSimError(f"meters_per_unit is {meters_per_unit:g}, expected a positive number of meters")
-    steps = np.rint(np.asarray(depth, dtype=np.float64) / meters_per_unit)
-    fits = (steps > 0) & (steps <= _MOST)  # false for NaN
-    data = _encode(".png", np.where(fits, steps, 0).astype(np.uint16))
+    data = _encode(".png", _depth_steps(np.ascontiguousarray(depth), meters_per_unit))
     text = _KEYWORD + b"\0" + repr(float(meters_per_unit)).encode("ascii")
     end = _FIRST_CHUNK.stop
     return data[:end] + _chunk(b"tEXt", text) + data[end:]
+
+
+@kernel
+def _depth_steps(depth: NDArray[np.float32], meters_per_unit: float) -> Any:
+    """Depth (H, W) in whole units; 0 for what does not fit."""
+    steps = np.zeros(depth.shape, np.uint16)
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            step = np.rint(depth[row, column] / meters_per_unit)
+            if 0.0 < step <= _MOST:  # never so for NaN
+                steps[row, column] = int(step)
+    return steps
 
 
 def decode_depth(data: bytes, *, name: str = "depth picture") -> Float32[np.ndarray, "H W"]:
@@ -107,9 +118,21 @@ def encode_ids(pictures: Pictures) -> bytes | None:
 
 def encode_normals(normals: Float32[np.ndarray, "H W 3"]) -> bytes:
     """Unit normals as 8-bit PNG: x, y, z are (red, green, blue - 128) / 127; black is nothing."""
-    levels = np.rint(normals * _NORMAL_SCALE) + _NORMAL_ZERO
-    something = (normals != 0.0).any(axis=-1, keepdims=True)
-    return encode_png(np.where(something, levels, 0).astype(np.uint8))
+    return _encode(".png", _normal_levels(np.ascontiguousarray(normals)))
+
+
+@kernel
+def _normal_levels(normals: NDArray[np.float32]) -> Any:
+    """Normals (H, W, 3) as bytes, z first as OpenCV has blue."""
+    levels = np.zeros(normals.shape, np.uint8)
+    for row in range(normals.shape[0]):
+        for column in range(normals.shape[1]):
+            x, y, z = normals[row, column]
+            if x != 0.0 or y != 0.0 or z != 0.0:
+                levels[row, column, 2] = int(np.rint(x * _NORMAL_SCALE)) + _NORMAL_ZERO
+                levels[row, column, 1] = int(np.rint(y * _NORMAL_SCALE)) + _NORMAL_ZERO
+                levels[row, column, 0] = int(np.rint(z * _NORMAL_SCALE)) + _NORMAL_ZERO
+    return levels
 
 
 def encode_pictures(frame: RenderedFrame, *, lossless: bool) -> dict[str, bytes]:

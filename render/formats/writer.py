@@ -13,7 +13,13 @@ from typing import Final, Protocol
 
 from handsim.errors import HandSimError, choices
 from render.formats.clip_writer import WebdatasetWriter
-from render.formats.folder_writers import CocoWriter, ExrWriter, InterhandWriter, PngWriter
+from render.formats.folder_writers import (
+    CocoWriter,
+    ExrWriter,
+    InterhandWriter,
+    PngWriter,
+    YoloWriter,
+)
 from render.formats.freihand_writer import FreihandWriter
 from render.frames import RenderedFrame
 
@@ -46,13 +52,14 @@ class FrameWriter(Protocol):
 WRITERS: Final[dict[str, Callable[[Path], FrameWriter]]] = {
     "webdataset": WebdatasetWriter,
     "coco": CocoWriter,
+    "yolo": YoloWriter,
     "freihand": FreihandWriter,
     "interhand": InterhandWriter,
     "exr": ExrWriter,
     "png": PngWriter,
 }
 FORMATS: Final = tuple(WRITERS)
-NEED_COLORS: Final = ("coco", "freihand", "interhand")
+NEED_COLORS: Final = ("coco", "yolo", "freihand", "interhand")
 """Formats of color pictures."""
 
 

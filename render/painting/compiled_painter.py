@@ -17,11 +17,27 @@ from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from render.painting.figures import Drawn
 from render.painting.rasterizer import nearest_faces, project
-from render.painting.shading import SPOT, TO_DISPLAY, TO_LINEAR, display, read_texels, shade
+from render.painting.shading import (
+    BUMP,
+    COLOR,
+    NORMAL,
+    POSITION,
+    ROUGH,
+    SPOT,
+    TANGENT,
+    TINT,
+    TO_DISPLAY,
+    TO_LINEAR,
+    display,
+    read_texels,
+    shade,
+)
 from render.painting.shadows import shadow_map
 from render.scenery.lights import Lighting
 
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
+_ROUGHEST: Final = 0.04  # that a mirror can be
+_BLOCK: Final = 2048  # surface points shaded at a time, so that they stay in the processor's cache
 
 _NO_TEXELS: Final = np.empty((0, 0, 8), dtype=np.uint8)
 
@@ -32,8 +48,10 @@ class _Mesh(NamedTuple):
     begin: int
     """Number of its first face among those of all surfaces."""
     faces: NDArray[np.int64]
-    vertices: NDArray[np.float64]
-    """Rows (14) as in `shading.Spot`, the first three of `rasterizer.project` at twice the picture's size."""
+    corners: NDArray[np.float64]
+    """Of `rasterizer.project` (V, 3) at twice the picture's size."""
+    rows: NDArray[np.float32]
+    """Position [m], normal, tint and texture coordinates of each vertex (V, 11)."""
     texels: NDArray[np.uint8]
     """Empty where there is no texture."""
     finish: NDArray[np.float64]
@@ -44,16 +62,29 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     """See `render.painting.painter.paint`; the same bytes on every machine but for rounding."""
     width, height = camera.size
     meshes = _meshes(camera, drawn)
-    counts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    counts = np.cumsum([0, *(len(mesh.corners) for mesh in meshes)])
     faces = np.concatenate([mesh.faces + first for mesh, first in zip(meshes, counts, strict=False)])
-    vertices = np.concatenate([mesh.vertices[:, :6] for mesh in meshes])
-    nearness, first = nearest_faces(vertices[:, :3], faces, (2 * width, 2 * height), farthest=0.0)
+    corners = np.concatenate([mesh.corners for mesh in meshes])
+    nearness, first = nearest_faces(corners, faces, (2 * width, 2 * height), farthest=0.0)
     lamps, around = _lamp_table(lighting), np.zeros((9, 3))
     around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
-    shadows = shadow_map(vertices[:, 3:], faces, lamps[0, :3])
+    casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
+    shadows = shadow_map(np.concatenate([mesh.rows[:, :3] for mesh in meshes]), casting, lamps[0, :3])
     sums = np.zeros((height, width, 4), dtype=np.float32)
     for mesh in meshes:
-        _shade_surface(nearness, first, *mesh, lamps, around, *shadows, TO_LINEAR, TO_DISPLAY, sums)
+        spots, pixels, shares = _spots(nearness, first, *mesh, TO_LINEAR)
+        _add_colors(
+            spots,
+            pixels,
+            shares,
+            len(mesh.texels) > 0,
+            mesh.finish,
+            lamps,
+            around,
+            *shadows,
+            TO_DISPLAY,
+            sums,
+        )
     painted: NDArray[np.uint8] = np.rint(63.75 * sums).astype(np.uint8)
     return painted
 
@@ -64,17 +95,16 @@ def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
     meshes, begin = [], 0
     for one in drawn:
         triangles, material = one.triangles, one.material()
-        vertices = np.zeros((len(triangles.vertices), 14))
-        vertices[:, 3:6] = camera.local(triangles.vertices)
-        vertices[:, :3] = project(vertices[:, 3:6], doubled)
-        vertices[:, 6:9] = triangles.normals @ rotation
-        vertices[:, 9:12] = one.colors[:, :3]
+        local = camera.local(triangles.vertices)
+        rows = np.zeros((len(local), 11), dtype=np.float32)
+        rows[:, :3], rows[:, 3:6] = local, triangles.normals @ rotation
+        rows[:, 6:9] = one.colors[:, :3]
         if one.uv is not None:
-            vertices[:, 12:] = one.uv
+            rows[:, 9:] = one.uv
         texels = _NO_TEXELS if material.texels is None else material.texels
         faces = np.ascontiguousarray(triangles.faces, dtype=np.int64)
         finish = np.array([*material.color, material.roughness, material.glow, *material.scatter])
-        meshes.append(_Mesh(begin, faces, vertices, texels, finish))
+        meshes.append(_Mesh(begin, faces, project(local, doubled), rows, texels, finish))
         begin += len(faces)
     return meshes
 
@@ -93,46 +123,41 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
 
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
 @kernel
-def _shade_surface(
+def _spots(
     nearness: NDArray[np.float32],
     first: NDArray[np.int32],
     begin: int,
     faces: NDArray[np.int64],
-    vertices: NDArray[np.float64],
+    corners: NDArray[np.float64],
+    rows: NDArray[np.float32],
     texels: NDArray[np.uint8],
     finish: NDArray[np.float64],
-    lamps: NDArray[np.float64],
-    ambient: NDArray[np.float64],
-    to_map: NDArray[np.float64],
-    nearest: NDArray[np.float32],
-    bias: float,
-    to_linear: NDArray[np.float64],
-    to_display: NDArray[np.float64],
-    sums: NDArray[np.float32],
-) -> None:
-    """Add one surface's colors, and how many of four samples per pixel it fills.
+    to_linear: NDArray[np.float32],
+) -> Any:
+    """The surface points that are shaded: their table, the pixel of each, and its share of four samples.
 
     Args:
         nearness: One over the depth (2 H, 2 W) [1/m].
         first: Nearest face of each sample (2 H, 2 W), counted over all surfaces; -1 for none.
         begin: Number of this surface's first face.
         faces: Triangles (F, 3).
-        vertices: Rows (V, 14) of `_Mesh.vertices`.
+        corners: See `_Mesh.corners` (V, 3).
+        rows: See `_Mesh.rows` (V, 11).
         texels: Texture (h, w, 8), empty for none; see `Material.texels`.
         finish: Linear color (3), roughness, glow and scatter (3).
-        lamps: Rows (L, 9) of `_lamp_table`.
-        ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
-        to_map: `ShadowMap.to_map` (3, 4).
-        nearest: `ShadowMap.nearest` (N, N) [m].
-        bias: `ShadowMap.bias` [m].
         to_linear: `shading.TO_LINEAR` (256,).
-        to_display: `shading.TO_DISPLAY` (2048,).
-        sums: Sums of display colors and samples (H, W, 4), added to.
     """
-    spot, light = np.empty(SPOT), np.empty(3)
-    for row in range(len(sums)):
-        for column in range(sums.shape[1]):
-            count, smooth = _samples(nearness, first, begin, begin + len(faces), row, column)
+    height, width = first.shape[0] // 2, first.shape[1] // 2
+    end, most = begin + len(faces), 0
+    for row in range(2 * height):
+        for column in range(2 * width):
+            most += begin <= first[row, column] < end
+    spots = np.empty((most, SPOT), np.float32)
+    pixels, shares = np.empty(most, np.int64), np.empty(most, np.float32)
+    spot = 0
+    for row in range(height):
+        for column in range(width):
+            count, smooth = _samples(nearness, first, begin, end, row, column)
             if count == 0:
                 continue
             for i in range(1 if smooth else 2):
@@ -141,19 +166,67 @@ def _shade_surface(
                     if not 0 <= face < len(faces):
                         continue
                     x, y = (1.0, 1.0) if smooth else (j + 0.5, i + 0.5)
-                    _interpolate(vertices, faces, face, 2 * column + x, 2 * row + y, spot)
-                    spot[14:18] = finish[:4]
-                    if len(texels):
-                        read_texels(texels, to_linear, spot)
-                        _apply_normal_map(vertices, faces, face, spot)
-                    shade(spot, finish, lamps, ambient, to_map, nearest, bias, light)
-                    share = 4.0 if smooth else 1.0
-                    for k in range(3):
-                        sums[row, column, k] += share * display(spot[9 + k] * light[k], to_display)
-                    sums[row, column, 3] += share
+                    place = faces[face]
+                    _write_spot(
+                        corners,
+                        rows,
+                        place,
+                        2 * column + x,
+                        2 * row + y,
+                        texels,
+                        finish,
+                        to_linear,
+                        spots,
+                        spot,
+                    )
+                    pixels[spot], shares[spot] = row * width + column, 4.0 if smooth else 1.0
+                    spot += 1
+    return spots[:spot], pixels[:spot], shares[:spot]
 
 
 @kernel
+def _add_colors(
+    spots: NDArray[np.float32],
+    pixels: NDArray[np.int64],
+    shares: NDArray[np.float32],
+    mapped: bool,
+    finish: NDArray[np.float64],
+    lamps: NDArray[np.float64],
+    ambient: NDArray[np.float64],
+    to_map: NDArray[np.float64],
+    nearest: NDArray[np.float32],
+    bias: float,
+    to_display: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
+    """Add one surface's colors, and how many of four samples per pixel it fills.
+
+    Args:
+        spots: Rows (N, 23) as the columns of `shading.SPOT`.
+        pixels: Pixel of each (N,).
+        shares: Samples of the pixel that each stands for (N,).
+        mapped: Whether the surface has a texture.
+        finish: Linear color (3), roughness, glow and scatter (3).
+        lamps: Rows (L, 9) of `_lamp_table`.
+        ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
+        to_map: `ShadowMap.to_map` (3, 4).
+        nearest: `ShadowMap.nearest` (N, N) [m].
+        bias: `ShadowMap.bias` [m].
+        to_display: `shading.TO_DISPLAY` (2048,).
+        sums: Sums of display colors and samples (H, W, 4), added to.
+    """
+    flat = sums.reshape(-1, 4)
+    for start in range(0, len(pixels), _BLOCK):
+        block = np.ascontiguousarray(spots[start : start + _BLOCK].T)
+        light = shade(block, mapped, finish, lamps, ambient, to_map, nearest, bias)
+        for n in range(block.shape[1]):
+            pixel, share = pixels[start + n], shares[start + n]
+            for k in range(3):
+                flat[pixel, k] += share * display(block[TINT + k, n] * light[k, n], to_display)
+            flat[pixel, 3] += share
+
+
+@kernel(inline=True)
 def _samples(
     nearness: NDArray[np.float32], first: NDArray[np.int32], begin: int, end: int, row: int, column: int
 ) -> Any:
@@ -177,77 +250,63 @@ def _samples(
     return count, count == 4 and most - least < _SMOOTH * most
 
 
-@kernel
-def _interpolate(
-    vertices: NDArray[np.float64],
-    faces: NDArray[np.int64],
-    face: int,
+@kernel(inline=True)
+def _write_spot(
+    corners: NDArray[np.float64],
+    rows: NDArray[np.float32],
+    place: NDArray[np.int64],
     x: float,
     y: float,
-    spot: NDArray[np.float64],
+    texels: NDArray[np.uint8],
+    finish: NDArray[np.float64],
+    to_linear: NDArray[np.float32],
+    spots: NDArray[np.float32],
+    spot: int,
 ) -> None:
     """Write the surface point of a face behind a pixel: its corners' rows, interpolated with perspective.
 
     Args:
-        vertices: Rows (V, 14) of `_Mesh.vertices`.
-        faces: Triangles (F, 3).
-        face: Index of the face.
+        corners: See `_Mesh.corners` (V, 3).
+        rows: See `_Mesh.rows` (V, 11).
+        place: The face's vertices (3,).
         x: Column in the doubled picture [px].
         y: Row in the doubled picture [px].
-        spot: See `shading.SPOT`; columns 3 to 13 are written.
+        texels: See `_spots`.
+        finish: See `_spots`.
+        to_linear: See `_spots`.
+        spots: Rows as the columns of `shading.SPOT`; one is written.
+        spot: Which.
     """
-    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-    ax, ay = vertices[a, 0], vertices[a, 1]
-    bx, by = vertices[b, 0] - ax, vertices[b, 1] - ay
-    cx, cy = vertices[c, 0] - ax, vertices[c, 1] - ay
+    a, b, c = place[0], place[1], place[2]
+    ax, ay = corners[a, 0], corners[a, 1]
+    bx, by = corners[b, 0] - ax, corners[b, 1] - ay
+    cx, cy = corners[c, 0] - ax, corners[c, 1] - ay
     scale = 1.0 / (bx * cy - by * cx)
     second = max(((x - ax) * cy - (y - ay) * cx) * scale, 0.0)
     third = max(((y - ay) * bx - (x - ax) * by) * scale, 0.0)
-    first = max(1.0 - second - third, 0.0) * vertices[a, 2]
-    second, third = second * vertices[b, 2], third * vertices[c, 2]
+    first = max(1.0 - second - third, 0.0) * corners[a, 2]
+    second, third = second * corners[b, 2], third * corners[c, 2]
     scale = 1.0 / (first + second + third)
     first, second, third = first * scale, second * scale, third * scale
-    for i in range(3, 14):
-        spot[i] = first * vertices[a, i] + second * vertices[b, i] + third * vertices[c, i]
-    _normalize(spot)
-
-
-@kernel
-def _apply_normal_map(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], face: int, spot: NDArray[np.float64]
-) -> None:
-    """Replace a normal (of `spot`) by the texture's, whose first axis is the direction in which u grows.
-
-    Args:
-        vertices: Rows (V, 14) of `_Mesh.vertices`.
-        faces: Triangles (F, 3).
-        face: Index of the face.
-        spot: See `shading.SPOT`; the normal is written.
-    """
-    a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
-    bu, bv = vertices[b, 12] - vertices[a, 12], vertices[b, 13] - vertices[a, 13]
-    cu, cv = vertices[c, 12] - vertices[a, 12], vertices[c, 13] - vertices[a, 13]
-    sign = 1.0 if bu * cv - cu * bv >= 0.0 else -1.0
-    bv, cv = sign * bv, sign * cv
-    tx = cv * (vertices[b, 3] - vertices[a, 3]) - bv * (vertices[c, 3] - vertices[a, 3])
-    ty = cv * (vertices[b, 4] - vertices[a, 4]) - bv * (vertices[c, 4] - vertices[a, 4])
-    tz = cv * (vertices[b, 5] - vertices[a, 5]) - bv * (vertices[c, 5] - vertices[a, 5])
-    nx, ny, nz = spot[6], spot[7], spot[8]
-    along = nx * tx + ny * ty + nz * tz
-    tx, ty, tz = tx - along * nx, ty - along * ny, tz - along * nz
-    square = tx * tx + ty * ty + tz * tz
-    if square == 0.0:
-        return
-    across, up, out = spot[18] / np.sqrt(square), spot[19] / np.sqrt(square), spot[20]
-    spot[6] = across * tx + up * (ny * tz - nz * ty) + out * nx
-    spot[7] = across * ty + up * (nz * tx - nx * tz) + out * ny
-    spot[8] = across * tz + up * (nx * ty - ny * tx) + out * nz
-    _normalize(spot)
-
-
-@kernel
-def _normalize(spot: NDArray[np.float64]) -> None:
-    """Scale the normal of a surface point (see `shading.SPOT`) to unit length."""
-    scale = 1.0 / np.sqrt(spot[6] * spot[6] + spot[7] * spot[7] + spot[8] * spot[8])
-    for i in range(6, 9):
-        spot[i] *= scale
+    ra, rb, rc = rows[a], rows[b], rows[c]
+    px = first * ra[0] + second * rb[0] + third * rc[0]
+    py = first * ra[1] + second * rb[1] + third * rc[1]
+    pz = first * ra[2] + second * rb[2] + third * rc[2]
+    spots[spot, POSITION], spots[spot, POSITION + 1], spots[spot, POSITION + 2] = px, py, pz
+    for i in range(3):
+        spots[spot, NORMAL + i] = first * ra[3 + i] + second * rb[3 + i] + third * rc[3 + i]
+        spots[spot, TINT + i] = first * ra[6 + i] + second * rb[6 + i] + third * rc[6 + i]
+    red, green, blue, rough = finish[0], finish[1], finish[2], finish[3]
+    if len(texels):
+        u = first * ra[9] + second * rb[9] + third * rc[9]
+        v = first * ra[10] + second * rb[10] + third * rc[10]
+        r, g, b_, shine, across, up, out = read_texels(texels, to_linear, u, v)
+        red, green, blue, rough = red * r, green * g, blue * b_, rough * shine
+        spots[spot, BUMP], spots[spot, BUMP + 1], spots[spot, BUMP + 2] = across, up, out
+        bu, bv = rb[9] - ra[9], rb[10] - ra[10]
+        cu, cv = rc[9] - ra[9], rc[10] - ra[10]
+        sign = 1.0 if bu * cv - cu * bv >= 0.0 else -1.0
+        for i in range(3):
+            spots[spot, TANGENT + i] = sign * (cv * (rb[i] - ra[i]) - bv * (rc[i] - ra[i]))
+    spots[spot, COLOR], spots[spot, COLOR + 1], spots[spot, COLOR + 2] = red, green, blue
+    spots[spot, ROUGH] = max(rough, _ROUGHEST)

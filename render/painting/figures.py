@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from gloves.takes.take import RigidBody
-from handsim.hand.keypoints import keypoint_flesh
+from handsim.hand.keypoints import keypoint_thickness
 from handsim.hand.skin.surface import vertex_normals
 from render.frames import PARTS_A_HAND
 from render.painting.materials import (
@@ -85,6 +85,13 @@ class Drawn:
     uv: Float32[np.ndarray, "V 2"] | None
     material: Callable[[], Material]
     """Returns the same material every time; only called for colors, because textures take time."""
+    coarse_faces: Int[np.ndarray, "G 3"] | None = None
+    """Triangles of the same vertices that cast its shadow; None: all of its own."""
+
+    @property
+    def casting(self) -> Int[np.ndarray, "G 3"]:
+        """Triangles that cast its shadow."""
+        return self.triangles.faces if self.coarse_faces is None else self.coarse_faces
 
 
 def sample_people(
@@ -119,10 +126,10 @@ class HandFigure:
         self._painted: Material | None = None
         self._marker_bones = bones = fit.attachment.main_bones
         self._marker_numbers = (1 + first_marker + np.arange(len(bones))).astype(np.uint8)
-        self.flesh: Float[np.ndarray, "21"] = keypoint_flesh(fit.model)
-        """Depth of each keypoint under the back or the palm, whichever is more, markers included [m]."""
+        self.thickness: Float[np.ndarray, "21"] = keypoint_thickness(fit.model.shape)
+        """Of the hand at each keypoint, markers included [m]."""
         if look.glove is not None:
-            self.flesh = self.flesh + fit.layout.heights.max() + fit.layout.radius
+            self.thickness = self.thickness + fit.layout.heights.max() + fit.layout.radius
 
     def drawn(self, qpos: Float[np.ndarray, "27"], number: int) -> list[Drawn]:
         """Skin, and markers where a glove is worn.
@@ -141,7 +148,7 @@ class HandFigure:
             np.full(count, 1 + number, dtype=np.uint8),
             np.zeros(count, dtype=np.uint8),
         )
-        drawn = [Drawn(triangles, shade_colors(skin.shade), skin.uv, self._material)]
+        drawn = [Drawn(triangles, shade_colors(skin.shade), skin.uv, self._material, skin.coarse_faces)]
         if self.look.glove is not None:
             drawn.append(self._drawn_markers(qpos, number))
         return drawn

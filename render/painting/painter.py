@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Final, Literal
 
@@ -51,9 +50,7 @@ def paint(
     picture = np.zeros((height, width, 4), dtype=np.uint8)
     left, top, right, bottom = _window(camera, drawn)
     if left < right and top < bottom:
-        inner = dataclasses.replace(
-            camera, size=(right - left, bottom - top), K=camera.K - [[0, 0, left], [0, 0, top], [0, 0, 0]]
-        )
+        inner = camera.part(left, top, right - left, bottom - top)
         picture[top:bottom, left:right] = paint_colors(inner, drawn, lighting)
     return picture
 

@@ -21,6 +21,8 @@ from render.frames import Pictures
 
 NEAR: Final = 0.01
 """Triangles nearer to the camera's plane are not drawn [m]."""
+_ROUNDING: Final = 1e-12  # of barycentric coordinates, so that no pixel on a common side falls between faces
+_NARROW: Final = 6  # [px] width of a triangle's box up to which each of its pixels is tested
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,6 +122,16 @@ def project(local: NDArray[np.float64], K: NDArray[np.float64]) -> Any:
 
 
 @kernel
+def _where_positive(value: float, step: float, low: float, high: float) -> Any:
+    """The part of low..high where `value + step * place` is positive, and one place more on either side."""
+    if step > 0.0:
+        return max(low, -value / step - 1.0), high
+    if step < 0.0:
+        return low, min(high, -value / step + 1.0)
+    return low, high
+
+
+@kernel
 def _draw(
     corners: NDArray[np.float64],
     faces: NDArray[np.int64],
@@ -151,12 +163,22 @@ def _draw(
         top, bottom = max(0, int(np.ceil(low_y - 0.5))), min(height - 1, int(np.floor(high_y - 0.5)))
         scale = 1.0 / area
         step_v, step_w = cy * scale, -by * scale
+        begin, end = left, right
         for row in range(top, bottom + 1):
             y = row + 0.5 - ay
-            x = left + 0.5 - ax
+            if right - left > _NARROW:  # most of a slanted triangle's box is outside of it
+                x = left + 0.5 - ax
+                v, w = (x * cy - y * cx) * scale, (y * bx - x * by) * scale
+                low, high = _where_positive(v, step_v, 0.0, float(right - left))
+                low, high = _where_positive(w, step_w, low, high)
+                low, high = _where_positive(1.0 - v - w, -step_v - step_w, low, high)
+                if low > high:
+                    continue
+                begin, end = left + int(low), left + int(high)
+            x = begin + 0.5 - ax
             v, w = (x * cy - y * cx) * scale, (y * bx - x * by) * scale
-            for column in range(left, right + 1):
-                if v >= 0.0 and w >= 0.0 and v + w <= 1.0:
+            for column in range(begin, end + 1):
+                if v >= -_ROUNDING and w >= -_ROUNDING and v + w <= 1.0 + _ROUNDING:
                     near = az + v * bz + w * cz
                     if near > nearness[row, column]:
                         nearness[row, column] = near

@@ -1,12 +1,15 @@
-"""Shading of a surface point by its texture and glTF 2.0's microfacet model.
+"""Shading of surface points by their texture and glTF 2.0's microfacet model.
 
 Lambert's diffuse light under Schlick's Fresnel term, GGX with Smith's occlusion in Schlick's form (Khronos
 glTF 2.0 specification, appendix B), as in pyrender's shader, so that both painters agree.
+
+Points come as columns of a table, a row for each number, so that loops over points are compiled into vector
+instructions: a loop writes one row and reads few, or the compiler cannot tell that rows do not overlap.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +18,36 @@ from handsim.kernels.kernel import kernel
 from render.painting.shadows import lit_share
 
 GAMMA: Final = 2.2
-_FACING: Final = 0.04  # specular reflectance of dielectrics at normal incidence
+_FACING: Final = np.float32(0.04)  # specular reflectance of dielectrics at normal incidence
 _LIFT: Final = 1.7  # offset of shadow look-ups from slanted surfaces, against self-shadowing [bias]
 _UNDER: Final = 0.012  # depth that scattered light passes at a scatter of 1 [m]
+_PI: Final = np.float32(np.pi)
+_ZERO: Final = np.float32(0.0)
+_ONE: Final = np.float32(1.0)
+_HALF: Final = np.float32(0.5)
+_TINY: Final = np.float32(1e-12)
+_LEAST: Final = np.float32(1e-30)
+_EDGE: Final = np.float32(0.001)  # cosine of the flattest view that is told apart
 _LEVELS: Final = 2048
 _BYTES = np.arange(256) / 255.0
-TO_LINEAR: Final = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4)
+TO_LINEAR: Final = np.where(_BYTES <= 0.04045, _BYTES / 12.92, ((_BYTES + 0.055) / 1.055) ** 2.4).astype(
+    np.float32
+)
 """Linear light of sRGB bytes."""
-TO_DISPLAY: Final = np.linspace(0.0, 1.0, _LEVELS) ** (2.0 / GAMMA)
+TO_DISPLAY: Final = (np.linspace(0.0, 1.0, _LEVELS) ** (2.0 / GAMMA)).astype(np.float32)
 """Display values in [0, 1] by the square root of linear light, where the curve is nearly straight."""
 
-SPOT: Final = 21
-"""Length of the row of numbers that describes a surface point (a spot).
+SPOT: Final = 23
+"""Number of rows of a table of surface points, a column a point.
 
-Pixel and one over the depth (3), position [m] (3) and unit normal (3) in the camera's axes, tint (3), texture
-coordinates (2), linear color (3), roughness, the texture's normal (3)."""
+Position [m] (3) and normal (3) in the camera's axes; tint (3); linear color (3); roughness; the way in which
+u grows (3) and the texture's normal (3), both without a meaning where there is no texture; and what `shade`
+finds: unit vector to the camera (3) and its cosine with the normal."""
+POSITION, NORMAL, TINT, COLOR, ROUGH, TANGENT, BUMP, VIEW, FACING = 0, 3, 6, 9, 12, 13, 16, 19, 22
 
 
-@kernel
-def display(light: float, table: NDArray[np.float64]) -> float:
+@kernel(inline=True)
+def display(light: float, table: NDArray[np.float32]) -> float:
     """The display value of linear light, clipped to [0, 1]; `table` is `TO_DISPLAY` (2048,)."""
     root = np.sqrt(min(max(light, 0.0), 1.0)) * (_LEVELS - 1)
     low = min(int(root), _LEVELS - 2)
@@ -41,97 +55,306 @@ def display(light: float, table: NDArray[np.float64]) -> float:
     return value
 
 
-@kernel
-def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float64], spot: NDArray[np.float64]) -> None:
-    """Multiply a surface point's color and roughness by the texture's, and write its normal; bilinear.
+@kernel(inline=True)
+def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float32], u: float, v: float) -> Any:
+    """Linear color (3), roughness and normal (3) of a texture; bilinear.
 
     Args:
         texels: Texture (h, w, 8); see `Material.texels`.
         table: `TO_LINEAR` (256,).
-        spot: See `SPOT`.
+        u: Texture coordinate to the right.
+        v: Texture coordinate upwards.
     """
     rows, columns = texels.shape[:2]
-    across = min(max(spot[12] * columns - 0.5, 0.0), columns - 1.001)
-    down = min(max((1.0 - spot[13]) * rows - 0.5, 0.0), rows - 1.001)
+    across = min(max(u * columns - 0.5, 0.0), columns - 1.001)
+    down = min(max((1.0 - v) * rows - 0.5, 0.0), rows - 1.001)
     column, row = int(across), int(down)
     right, below = across - column, down - row
     red = green = blue = rough = x = y = z = 0.0
     for i in range(2):
         for j in range(2):
             share = (below if i else 1.0 - below) * (right if j else 1.0 - right)
-            red += share * table[texels[row + i, column + j, 0]]
-            green += share * table[texels[row + i, column + j, 1]]
-            blue += share * table[texels[row + i, column + j, 2]]
-            rough += share * texels[row + i, column + j, 3]
-            x += share * texels[row + i, column + j, 4]
-            y += share * texels[row + i, column + j, 5]
-            z += share * texels[row + i, column + j, 6]
-    spot[14] *= red
-    spot[15] *= green
-    spot[16] *= blue
-    spot[17] *= rough / 255.0
-    spot[18], spot[19], spot[20] = x / 127.5 - 1.0, y / 127.5 - 1.0, z / 127.5 - 1.0
+            texel = texels[row + i, column + j]
+            red += share * table[texel[0]]
+            green += share * table[texel[1]]
+            blue += share * table[texel[2]]
+            rough += share * texel[3]
+            x += share * texel[4]
+            y += share * texel[5]
+            z += share * texel[6]
+    return red, green, blue, rough / 255.0, x / 127.5 - 1.0, y / 127.5 - 1.0, z / 127.5 - 1.0
 
 
 @kernel
 def shade(
-    spot: NDArray[np.float64],
+    spots: NDArray[np.float32],
+    mapped: bool,
     finish: NDArray[np.float64],
     lamps: NDArray[np.float64],
     ambient: NDArray[np.float64],
     to_map: NDArray[np.float64],
     nearest: NDArray[np.float32],
     bias: float,
-    light: NDArray[np.float64],
-) -> None:
-    """Write the linear light (red, green, blue) that a surface point sends to the camera in the origin.
+) -> Any:
+    """Linear light (3, N) that surface points send to the camera in the origin.
 
     Args:
-        spot: See `SPOT`.
+        spots: Table (23, N); see `SPOT`. Normals become unit normals of the relief.
+        mapped: Whether the surface has a texture with a relief.
         finish: Linear color (3), roughness, glow, scatter (3); see `Material`.
         lamps: Rows (L, 9): unit vector to the lamp, its light with shadows, and its light without.
         ambient: Ambient light by the normal (9, 3); see `surroundings.irradiance`.
         to_map: `ShadowMap.to_map` (3, 4) of the first lamp.
         nearest: `ShadowMap.nearest` (N, N) of the first lamp [m].
         bias: `ShadowMap.bias` of the first lamp [m].
-        light: Three numbers, written.
     """
-    px, py, pz, nx, ny, nz = spot[3], spot[4], spot[5], spot[6], spot[7], spot[8]
-    away = -1.0 / np.sqrt(px * px + py * py + pz * pz)
-    vx, vy, vz = px * away, py * away, pz * away
-    facing = min(max(abs(nx * vx + ny * vy + nz * vz), 0.001), 1.0)
-    rough = max(spot[17], 0.04)
-    square, k = rough**4, (rough + 1.0) ** 2 / 8.0
+    count = spots.shape[1]
+    normals, views = spots[NORMAL : NORMAL + 3], spots[VIEW : VIEW + 3]
+    _normalize(normals)
+    if mapped:
+        _map_normals(normals, spots[TANGENT : TANGENT + 3], spots[BUMP : BUMP + 3])
+    views[:] = -spots[POSITION : POSITION + 3]
+    _normalize(views)
+    _dot(normals, views, spots[FACING])
+    light = np.empty((3, count), np.float32)
     for i in range(3):
-        around = ambient[0, i] + nx * ambient[1, i] + ny * ambient[2, i] + nz * ambient[3, i]
-        around += nx * ny * ambient[4, i] + ny * nz * ambient[5, i] + nx * nz * ambient[6, i]
-        around += (nx * nx - ny * ny) * ambient[7, i] + (3.0 * nz * nz - 1.0) * ambient[8, i]
-        light[i] = spot[14 + i] * (max(around, 0.0) + finish[4])
+        _add_ambient(spots, ambient[:, i].astype(np.float32), np.float32(finish[4]), i, light[i])
+    cosine, fresnel, mirrored = (
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+        np.empty_like(light[0]),
+    )
+    lit = np.ones(count, np.float32)
     for lamp in range(len(lamps)):
-        lx, ly, lz = lamps[lamp, 0], lamps[lamp, 1], lamps[lamp, 2]
-        cosine = nx * lx + ny * ly + nz * lz
-        if cosine <= -finish[5]:
-            continue
-        hx, hy, hz = lx + vx, ly + vy, lz + vz
-        length = np.sqrt(max(hx * hx + hy * hy + hz * hz, 1e-12))
-        half = max((nx * hx + ny * hy + nz * hz) / length, 0.0)
-        grazing = 1.0 - 0.5 * length  # the half vector's length is twice its cosine with either
-        fresnel = _FACING + (1.0 - _FACING) * grazing**5
-        peak = half * half * (square - 1.0) + 1.0
-        occlusion = 4.0 * (facing * (1.0 - k) + k) * (max(cosine, 0.0) * (1.0 - k) + k)
-        mirrored = 0.0
-        if cosine > 0.0:
-            mirrored = cosine * fresnel * square / (np.pi * peak * peak * occlusion)
-        lit = 1.0
+        x, y, z = np.float32(lamps[lamp, 0]), np.float32(lamps[lamp, 1]), np.float32(lamps[lamp, 2])
+        _reflect(spots, x, y, z, cosine, fresnel, mirrored)
         if lamp == 0:
-            lift = _LIFT * bias * np.sqrt(1.0 - min(cosine, 1.0) ** 2)
-            # Light under the surface passes what is this thick before it.
-            under = finish[5] * _UNDER * (1.0 - cosine)
-            x, y, z = px + lift * nx + under * lx, py + lift * ny + under * ly, pz + lift * nz + under * lz
-            lit = lit_share(to_map, nearest, bias, x, y, z)
+            _cast_shadows(spots, lamps[0], finish[5], cosine, to_map, nearest, bias, lit)
         for i in range(3):
-            # The cosine, wrapped around the edge of the light.
-            wrapped = max((cosine + finish[5 + i]) / (1.0 + finish[5 + i]), 0.0)
-            scattered = wrapped * (1.0 - fresnel) * (1.0 - _FACING) / np.pi
-            arriving = lit * lamps[lamp, 3 + i] + lamps[lamp, 6 + i]
-            light[i] += (scattered * spot[14 + i] + mirrored) * arriving
+            hard, soft = np.float32(lamps[lamp, 3 + i]), np.float32(lamps[lamp, 6 + i])
+            _add_lamp(
+                spots[COLOR + i],
+                np.float32(finish[5 + i]),
+                hard,
+                soft,
+                cosine,
+                fresnel,
+                mirrored,
+                lit,
+                light[i],
+            )
+    return light
+
+
+@kernel
+def _dot(first: NDArray[np.float32], second: NDArray[np.float32], product: NDArray[np.float32]) -> None:
+    """Write the scalar products (N,) of vectors (3, N)."""
+    x, y, z, u, v, w = first[0], first[1], first[2], second[0], second[1], second[2]
+    for n in range(len(product)):
+        product[n] = x[n] * u[n] + y[n] * v[n] + z[n] * w[n]
+
+
+@kernel
+def _add_scaled(
+    target: NDArray[np.float32], vectors: NDArray[np.float32], factor: NDArray[np.float32]
+) -> None:
+    """Add vectors (3, N) times factors (N,) to others (3, N)."""
+    for i in range(3):
+        row, other = target[i], vectors[i]
+        for n in range(len(factor)):
+            row[n] += factor[n] * other[n]
+
+
+@kernel
+def _normalize(vectors: NDArray[np.float32]) -> None:
+    """Scale vectors (3, N) to unit length; what has no length stays."""
+    length = np.empty_like(vectors[0])
+    _dot(vectors, vectors, length)
+    for n in range(len(length)):
+        length[n] = _ONE / np.sqrt(length[n] if length[n] > _LEAST else _LEAST)
+    for i in range(3):
+        row = vectors[i]
+        for n in range(len(length)):
+            row[n] *= length[n]
+
+
+@kernel
+def _map_normals(
+    normals: NDArray[np.float32], tangents: NDArray[np.float32], bumps: NDArray[np.float32]
+) -> None:
+    """Replace unit normals by those of a relief.
+
+    Args:
+        normals: Unit normals (3, N), written.
+        tangents: Any vectors (3, N) on the side of the way in which u grows; made unit tangents.
+        bumps: The relief's normals (3, N): along the tangent, normal x tangent, and the normal.
+    """
+    along = np.empty_like(normals[0])
+    _dot(normals, tangents, along)
+    for n in range(len(along)):
+        along[n] = -along[n]
+    _add_scaled(tangents, normals, along)
+    _normalize(tangents)
+    across = np.empty_like(normals)
+    for i in range(3):
+        ny, nz, ty, tz = (
+            normals[(i + 1) % 3],
+            normals[(i + 2) % 3],
+            tangents[(i + 1) % 3],
+            tangents[(i + 2) % 3],
+        )
+        row = across[i]
+        for n in range(len(along)):
+            row[n] = ny[n] * tz[n] - nz[n] * ty[n]
+    for i in range(3):
+        row, out = normals[i], bumps[2]
+        for n in range(len(along)):
+            row[n] *= out[n]
+    _add_scaled(normals, tangents, bumps[0])
+    _add_scaled(normals, across, bumps[1])
+    _normalize(normals)
+
+
+@kernel
+def _add_ambient(
+    spots: NDArray[np.float32],
+    around: NDArray[np.float32],
+    glow: np.float32,
+    i: int,
+    light: NDArray[np.float32],
+) -> None:
+    """Write what one color of light from everywhere and a glow give to surface points.
+
+    Args:
+        spots: See `SPOT`.
+        around: The color's ambient light by the normal (9,).
+        glow: Emitted light, as a share of the color.
+        i: Index of the color.
+        light: Written (N,).
+    """
+    x, y, z, color = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2], spots[COLOR + i]
+    a, b, c, d, e = around[0], around[1], around[2], around[3], around[4]
+    f, g, h, k = around[5], around[6], around[7], around[8]
+    three = np.float32(3.0)
+    for n in range(len(light)):
+        total = a + x[n] * b + y[n] * c + z[n] * d + x[n] * y[n] * e + y[n] * z[n] * f + x[n] * z[n] * g
+        total += (x[n] * x[n] - y[n] * y[n]) * h + (three * z[n] * z[n] - _ONE) * k
+        light[n] = color[n] * ((total if total > _ZERO else _ZERO) + glow)
+
+
+@kernel
+def _reflect(
+    spots: NDArray[np.float32],
+    x: np.float32,
+    y: np.float32,
+    z: np.float32,
+    cosine: NDArray[np.float32],
+    fresnel: NDArray[np.float32],
+    mirrored: NDArray[np.float32],
+) -> None:
+    """Write how surface points reflect a lamp.
+
+    Args:
+        spots: See `SPOT`.
+        x: Of the unit vector to the lamp, as `y` and `z`.
+        y: See `x`.
+        z: See `x`.
+        cosine: Written (N,), between normal and lamp.
+        fresnel: Written (N,), Schlick's term.
+        mirrored: Written (N,), the mirrored share of the light.
+    """
+    nx, ny, nz = spots[NORMAL], spots[NORMAL + 1], spots[NORMAL + 2]
+    vx, vy, vz = spots[VIEW], spots[VIEW + 1], spots[VIEW + 2]
+    facing, roughness = spots[FACING], spots[ROUGH]
+    two, four, eighth = np.float32(2.0), np.float32(4.0), np.float32(0.125)
+    for n in range(len(cosine)):
+        cosine[n] = nx[n] * x + ny[n] * y + nz[n] * z
+    for n in range(len(cosine)):
+        square = two + two * (vx[n] * x + vy[n] * y + vz[n] * z)  # of the half vector's length
+        grazing = _ONE - _HALF * np.sqrt(square if square > _TINY else _TINY)  # the length is twice a cosine
+        fresnel[n] = _FACING + (_ONE - _FACING) * grazing * grazing * grazing * grazing * grazing
+    for n in range(len(cosine)):
+        hx, hy, hz = x + vx[n], y + vy[n], z + vz[n]
+        length = hx * hx + hy * hy + hz * hz
+        length = np.sqrt(length if length > _TINY else _TINY)
+        half = (nx[n] * hx + ny[n] * hy + nz[n] * hz) / length
+        half = half if half > _ZERO else _ZERO
+        grazing = _ONE - _HALF * length
+        schlick = _FACING + (_ONE - _FACING) * grazing * grazing * grazing * grazing * grazing
+        towards = nx[n] * x + ny[n] * y + nz[n] * z
+        towards = towards if towards > _ZERO else _ZERO
+        rough = roughness[n]
+        square = rough * rough * rough * rough
+        k = (rough + _ONE) * (rough + _ONE) * eighth
+        peak = half * half * (square - _ONE) + _ONE
+        seen = facing[n] if facing[n] > _ZERO else -facing[n]
+        seen = seen if seen > _EDGE else _EDGE
+        occlusion = four * (seen * (_ONE - k) + k) * (towards * (_ONE - k) + k)
+        mirrored[n] = towards * schlick * square / (_PI * peak * peak * occlusion)
+
+
+@kernel
+def _cast_shadows(
+    spots: NDArray[np.float32],
+    lamp: NDArray[np.float64],
+    scatter: float,
+    cosine: NDArray[np.float32],
+    to_map: NDArray[np.float64],
+    nearest: NDArray[np.float32],
+    bias: float,
+    lit: NDArray[np.float32],
+) -> None:
+    """Write the share (N,) of the first lamp that surface points see.
+
+    Args:
+        spots: See `SPOT`.
+        lamp: Its row (9,); see `shade`.
+        scatter: How far red light travels under the surface.
+        cosine: Between normals and the lamp (N,).
+        to_map: `ShadowMap.to_map` (3, 4).
+        nearest: `ShadowMap.nearest` (N, N) [m].
+        bias: `ShadowMap.bias` [m].
+        lit: Written (N,).
+    """
+    for n in range(len(lit)):
+        if cosine[n] <= -scatter:
+            continue
+        lift = _LIFT * bias * np.sqrt(max(1.0 - cosine[n] * cosine[n], 0.0))
+        # Light under the surface passes what is this thick before it.
+        under = scatter * _UNDER * (1.0 - cosine[n])
+        x = spots[POSITION, n] + lift * spots[NORMAL, n] + under * lamp[0]
+        y = spots[POSITION + 1, n] + lift * spots[NORMAL + 1, n] + under * lamp[1]
+        z = spots[POSITION + 2, n] + lift * spots[NORMAL + 2, n] + under * lamp[2]
+        lit[n] = lit_share(to_map, nearest, bias, x, y, z)
+
+
+@kernel
+def _add_lamp(
+    color: NDArray[np.float32],
+    scatter: np.float32,
+    hard: np.float32,
+    soft: np.float32,
+    cosine: NDArray[np.float32],
+    fresnel: NDArray[np.float32],
+    mirrored: NDArray[np.float32],
+    lit: NDArray[np.float32],
+    light: NDArray[np.float32],
+) -> None:
+    """Add one color of a lamp's light.
+
+    Args:
+        color: Of the surface points (N,).
+        scatter: Cosine beyond grazing at which the lamp still lights them.
+        hard: The lamp's light that objects hide.
+        soft: Its light without shadows.
+        cosine: See `_reflect` (N,).
+        fresnel: See `_reflect` (N,).
+        mirrored: See `_reflect` (N,).
+        lit: Share of the hard light (N,).
+        light: Added to (N,).
+    """
+    diffuse = (_ONE - _FACING) / (_PI * (_ONE + scatter))
+    for n in range(len(light)):
+        wrapped = cosine[n] + scatter  # around the edge of the light
+        wrapped = (wrapped if wrapped > _ZERO else _ZERO) * (_ONE - fresnel[n]) * diffuse
+        light[n] += (wrapped * color[n] + mirrored[n]) * (lit[n] * hard + soft)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -39,7 +39,7 @@ class ShadowMap(NamedTuple):
 
 
 def shadow_map(
-    points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], towards: Float[np.ndarray, "3"]
+    points: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], towards: Float[np.ndarray, "3"]
 ) -> ShadowMap:
     """The shadows of a surface.
 
@@ -51,16 +51,36 @@ def shadow_map(
     aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
     rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
-    rotated = points @ rotation.T
-    aside_and_down = np.ascontiguousarray(rotated[:, :2].T)
-    low, high = aside_and_down.min(axis=1), aside_and_down.max(axis=1)
-    scale = (_TEXELS - 2.0 * _EDGE) / max(float((high - low).max()), 1e-6)
-    to_map = np.column_stack([rotation, np.zeros(3)])
-    to_map[:2] *= scale
-    to_map[:2, 3] = _EDGE - scale * low
-    corners = rotated * [scale, scale, 1.0] + to_map[:, 3]
+    corners, to_map, scale = _onto_map(points, rotation)
     nearest, _ = nearest_faces(corners, faces, (_TEXELS, _TEXELS), farthest=-np.inf)
     return ShadowMap(to_map, nearest, 1.5 / scale)
+
+
+@kernel
+def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64]) -> Any:
+    """Points in a map that has room for all of them (V, 3), `ShadowMap.to_map`, and its texels a meter.
+
+    Args:
+        points: Vertices (V, 3) [m].
+        rotation: Rows are the map's axes: right, down, to the lamp (3, 3).
+    """
+    corners = np.empty((len(points), 3))
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for point in range(len(points)):
+        for axis in range(3):
+            value = rotation[axis, 0] * points[point, 0]
+            value += rotation[axis, 1] * points[point, 1] + rotation[axis, 2] * points[point, 2]
+            corners[point, axis] = value
+            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+    scale = (_TEXELS - 2.0 * _EDGE) / max(high[0] - low[0], high[1] - low[1], 1e-6)
+    to_map = np.zeros((3, 4))
+    to_map[:, :3] = rotation
+    to_map[:2] *= scale
+    for axis in range(2):
+        to_map[axis, 3] = _EDGE - scale * low[axis]
+        for point in range(len(points)):
+            corners[point, axis] = scale * corners[point, axis] + to_map[axis, 3]
+    return corners, to_map, scale
 
 
 @kernel
@@ -114,7 +134,7 @@ def light_behind(
     surfaces = [one.triangles for one in drawn]
     points = camera.local(np.concatenate([surface.vertices for surface in surfaces]))
     first = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
-    faces = np.concatenate([one.faces + start for one, start in zip(surfaces, first, strict=False)])
+    faces = np.concatenate([one.casting + start for one, start in zip(drawn, first, strict=False)])
     size = np.array(camera.size, dtype=np.float64)
     fallen, distance = np.full_like(points, np.nan), np.zeros(2)
     _fall(points, normal, towards, backdrop.gap, camera.K, size, fallen, distance)

@@ -6,6 +6,7 @@ picture.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -16,8 +17,10 @@ from jaxtyping import Float32
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError, choices
+from handsim.kernels.kernel import kernel
 from render.scenery.photographs import draw_photo, pick_photo
 from render.scenery.rooms import draw_room, paint_tint
+from render.sensors.random_images import normal_numbers
 
 SHARE: Final = 0.6
 """Of backgrounds that could have a backdrop, those that do; the others are too far away for a shadow."""
@@ -110,6 +113,14 @@ def sample_background(config: BackgroundConfig, *, rng: np.random.Generator) -> 
     return Background(kind, (first, second), int(rng.integers(2**31)), blur, photo, backdrop)
 
 
+@functools.lru_cache(maxsize=2)  # drawn for its light, then behind the hands
+def kept_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
+    """The picture of `draw_background`, which cannot be written."""
+    picture = draw_background(background, size)
+    picture.setflags(write=False)
+    return picture
+
+
 def draw_background(background: Background, size: tuple[int, int]) -> Float32[np.ndarray, "H W 3"]:
     """The picture in linear light, 1 for full white.
 
@@ -132,14 +143,14 @@ def draw_background(background: Background, size: tuple[int, int]) -> Float32[np
     elif background.kind == "clutter":
         picture = _clutter(first, second, size, rng)
     elif background.kind == "room":
-        picture = draw_room(size, rng=rng)
+        picture = draw_room(size, background.seed)
     elif background.kind == "photo":
         picture = draw_photo(Path(str(background.photo)), size, rng)
     else:
         raise HandSimError(choices(background.kind, KINDS, noun="background"))
     if background.blur * height > 0.3:
         picture = cv2.GaussianBlur(picture, (0, 0), background.blur * height)
-    drawn: NDArray[np.float32] = np.clip(picture, 0.0, 1.0).astype(np.float32)
+    drawn: NDArray[np.float32] = np.clip(picture, 0.0, 1.0, dtype=np.float32)
     return drawn
 
 
@@ -172,7 +183,7 @@ def _octaves(
     while cells < height:
         shape = (max(2, cells * width // height), cells)
         total = cv2.resize(total, shape, interpolation=cv2.INTER_CUBIC).reshape(cells, shape[0], channels)
-        total += np.float32(strength) * rng.standard_normal(total.shape, dtype=np.float32)
+        total += np.float32(strength) * normal_numbers(total.shape, rng=rng)
         squares += strength**2
         cells, strength = 2 * cells, fall * strength
     total *= np.float32(1.0 / np.sqrt(squares))
@@ -221,9 +232,33 @@ def _paint_object(
     if (low >= high).any():
         return
     part = picture[low[1] : high[1], low[0] : high[0]]
-    mask = np.zeros(part.shape[:2], dtype=np.float32)
-    cv2.fillPoly(mask, [np.rint(16.0 * (outline + offset - low)).astype(np.int32)], 0.5, cv2.LINE_AA, 4)
-    part *= 1.0 - cv2.blur(mask, (9, 9))[..., None]
-    mask[:] = 0.0
-    cv2.fillPoly(mask, [np.rint(16.0 * (outline - low)).astype(np.int32)], 1.0, cv2.LINE_AA, 4)
-    part += mask[..., None] * (color - part)
+    corners = np.rint(16.0 * (outline - low)).astype(np.int32)
+    covered, shadow = np.zeros((2, *part.shape[:2]), dtype=np.uint8)
+    cv2.fillPoly(covered, [corners], 255, cv2.LINE_AA, 4)
+    cv2.fillPoly(shadow, [corners + int(16.0 * offset)], 255, cv2.LINE_AA, 4)
+    _lay_over(part, covered, cv2.blur(shadow, (9, 9)), color.astype(np.float32))
+
+
+@kernel
+def _lay_over(
+    part: NDArray[np.float32],
+    covered: NDArray[np.uint8],
+    shadow: NDArray[np.uint8],
+    color: NDArray[np.float32],
+) -> None:
+    """Lay a color over a part of a picture.
+
+    Args:
+        part: Of the picture (h, w, 3), written.
+        covered: Where the color covers it (h, w), 255 for wholly.
+        shadow: Where it takes half of the light (h, w), likewise.
+        color: Linear (3,).
+    """
+    for row in range(part.shape[0]):
+        for column in range(part.shape[1]):
+            if covered[row, column] or shadow[row, column]:
+                share = np.float32(covered[row, column] / 255.0)
+                light = np.float32(1.0 - shadow[row, column] / 510.0)
+                for channel in range(3):
+                    value = part[row, column, channel] * light
+                    part[row, column, channel] = value + share * (color[channel] - value)

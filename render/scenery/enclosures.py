@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import cv2
@@ -21,6 +22,7 @@ from handsim.space.camera import Camera
 from handsim.space.lens import Lens
 from render.frames import Pictures
 from render.scenery.backgrounds import Background, draw_background
+from render.scenery.photographs import photos_beside
 from render.scenery.rooms import RoomLight, cast_room
 
 Corner = tuple[float, float, float]
@@ -128,7 +130,7 @@ def _drawn(
         free = np.array(enclosure.free) - low
         met = cast_room(world.astype(np.float32), eye, high - low, free, rng=rng)
     else:
-        met = _meet_walls(world, eye, high - low, _wall_pictures(background))
+        met = _meet_walls(world, eye, high - low, _wall_pictures(background, enclosure))
     shape = size[::-1]
     light = np.clip(met.light, 0.0, 1.0).reshape(*shape, 3) * known[..., None]
     if background.blur * shape[0] > 0.3:
@@ -141,12 +143,21 @@ def _drawn(
 
 
 @functools.lru_cache(maxsize=2)
-def _wall_pictures(background: Background) -> Float32[np.ndarray, "R S 3"]:
-    """Linear pictures of the six walls, one below the other."""
+def _wall_pictures(background: Background, enclosure: Enclosure) -> Float32[np.ndarray, "R S 3"]:
+    """Linear pictures of the six walls, one below the other; a photograph of its own fills each."""
     walls = [
         dataclasses.replace(background, seed=(background.seed + wall) % 2**31, blur=0.0) for wall in range(6)
     ]
-    return np.concatenate([draw_background(wall, (_TEXTURE, _TEXTURE)) for wall in walls])
+    if background.photo is None:
+        return np.concatenate([draw_background(wall, (_TEXTURE, _TEXTURE)) for wall in walls])
+    room = np.array(enclosure.high) - np.array(enclosure.low)
+    pictures = []
+    for number, (wall, photo) in enumerate(zip(walls, photos_beside(Path(background.photo), 6), strict=True)):
+        sides = np.delete(room, number // 2)  # across and up
+        width, height = np.ceil(_TEXTURE * sides / sides.max()).astype(int).tolist()
+        picture = draw_background(dataclasses.replace(wall, photo=str(photo)), (width, height))
+        pictures.append(cv2.resize(picture, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_LINEAR))
+    return np.concatenate(pictures)
 
 
 def _meet_walls(

@@ -11,12 +11,13 @@ import functools
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
-from render.scenery.backgrounds import Background, BackgroundConfig, draw_background, sample_background
+from render.scenery.backgrounds import Background, BackgroundConfig, kept_background, sample_background
 from render.skin.look import SkinLook
 
 _MOST_LAMPS: Final = 5  # pyrender's shader takes four lamps without a shadow
@@ -121,20 +122,26 @@ def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 def sample_surroundings(
-    config: BackgroundConfig, skin: SkinLook | None, *, rng: np.random.Generator
+    config: BackgroundConfig,
+    skin: SkinLook | None,
+    size: tuple[int, int] = _SIZE,
+    *,
+    rng: np.random.Generator,
 ) -> tuple[Background, Lighting]:
     """A random background, and random lamps in the light that it gives.
 
     Args:
         config: Which backgrounds.
         skin: Whose hands the picture is exposed for; None for gloves.
+        size: Of the picture that it will be behind [px]: the background is then painted once.
         rng: Where the choices come from.
 
     Raises:
         HandSimError: There is no photograph that can be read.
     """
     background, lighting = sample_background(config, rng=rng), sample_lighting(rng=rng)
-    lighting = surround(lighting, draw_background(background, _SIZE), rng.uniform(*_SHARE))
+    picture = cv2.resize(kept_background(background, size), _SIZE, interpolation=cv2.INTER_AREA)
+    lighting = surround(lighting, picture, rng.uniform(*_SHARE))
     return background, lighting if skin is None else expose_for(lighting, skin)
 
 
@@ -176,16 +183,23 @@ def irradiance(picture: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "9 3"]:
     Args:
         picture: Linear light; its middle is straight ahead, its borders are at right angles to that.
     """
-    directions, functions = _sphere()
     height, width = picture.shape[:2]
+    pixels, functions = _looked_up(width, height)
+    light = picture.reshape(-1, 3).take(pixels, axis=0).astype(np.float64)
+    projected = functions.T @ light * (4.0 * np.pi / len(functions))
+    coefficients: NDArray[np.float64] = (_MATT / _SQUARES)[:, None] * projected
+    return coefficients
+
+
+@functools.lru_cache(maxsize=4)
+def _looked_up(width: int, height: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Pixel of a picture in each direction (D,), and the nine functions there (D, 9)."""
+    directions, functions = _sphere()
     away = np.arccos(np.abs(directions[:, 2])) / (np.pi / 2)
     aside = directions[:, :2] / np.maximum(np.linalg.norm(directions[:, :2], axis=1, keepdims=True), 1e-9)
     points = 0.5 + 0.5 * away[:, None] * aside
     columns, rows = np.minimum((points * (width, height)).astype(int), (width - 1, height - 1)).T
-    light = picture[rows, columns].astype(np.float64)
-    projected = functions.T @ light * (4.0 * np.pi / len(directions))
-    coefficients: NDArray[np.float64] = (_MATT / _SQUARES)[:, None] * projected
-    return coefficients
+    return rows * width + columns, functions
 
 
 @functools.cache

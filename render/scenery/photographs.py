@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import warnings
 from pathlib import Path
 from typing import Final
@@ -47,6 +48,15 @@ def pick_photo(folder: Path, rng: np.random.Generator) -> Path:
     raise _no_photo(folder)
 
 
+def photos_beside(file: Path, count: int) -> list[Path]:
+    """A photograph and others of its folder, so many together; they come again where there are fewer."""
+    files, _ = photo_files(file.parent)
+    start = files.index(file) + 1 if file in files else 0
+    others = (one for one in (*files[start:], *files[:start]) if one != file and _read(one) is not None)
+    chosen = [file, *itertools.islice(others, count - 1)]
+    return list(itertools.islice(itertools.cycle(chosen), count))
+
+
 def _no_photo(folder: Path) -> HandSimError:
     endings = ", ".join(PHOTO_SUFFIXES)
     return HandSimError(f"{folder}: no photograph that can be read; expected files that end in {endings}")
@@ -81,7 +91,7 @@ def _num_pixels(file: Path) -> int:
 
 
 def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float32]:
-    """A random part of a photograph in the picture's proportions, as large as fits at up to half the zoom."""
+    """A random part of a photograph in the picture's proportions, which fills it: half of it or more."""
     photo = _read(file)
     if photo is None:
         raise HandSimError(f"{file}: not a readable photograph")
@@ -90,8 +100,6 @@ def draw_photo(file: Path, size: tuple[int, int], rng: np.random.Generator) -> N
     part = np.maximum(np.array(size) * scale, 1.0).astype(int)
     left, top = (int(rng.integers(0, room + 1)) for room in np.array([width, height]) - part)
     cut = photo[top : top + part[1], left : left + part[0], ::-1]
-    if rng.random() < 0.5:
-        cut = cut[:, ::-1]
     shrinks = part[0] > size[0]
     scaled = cv2.resize(
         np.ascontiguousarray(cut), size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

@@ -5,6 +5,7 @@ Half of the picture's resolution is enough: a background is out of focus.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -13,6 +14,7 @@ from jaxtyping import Float, Float32, Int8
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
+from render.sensors.random_images import normal_numbers
 
 _REDUCED: Final = 2
 _FURNITURE: Final = (4, 14)
@@ -64,26 +66,50 @@ class _Boxes(NamedTuple):
     """Of the faces along x, y and z (B, 3)."""
 
 
-def draw_room(size: tuple[int, int], *, rng: np.random.Generator) -> Float32[np.ndarray, "H W 3"]:
+def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
     """A random room from a random position, linear light.
 
     Args:
         size: Width and height [pixels].
-        rng: Source of the random choices.
+        seed: Seed of the random choices.
     """
     width, height = (max(1, length // _REDUCED) for length in size)
-    room = rng.uniform((2.5, 2.5, 2.3), (7.0, 7.0, 3.2))  # [m], corner at the origin, z up
-    eye = room * rng.uniform((0.25, 0.05, 0.35), (0.75, 0.3, 0.75))
-    rays = _rays(width, height, rng)
-    # Lamps and windows leave some parts darker than others.
-    lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
-    walls = _paint_walls(room, rng)
-    light = _cast_all(rays, eye, room, walls, _place_boxes(room, eye, rng), lamp, strength).light
+    scene = _scene(seed)
+    rays = _rays(width, height, *scene.lens)
+    light = _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
     small = light.reshape(height, width, 3)
-    small *= 1.0 + np.float32(0.05) * rng.standard_normal((height, width, 1), dtype=np.float32)
+    grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
+    small *= np.float32(1.0) + np.float32(0.05) * grain
     small = cv2.GaussianBlur(small, (0, 0), 0.9)  # or edges would show the coarse pixels
     drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
     return drawn
+
+
+class _Scene(NamedTuple):
+    """A room and who looks into it."""
+
+    room: NDArray[np.float64]
+    """Far corner [m]; the other one is at the origin, z up."""
+    eye: NDArray[np.float64]
+    lens: tuple[float, float, float, float]
+    """Focal length [picture heights], yaw, pitch and roll [rad]."""
+    lamp: NDArray[np.float64]
+    """Lamps and windows leave some parts darker than others."""
+    strength: float
+    walls: _Walls
+    boxes: _Boxes
+
+
+@functools.lru_cache(maxsize=2)  # drawn twice: small for its light, then behind the hands
+def _scene(seed: int) -> _Scene:
+    rng = np.random.default_rng(seed)
+    room = rng.uniform((2.5, 2.5, 2.3), (7.0, 7.0, 3.2))
+    eye = room * rng.uniform((0.25, 0.05, 0.35), (0.75, 0.3, 0.75))
+    focal = float(rng.uniform(0.8, 1.5))
+    yaw, pitch, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
+    lamp, strength = room * rng.uniform((0.1, 0.1, 0.7), (0.9, 0.9, 1.0)), rng.uniform(0.55, 1.1)
+    walls = _paint_walls(room, rng)
+    return _Scene(room, eye, (focal, yaw, pitch, roll), lamp, strength, walls, _place_boxes(room, eye, rng))
 
 
 def cast_room(
@@ -129,17 +155,23 @@ def _cast_all(
     return seen
 
 
-def _rays(width: int, height: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def _rays(
+    width: int, height: int, focal: float, yaw: float, pitch: float, roll: float
+) -> NDArray[np.float32]:
     """Directions (H W, 3) of a camera that looks into the room, a little up or down and askew."""
-    focal = height * rng.uniform(0.8, 1.5)
-    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-    yaw, pitch, roll = rng.normal(0.0, 0.45), rng.normal(-0.12, 0.25), rng.normal(0.0, 0.06)
-    x, y = np.cos(roll) * x - np.sin(roll) * y, np.sin(roll) * x + np.cos(roll) * y
-    ahead, up = focal * np.cos(pitch) + y * np.sin(pitch), focal * np.sin(pitch) - y * np.cos(pitch)
-    along = np.stack([np.cos(yaw) * x - np.sin(yaw) * ahead, np.sin(yaw) * x + np.cos(yaw) * ahead, up], -1)
+    (sy, cy), (sp, cp), (sr, cr) = ((np.sin(angle), np.cos(angle)) for angle in (yaw, pitch, roll))
+    aside, upright = np.array([cy, sy, 0.0]), np.array([0.0, 0.0, 1.0])
+    level = np.array([-sy, cy, 0.0])
+    ahead, down = cp * level + sp * upright, sp * level - cp * upright
+    right, below = cr * aside + sr * down, cr * down - sr * aside
+    x = ((np.arange(width) + 0.5 - width / 2) / (focal * height)).astype(np.float32)
+    y = ((np.arange(height) + 0.5 - height / 2) / (focal * height)).astype(np.float32)
+    along = y[:, None, None] * below.astype(np.float32) + ahead.astype(np.float32)
+    along = along + x[None, :, None] * right.astype(np.float32)
     along = along.reshape(-1, 3)
+    along *= np.float32(1.0) / np.sqrt(np.einsum("ij,ij->i", along, along))[:, None]
     along[np.abs(along) < 1e-6] = 1e-6
-    rays: NDArray[np.float32] = (along / np.linalg.norm(along, axis=1, keepdims=True)).astype(np.float32)
+    rays: NDArray[np.float32] = along
     return rays
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, choices
+from handsim.kernels.kernel import kernel
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
 from render.sensors import structured_light, time_of_flight
@@ -126,11 +127,38 @@ def apply_depth_noise(
 def _facing(normals: NDArray[np.float32], camera: Camera) -> NDArray[np.float32]:
     """Cosines between normals and the rays that come back."""
     (fx, _, cx), (_, fy, cy) = camera.K[:2].tolist()
+    if camera.lens.kind == "pinhole":
+        return np.asarray(_facing_pinhole(normals, fx, fy, cx, cy))
     rays = _back(camera.size, (fx, fy, cx, cy), camera.lens)
     cosines: NDArray[np.float32] = rays[0] * normals[..., 0]
     cosines += rays[1] * normals[..., 1]
     cosines += rays[2] * normals[..., 2]
     np.maximum(cosines, np.float32(0.0), out=cosines)
+    return cosines
+
+
+@kernel
+def _facing_pinhole(normals: NDArray[np.float32], fx: float, fy: float, cx: float, cy: float) -> Any:
+    """Cosines (H, W) between normals and the rays that come back to a pinhole; 0 where there is no surface.
+
+    Args:
+        normals: In the camera's axes (H, W, 3).
+        fx: Focal length across [px], as `fy` is down.
+        fy: See `fx`.
+        cx: Column of the principal point [px], as `cy` is its row.
+        cy: See `cx`.
+    """
+    height, width = normals.shape[:2]
+    cosines = np.zeros((height, width), np.float32)
+    for row in range(height):
+        y = (row + 0.5 - cy) / fy
+        for column in range(width):
+            nx, ny, nz = normals[row, column, 0], normals[row, column, 1], normals[row, column, 2]
+            if nx != 0.0 or ny != 0.0 or nz != 0.0:
+                x = (column + 0.5 - cx) / fx
+                along = -(x * nx + y * ny + nz)
+                if along > 0.0:
+                    cosines[row, column] = along / np.sqrt(x * x + y * y + 1.0)
     return cosines
 
 

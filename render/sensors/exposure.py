@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -16,10 +16,11 @@ from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError
-from render.sensors.random_images import normal_numbers
+from handsim.kernels.kernel import kernel
+from render.sensors.random_images import quantiles, random_words
 
+_ROOTS: Final = 4096  # of light in the same table by its root, which stays in the processor's cache
 _LEVELS: Final = 65536  # of light in the table of the sRGB curve: twenty to its narrowest step
-_BAND: Final = 32  # rows done at a time, so that they stay in the processor's cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,17 +95,86 @@ def expose(
     if linear.ndim != 3 or linear.shape[2] != 3:
         raise ArgumentError(f"linear has shape {linear.shape}, expected (H, W, 3)")
     height, width = linear.shape[:2]
-    balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
     rgb = np.empty((height, 3 * width), np.uint8)
-    for first in range(0, height, _BAND):
-        rows = slice(first, min(first + _BAND, height))
-        light = linear[rows].reshape(-1, 3 * width) * _gain(rows, (height, width), exposure)
-        if exposure.white_electrons > 0.0:
-            light += _noise(light, exposure, rng=rng)
-        light *= balance
-        rgb[rows] = encoded(light)
+    white = exposure.white_electrons
+    words = random_words(linear.shape if white > 0.0 else (0, 0, 0), rng=rng)
+    away = np.repeat((np.arange(width) + 0.5 - 0.5 * width) ** 2, 3).astype(np.float32)
+    numbers = _Sensor(
+        np.float32(2.0**exposure.stops),
+        np.float32(exposure.vignetting),
+        np.float32(1.0 / white if white > 0.0 else 0.0),
+        np.float32((exposure.read_noise / white) ** 2 if white > 0.0 else 0.0),
+    )
+    balance = np.tile(np.array(exposure.balance, dtype=np.float32), width)
+    light = np.ascontiguousarray(linear, dtype=np.float32).reshape(height, 3 * width)
+    _expose(light, *numbers, words.reshape(-1, 3 * width), quantiles(), away, balance, _root_curve(), rgb)
     rgb = rgb.reshape(linear.shape)
     return rgb if exposure.jpeg_quality is None else _through_jpeg(rgb, exposure.jpeg_quality)
+
+
+class _Sensor(NamedTuple):
+    """Numbers of a picture's exposure."""
+
+    gain: np.float32
+    """Factor on the light in the middle of the picture."""
+    lost: np.float32
+    """Share that is missing in the corners; it grows with the squared distance from the middle."""
+    shot: np.float32
+    """One over the electrons of white; 0 for no noise."""
+    dark: np.float32
+    """Variance of the noise in the dark, 1 for white."""
+
+
+@kernel
+def _expose(
+    linear: NDArray[np.float32],
+    gain: np.float32,
+    lost: np.float32,
+    shot: np.float32,
+    dark: np.float32,
+    words: NDArray[np.uint16],
+    normal: NDArray[np.float32],
+    away: NDArray[np.float32],
+    balance: NDArray[np.float32],
+    curve: NDArray[np.uint8],
+    rgb: NDArray[np.uint8],
+) -> None:
+    """Write what a sensor makes of light, row by row, in loops that are compiled into vector instructions.
+
+    Args:
+        linear: The light (H, 3 W).
+        gain: See `_Sensor`, as the next three.
+        lost: See `gain`.
+        shot: See `gain`.
+        dark: See `gain`.
+        words: Random numbers (H, 3 W), empty for no noise.
+        normal: `quantiles` (65536,).
+        away: Squared distance of a row's values from the middle column (3 W,) [px^2].
+        balance: Factor on each of them (3 W,).
+        curve: `_root_curve` (4096,).
+        rgb: Written (H, 3 W).
+    """
+    height, width = linear.shape
+    corner = np.float32(1.0 / (0.25 * (height * height + width * width / 9.0)))
+    zero, one, half, top = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(_ROOTS - 1)
+    light, noise = np.empty(width, np.float32), np.zeros(width, np.float32)
+    level = np.empty(width, np.int32)
+    for row in range(height):
+        down = np.float32((row + 0.5 - 0.5 * height) ** 2)
+        for n in range(width):
+            light[n] = linear[row, n] * (gain * (one - lost * (down + away[n]) * corner))
+        if len(words):
+            for n in range(width):
+                noise[n] = normal[words[row, n]]
+            for n in range(width):
+                signal = light[n] if light[n] > zero else zero
+                light[n] += noise[n] * np.sqrt(signal * shot + dark)
+        for n in range(width):
+            value = light[n] * balance[n]
+            value = value if value > zero else zero
+            level[n] = int(np.sqrt(value if value < one else one) * top + half)
+        for n in range(width):
+            rgb[row, n] = curve[level[n]]
 
 
 def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]:
@@ -114,34 +184,6 @@ def encoded(light: Float32[np.ndarray, "*batch"]) -> UInt8[np.ndarray, "*batch"]
     np.clip(scaled, 0.0, _LEVELS - 1, out=scaled)
     rgb: NDArray[np.uint8] = _curve().take(scaled.astype(np.uint16), mode="clip")
     return rgb
-
-
-def _gain(rows: slice, shape: tuple[int, int], exposure: Exposure) -> NDArray[np.float32]:
-    """Factor of each pixel, repeated for the channels; falls with the squared distance from the center."""
-    gain = 2.0**exposure.stops
-    if exposure.vignetting == 0.0:
-        return np.full((1, 1), gain, np.float32)
-    down, right = (
-        (np.arange(length) + 0.5 - 0.5 * length) ** 2 / (0.25 * (shape[0] ** 2 + shape[1] ** 2))
-        for length in shape
-    )
-    lost = np.repeat(right, 3).astype(np.float32) + down[rows, None].astype(np.float32)  # 1 in the corners
-    lost *= np.float32(-gain * exposure.vignetting)
-    lost += np.float32(gain)
-    return lost
-
-
-def _noise(
-    light: NDArray[np.float32], exposure: Exposure, *, rng: np.random.Generator
-) -> NDArray[np.float32]:
-    """Electrons' noise, 1 for as many as white has."""
-    white = exposure.white_electrons
-    noise = light * np.float32(1.0 / white)
-    np.maximum(noise, 0.0, out=noise)
-    noise += np.float32((exposure.read_noise / white) ** 2)
-    np.sqrt(noise, out=noise)
-    noise *= normal_numbers(light.shape, rng=rng)
-    return noise
 
 
 def _through_jpeg(rgb: NDArray[np.uint8], quality: int) -> NDArray[np.uint8]:
@@ -156,6 +198,13 @@ def _decoded() -> NDArray[np.float32]:
     """Light of the 256 sRGB values (IEC 61966-2-1)."""
     value = np.arange(256) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+@functools.cache
+def _root_curve() -> NDArray[np.uint8]:
+    """The sRGB values of light in even steps of its root: sixteen or more to each."""
+    values: NDArray[np.uint8] = encoded(((np.arange(_ROOTS) / (_ROOTS - 1)) ** 2).astype(np.float32))
+    return values
 
 
 @functools.cache

@@ -41,6 +41,8 @@ class Atlas(NamedTuple):
     """Drawn vertex of each corner (D,): a vertex on tiles' borders has one for each tile."""
     corner_faces: NDArray[np.int64]
     """The same triangles (F, 3) as indices of `corners`."""
+    coarse_faces: NDArray[np.int64]
+    """A quarter as many triangles (G, 3) of the same corners: the surface to a few tenths of a millimeter."""
     uv: NDArray[np.float32]
     """Texture coordinates (D, 2), the origin at the bottom left."""
     tiles: NDArray[np.int64]
@@ -113,7 +115,7 @@ def _assemble(used: NDArray[np.int64], tiles: NDArray[np.int64], wrist: NDArray[
     across, up = np.broadcast_arrays(across, up)
     uv = [np.stack([across / width, 1.0 - up / height], axis=-1).reshape(-1, 2)]
     nodes = np.arange(tiles.size).reshape(tiles.shape)
-    faces = [_triangles(nodes[:, :-1, :-1], nodes[:, :-1, 1:], nodes[:, 1:, 1:], nodes[:, 1:, :-1])]
+    faces, coarse = [_squares(nodes)], [_squares(nodes[:, ::2, ::2])]
     corners = [tiles.ravel()]
     # The forearm: a grid of rings, its first column once more at the end.
     around, first = len(wrist), len(used)
@@ -122,7 +124,8 @@ def _assemble(used: NDArray[np.int64], tiles: NDArray[np.int64], wrist: NDArray[
     rings = np.concatenate([rings, rings[:, :1]], axis=1)
     node = tiles.size + np.arange(rings.size).reshape(rings.shape)
     # Rings come in the palm's order, index side over the back: outwards is from a ring to the wrist.
-    faces.append(_triangles(node[1:, :-1], node[1:, 1:], node[:-1, 1:], node[:-1, :-1]))
+    faces.append(_squares(node[None, ::-1]))
+    coarse.append(_squares(node[None, ::-2, ::2]))
     corners += [rings.ravel(), np.array([end])]
     middle = tiles.size + rings.size
     cap = np.stack([np.full(around, middle), node[-1, 1:], node[-1, :-1]], axis=1)
@@ -138,6 +141,7 @@ def _assemble(used: NDArray[np.int64], tiles: NDArray[np.int64], wrist: NDArray[
         table[corner_faces],
         table,
         corner_faces,
+        np.concatenate(coarse),
         np.concatenate(uv).astype(np.float32),
         tiles,
         (width, height),
@@ -147,10 +151,9 @@ def _assemble(used: NDArray[np.int64], tiles: NDArray[np.int64], wrist: NDArray[
     return atlas
 
 
-def _triangles(
-    a: NDArray[np.int64], b: NDArray[np.int64], c: NDArray[np.int64], d: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Two triangles of each quad."""
+def _squares(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Two triangles of each square of grids (K, R, C)."""
+    a, b, c, d = nodes[:, :-1, :-1], nodes[:, :-1, 1:], nodes[:, 1:, 1:], nodes[:, 1:, :-1]
     first = np.stack([a, b, c], axis=-1).reshape(-1, 3)
     second = np.stack([a, c, d], axis=-1).reshape(-1, 3)
     return np.concatenate([first, second])

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
+from render.sensors.random_images import normal_numbers
 
-_MOST_KNOTS: Final = 128  # of noise, each way
+_KNOTS: Final = 32
+"""Of noise, each way; a power of two. It repeats after as many blots, which nobody sees on a hand."""
 
 
 def noise(
     positions: NDArray[np.float64], sizes: tuple[float, ...], *, rng: np.random.Generator
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Smooth noise in space with a standard deviation of about one.
 
     Args:
@@ -22,65 +24,56 @@ def noise(
         sizes: Size of the blots of each octave [m].
         rng: Source of the noise.
     """
-    total = np.zeros(len(positions))
-    low, high = _extent(positions)
+    total = np.zeros(len(positions), dtype=np.float32)
     for size in sizes:
-        count = np.minimum(np.ceil((high - low) / size).astype(int) + 2, _MOST_KNOTS)
-        scale = (count - 1.001) / np.maximum(high - low, 1e-9)
-        _add_octave(positions, low, scale, rng.standard_normal(count), total)
-    total *= 1.6 / np.sqrt(len(sizes))
+        knots = normal_numbers((_KNOTS, _KNOTS, _KNOTS), rng=rng)
+        _add_octave(positions, rng.uniform(0.0, _KNOTS, 3), 1.0 / size, knots, total)
+    total *= np.float32(1.6 / np.sqrt(len(sizes)))
     return total
-
-
-@kernel
-def _extent(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least and greatest coordinates (3,) of positions (N, 3)."""
-    low, high = positions[0].copy(), positions[0].copy()
-    for row in positions:
-        for axis in range(3):
-            low[axis] = min(low[axis], row[axis])
-            high[axis] = max(high[axis], row[axis])
-    return low, high
 
 
 @kernel
 def _add_octave(
     positions: NDArray[np.float64],
-    low: NDArray[np.float64],
-    scale: NDArray[np.float64],
-    knots: NDArray[np.float64],
-    total: NDArray[np.float64],
+    start: NDArray[np.float64],
+    scale: float,
+    knots: NDArray[np.float32],
+    total: NDArray[np.float32],
 ) -> None:
-    """Add the trilinear interpolation of knots.
+    """Add the trilinear interpolation of knots, which repeat.
 
     Args:
         positions: Where (N, 3) [m].
-        low: Position of the first knot (3,) [m].
-        scale: Knots a meter, each way (3,).
-        knots: Values (A, B, C), which reach over all positions.
+        start: Place of the origin among the knots (3,).
+        scale: Knots a meter.
+        knots: Values (32, 32, 32).
         total: Added to (N,).
     """
+    far = float(64 * _KNOTS)  # so that no place is negative
     for number in range(len(positions)):
-        x = (positions[number, 0] - low[0]) * scale[0]
-        y = (positions[number, 1] - low[1]) * scale[1]
-        z = (positions[number, 2] - low[2]) * scale[2]
+        x = positions[number, 0] * scale + start[0] + far
+        y = positions[number, 1] * scale + start[1] + far
+        z = positions[number, 2] * scale + start[2] + far
         i, j, k = int(x), int(y), int(z)
-        u, v, w = x - i, y - j, z - k
-        near = (1.0 - w) * knots[i, j, k] + w * knots[i, j, k + 1]
-        beside = (1.0 - w) * knots[i, j + 1, k] + w * knots[i, j + 1, k + 1]
-        over = (1.0 - w) * knots[i + 1, j, k] + w * knots[i + 1, j, k + 1]
-        far = (1.0 - w) * knots[i + 1, j + 1, k] + w * knots[i + 1, j + 1, k + 1]
-        total[number] += (1.0 - u) * ((1.0 - v) * near + v * beside) + u * ((1.0 - v) * over + v * far)
+        u, v, w = np.float32(x - i), np.float32(y - j), np.float32(z - k)
+        i, j, k = i & (_KNOTS - 1), j & (_KNOTS - 1), k & (_KNOTS - 1)
+        right, down, on = (i + 1) & (_KNOTS - 1), (j + 1) & (_KNOTS - 1), (k + 1) & (_KNOTS - 1)
+        near = knots[i, j, k] + w * (knots[i, j, on] - knots[i, j, k])
+        beside = knots[i, down, k] + w * (knots[i, down, on] - knots[i, down, k])
+        over = knots[right, j, k] + w * (knots[right, j, on] - knots[right, j, k])
+        far_off = knots[right, down, k] + w * (knots[right, down, on] - knots[right, down, k])
+        low, high = near + v * (beside - near), over + v * (far_off - over)
+        total[number] += low + u * (high - low)
 
 
-def smooth(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.float64]:
+def smooth(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
     """0 below `low`, 1 above `high`, smooth between."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
-    result: NDArray[np.float64] = share * share * (3.0 - 2.0 * share)
+    result: NDArray[Any] = share * share * (3.0 - 2.0 * share)
     return result
 
 
-def bump(distance: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+def bump(distance: NDArray[Any], width: float | np.float32) -> NDArray[Any]:
     """A Gaussian bell of height 1."""
-    height: NDArray[np.float64] = np.exp(-((distance / width) ** 2))
+    height: NDArray[Any] = np.exp(-((distance / width) ** 2))
     return height

@@ -106,6 +106,11 @@ def check_tones(tones: Sequence[float]) -> None:
         )
 
 
+def tone_name(angle: float) -> str:
+    """The class of `TONES` that an individual typology angle [deg] is in; beyond all, the outer one."""
+    return next((name for name, (low, _) in TONES.items() if angle > low), "dark")
+
+
 def named_tones(names: Sequence[str]) -> tuple[float, ...]:
     """Ranges of typology angles [deg] of some classes of `TONES`; classes side by side are one range."""
     ranges: list[float] = []

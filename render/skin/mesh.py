@@ -42,6 +42,8 @@ class DrawnSkin:
     """Triangles, counter-clockwise from outside."""
     parts: UInt8[np.ndarray, "F"]
     """Bone of each triangle, an index of `topology.BONES` or `FOREARM`."""
+    coarse_faces: Int[np.ndarray, "G 3"]
+    """Fewer triangles of the same vertices, nearly the same surface."""
 
 
 class PosableSkin:
@@ -70,8 +72,9 @@ class PosableSkin:
         mirrored = model.shape.side == "left"
         self.faces = np.ascontiguousarray(atlas.faces[:, ::-1] if mirrored else atlas.faces)
         """Triangles (F, 3) of the vertices of `rest`: a closed surface."""
-        self._corner_faces = np.ascontiguousarray(
-            atlas.corner_faces[:, ::-1] if mirrored else atlas.corner_faces
+        self._corner_faces, self._coarse_faces = (
+            np.ascontiguousarray(faces[:, ::-1] if mirrored else faces)
+            for faces in (atlas.corner_faces, atlas.coarse_faces)
         )
         self._flexion = Flexion(model, self.rest, vertex_normals(self.rest, self.faces), bony)
         self._rest_occluded = self._rest_occlusion(model.rest_transforms[None], self.rest, self.faces)
@@ -96,6 +99,7 @@ class PosableSkin:
             shade[corners].astype(np.float32),
             self._corner_faces,
             face_parts(),
+            self._coarse_faces,
         )
 
     def merged(
@@ -110,15 +114,15 @@ class PosableSkin:
 
     def _rest_occlusion(
         self, transforms: NDArray[np.float64], points: NDArray[np.float64], faces: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.float32]:
         """Occlusion by neighboring capsules in the flat hand, where they are the same flesh."""
         return self._occluded(transforms, points, vertex_normals(points, faces))
 
     def _occluded(
         self, transforms: NDArray[np.float64], points: NDArray[np.float64], normals: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.float32]:
         capsules = self.model.capsules
-        occluded: NDArray[np.float64] = _occluded_share(
+        occluded: NDArray[np.float32] = _occluded_share(
             points, normals, capsules.posed(transforms)[0], capsules.radii * 1.2
         )
         return occluded
@@ -146,29 +150,51 @@ def _occluded_share(
 ) -> Any:
     """Share (V,) of each point's hemisphere behind capsules, each replaced by its nearest ball.
 
+    The inner loop has no branches and writes one array, so that it is compiled into vector instructions.
+
     Args:
         points: Positions (V, 3) [m].
         normals: Unit normals (V, 3).
         segments: Ends of the capsules (K, 2, 3) [m].
         radii: Radii of the capsules (K,) [m].
     """
-    occluded = np.empty(len(points))
-    axes = segments[:, 1] - segments[:, 0]
-    for v in range(len(points)):
-        free = 1.0
-        for k in range(len(radii)):
-            along, square = 0.0, 1e-12
-            for i in range(3):
-                along += (points[v, i] - segments[k, 0, i]) * axes[k, i]
-                square += axes[k, i] * axes[k, i]
-            along = min(max(along / square, 0.0), 1.0)
-            distance, facing = 0.0, 0.0
-            for i in range(3):
-                away = segments[k, 0, i] + along * axes[k, i] - points[v, i]
-                distance += away * away
-                facing += away * normals[v, i]
-            if facing > 0.0:
-                ratio = radii[k] * radii[k] / max(distance, radii[k] * radii[k])
-                free *= 1.0 - 0.85 * ratio * min(facing / np.sqrt(distance), 1.0)
-        occluded[v] = 1.0 - free
-    return occluded
+    count = len(points)
+    x, y, z = _columns(points)
+    nx, ny, nz = _columns(normals)
+    free = np.ones(count, np.float32)
+    zero, one, tiny = np.float32(0.0), np.float32(1.0), np.float32(1e-20)
+    for k in range(len(radii)):
+        sx, sy, sz = (
+            np.float32(segments[k, 0, 0]),
+            np.float32(segments[k, 0, 1]),
+            np.float32(segments[k, 0, 2]),
+        )
+        ax = np.float32(segments[k, 1, 0] - segments[k, 0, 0])
+        ay = np.float32(segments[k, 1, 1] - segments[k, 0, 1])
+        az = np.float32(segments[k, 1, 2] - segments[k, 0, 2])
+        scale = one / (ax * ax + ay * ay + az * az + np.float32(1e-12))
+        square = np.float32(radii[k] * radii[k])
+        strength = np.float32(0.85) * square
+        for v in range(count):
+            px, py, pz = sx - x[v], sy - y[v], sz - z[v]
+            along = -(px * ax + py * ay + pz * az) * scale
+            along = along if along > zero else zero
+            along = along if along < one else one
+            px, py, pz = px + along * ax, py + along * ay, pz + along * az
+            distance = px * px + py * py + pz * pz
+            facing = px * nx[v] + py * ny[v] + pz * nz[v]
+            facing = facing if facing > zero else zero
+            cosine = facing / np.sqrt(distance + tiny)
+            cosine = cosine if cosine < one else one
+            free[v] *= one - strength / (distance if distance > square else square) * cosine
+    return one - free
+
+
+@kernel
+def _columns(points: NDArray[np.float64]) -> Any:
+    """The columns of an array (V, 3)."""
+    return (
+        points[:, 0].astype(np.float32),
+        points[:, 1].astype(np.float32),
+        points[:, 2].astype(np.float32),
+    )

@@ -6,7 +6,7 @@ The drawn mesh stays as it is, and so do depth and silhouettes; only shading sho
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -35,7 +35,7 @@ class _TangentScales(NamedTuple):
     """Scale of the difference along the column, for the second tangent."""
 
 
-def normal_map(height: NDArray[np.float64], side: Side) -> UInt8[np.ndarray, "H W 3"]:
+def normal_map(height: NDArray[Any], side: Side) -> UInt8[np.ndarray, "H W 3"]:
     """Normal map in the tangent frame of pyrender's shader: along u, and normal x that.
 
     Args:
@@ -58,7 +58,7 @@ def normal_map(height: NDArray[np.float64], side: Side) -> UInt8[np.ndarray, "H 
     return encoded.reshape(rows, width, 3)
 
 
-def _differences(grid: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _differences(grid: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Differences a texel to the right and down within each tile, one-sided on its border."""
     rows, width, channels = grid.shape
     hand = rows - ARM_ROWS

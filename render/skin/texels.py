@@ -16,6 +16,7 @@ from scipy import ndimage
 from handsim.hand.model import HandModel
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import DIGITS, NUM_BONES
+from handsim.kernels.kernel import kernel
 from render.skin.atlas import ARM_ROWS, COLUMNS, RINGS, TILE, skin_atlas
 from render.skin.fields import bump, smooth
 from render.skin.forearm import Forearm
@@ -154,42 +155,120 @@ def _palm_distances() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return near, distances
 
 
-def line_depth(rng: np.random.Generator) -> NDArray[np.float64]:
+def line_depth(rng: np.random.Generator) -> NDArray[np.float32]:
     """Depth of each texel (N,) in a palm line, finger crease or knuckle wrinkle; 1 for a deep line."""
-    texels = skin_texels()
-    back = texels.back
-    depth = np.zeros(len(back))
-    near, distances = _palm_distances()
-    on_palm = (1.0 - back[near]) * (
-        1.0 - sum(_share_at(digit, near, len(back)) for digit in texels.digits[1:])
-    )
-    for distance in distances:
-        wobble = rng.uniform(0.8, 1.2)
-        depth[near] = np.maximum(depth[near], wobble * on_palm * bump(distance, 0.0011))
-    x = texels.positions[:, 0]
-    for position in _WRIST_LINES:
-        depth = np.maximum(depth, 0.35 * bump(x - position, 0.0009) * (1.0 - back))
-    for number, digit in enumerate(texels.digits):
-        mine, joints = digit.texels, np.cumsum(digit.lengths)[:2]
-        pad = 1.0 - back[mine]
-        waves = 0.0006 * np.sin(3.0 * digit.angle + rng.uniform(0.0, 6.0))
+    near, palm_lines, depth = _lines_of_all()
+    depth = depth.copy()
+    for line in palm_lines:
+        depth[near] = np.maximum(depth[near], np.float32(rng.uniform(0.8, 1.2)) * line)
+    for number, digit in enumerate(_digit_lines()):
+        joints = digit.joints
+        waves = digit.wave(rng.uniform(0.0, 6.0))
         # Palmar creases lie off the joints: Bugbee and Botte 1993, Clin. Orthop. Relat. Res. 296:122.
         creases = [(joints[0] - 0.0025, 1.0), (joints[0] + 0.0004, 0.5)]
         if number:
             creases += [(joints[1] - 0.0075, 0.9), (0.017, 0.9)]
         for position, strength in creases:
-            here = strength * pad * digit.share * bump(digit.along - position - waves, 0.0009)
-            depth[mine] = np.maximum(depth[mine], here)
+            _draw_line(digit.along, waves, digit.pad, position, 0.0009, strength, digit.texels, depth)
         for joint, count, spacing in ((joints[0], 5, 0.0020), (joints[1], 4, 0.0014)):
-            positions = (
-                joint + spacing * (np.arange(count) - (count - 1) / 2) + rng.normal(0.0, 0.0003, count)
-            )
-            arch = 0.0015 * np.cos(digit.angle)  # wrinkles are curved
-            for number_here, position in enumerate(positions):
-                bow = arch * (number_here - (count - 1) / 2) / count * 2.0
-                here = 0.55 * back[mine] * digit.share * bump(digit.along - position - bow, 0.0006)
-                depth[mine] = np.maximum(depth[mine], here * smooth(np.cos(digit.angle), -0.1, 0.6))
+            places = np.arange(count) - (count - 1) / 2
+            positions = joint + spacing * places + rng.normal(0.0, 0.0003, count)
+            for place, position in zip(places, positions, strict=True):
+                bow = digit.arch * np.float32(place / count * 2.0)  # wrinkles are curved
+                _draw_line(digit.along, bow, digit.back, position, 0.0006, 0.55, digit.texels, depth)
     return depth
+
+
+@kernel
+def _draw_line(
+    along: NDArray[np.float32],
+    bent: NDArray[np.float32],
+    share: NDArray[np.float32],
+    position: float,
+    width: float,
+    strength: float,
+    texels: NDArray[np.int64],
+    depth: NDArray[np.float32],
+) -> None:
+    """Draw a line across a digit.
+
+    Args:
+        along: Distance of its texels from its first joint (K,) [m].
+        bent: How far the line is from its position (K,) [m].
+        share: Factor on its depth (K,).
+        position: Distance of the line from the joint [m].
+        width: Of the line [m].
+        strength: Its depth.
+        texels: Indices of the texels (K,).
+        depth: Of all texels (N,), written.
+    """
+    for n in range(len(texels)):
+        away = (along[n] - position - bent[n]) / width
+        if abs(away) < 3.0:
+            here = np.float32(strength * share[n] * np.exp(-away * away))
+            depth[texels[n]] = max(depth[texels[n]], here)
+
+
+class _DigitLines(NamedTuple):
+    """The texels (K,) of a digit and where on it lines are drawn."""
+
+    texels: NDArray[np.int64]
+    along: NDArray[np.float32]
+    """Distance from its first joint [m]."""
+    sine: NDArray[np.float32]
+    cosine: NDArray[np.float32]
+    """Of three times the angle about it."""
+    arch: NDArray[np.float32]
+    """How far wrinkles bow [m]."""
+    pad: NDArray[np.float32]
+    """Share of creases on the palm's side."""
+    back: NDArray[np.float32]
+    """Share of wrinkles on its back."""
+    joints: NDArray[np.float64]
+    """Distance of its two other joints [m]."""
+
+    def wave(self, phase: float) -> NDArray[np.float32]:
+        """How far a crease waves from its position (K,) [m]."""
+        wave: NDArray[np.float32] = np.float32(0.0006 * np.cos(phase)) * self.sine
+        wave += np.float32(0.0006 * np.sin(phase)) * self.cosine
+        return wave
+
+
+@functools.cache
+def _digit_lines() -> tuple[_DigitLines, ...]:
+    texels, lines = skin_texels(), []
+    for digit in texels.digits:
+        back = texels.back[digit.texels]
+        on_back = back * digit.share * smooth(np.cos(digit.angle), -0.1, 0.6)
+        lines.append(
+            _DigitLines(
+                digit.texels,
+                along=digit.along.astype(np.float32),
+                sine=np.sin(3.0 * digit.angle).astype(np.float32),
+                cosine=np.cos(3.0 * digit.angle).astype(np.float32),
+                arch=(0.0015 * np.cos(digit.angle)).astype(np.float32),
+                pad=((1.0 - back) * digit.share).astype(np.float32),
+                back=on_back.astype(np.float32),
+                joints=np.cumsum(digit.lengths)[:2],
+            )
+        )
+    return tuple(lines)
+
+
+@functools.cache
+def _lines_of_all() -> tuple[NDArray[np.int64], tuple[NDArray[np.float32], ...], NDArray[np.float32]]:
+    """Texels of the palm (K,), its lines there (K,) each, and the depth (N,) of the wrist's lines."""
+    texels = skin_texels()
+    back = texels.back
+    near, distances = _palm_distances()
+    on_palm = (1.0 - back[near]) * (
+        1.0 - sum(_share_at(digit, near, len(back)) for digit in texels.digits[1:])
+    )
+    lines = tuple((on_palm * bump(distance, 0.0011)).astype(np.float32) for distance in distances)
+    depth = np.zeros(len(back))
+    for position in _WRIST_LINES:
+        depth = np.maximum(depth, 0.35 * bump(texels.positions[:, 0] - position, 0.0009) * (1.0 - back))
+    return near, lines, depth.astype(np.float32)
 
 
 def _share_at(digit: DigitTexels, texels: NDArray[np.int64], count: int) -> NDArray[np.float64]:

@@ -1,4 +1,7 @@
-"""Cases one after the other: only a `HandSimError` may escape, within five seconds and 500 MB."""
+"""Cases one after the other: only a `HandSimError` may escape, within five seconds and 500 MB.
+
+Its sentence, and that of a warning, has 500 characters at most, and nothing is printed.
+"""
 
 from __future__ import annotations
 
@@ -22,6 +25,7 @@ from tests.fuzzing.mutations import mutate
 CORPUS: Final = Path(__file__).parent / "corpus"
 MOST_SECONDS: Final = 5.0  # of computing, which other programs on the machine do not lengthen
 MOST_MEGABYTES: Final = 500.0
+MOST_CHARACTERS: Final = 500
 _SCREEN: Final = 200  # characters of a message that is shown
 
 
@@ -94,14 +98,28 @@ def _read(target: Target, file: Path) -> tuple[str | None, float, float]:
     memory, began = _peak_megabytes(), time.process_time()
     what = None
     try:
-        with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
-            warnings.simplefilter("ignore")
+        with (
+            warnings.catch_warnings(record=True) as told,
+            contextlib.redirect_stderr(io.StringIO()),
+            contextlib.redirect_stdout(io.StringIO()) as printed,
+        ):
+            warnings.simplefilter("always")
             target.read(file)
+        what = next((_fault(str(one.message)) for one in told), None)
     except target.refusals as error:
-        what = None if str(error).strip() and "\n" not in str(error) else f"not one sentence: {error!r}"
+        what = _fault(str(error))
     except Exception:
         what = traceback.format_exc().strip()
+    if what is None and printed.getvalue():
+        what = f"printed {printed.getvalue()[:_SCREEN]!r}"
     return what, time.process_time() - began, _peak_megabytes() - memory
+
+
+def _fault(sentence: str) -> str | None:
+    """What is wrong with a sentence, if anything is."""
+    if not sentence.strip() or "\n" in sentence:
+        return f"not one sentence: {sentence[:_SCREEN]!r}"
+    return f"a sentence of {len(sentence)} characters" if len(sentence) > MOST_CHARACTERS else None
 
 
 def keep(failure: Failure, folder: Path) -> Path:

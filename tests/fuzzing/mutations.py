@@ -1,12 +1,16 @@
-"""Seeded damage to bytes: flips, cuts, insertions, copies, and numbers swapped for extremes."""
+"""Seeded damage to bytes: flips, cuts, insertions, copies, and numbers swapped for extremes.
+
+And to the values in archives and checkpoints, whose form is then right.
+"""
 
 from __future__ import annotations
 
 import io
+import json
 import re
 import zipfile
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -21,6 +25,12 @@ _LONG: Final = (b"[", b"{", b"(", b'{"a":', b"[[", b"a.", b"\t", b",", b"\n", b"
 _WORDS: Final = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 _FLOATS: Final = (np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 1e-45, 0.0, -0.0)
 _LARGEST: Final = 10_000_000
+_VALUES: Final = (
+    None, True, [], {}, "", "x", "A" * 100_000, 0, -1, 1.5, 10**400, -(1 << 70), 1e308, float("nan"), [[]],
+    [None], {"": 0}, list(range(1000)),
+)  # fmt: skip
+_DTYPES: Final = ("<f8", "<f4", "<i8", "|i1", "<u4", "|b1", "<U3", "<c16", "|S2", "<M8[s]")
+_METHODS: Final = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
 
 Mutation = Callable[[bytearray, np.random.Generator], None]
 
@@ -54,6 +64,115 @@ def mutate_archive(data: bytes, rng: np.random.Generator) -> bytes:
         for member, content in members.items():
             archive.writestr(member, content)
     return out.getvalue()
+
+
+def mutate_take(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage an `.npz` with a JSON header: its bytes, or one to three values of its header and arrays."""
+    kind = rng.random()
+    if kind < 0.3:
+        return mutate_archive(data, rng)
+    with np.load(io.BytesIO(data)) as stored:
+        arrays = dict(stored)
+    for _ in range(int(rng.integers(1, 4))):
+        name = sorted(arrays)[int(rng.integers(len(arrays)))]
+        if rng.random() < 0.4 and "header" in arrays:
+            header = json.loads(str(arrays["header"]))
+            arrays["header"] = np.array(json.dumps(_swapped(header, rng)))
+        elif name != "header":
+            arrays[name] = _damaged_array(arrays[name], rng)
+    method = _METHODS[int(rng.integers(len(_METHODS)))]
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w", method) as archive:
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.save(buffer, array)
+            archive.writestr(f"{name}.npy", buffer.getvalue())
+    return out.getvalue() if kind < 0.8 else mutate(out.getvalue(), rng)
+
+
+def mutate_checkpoint(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage what `torch.save` wrote: its bytes, or one to three of its values."""
+    if rng.random() < 0.4:
+        return mutate_archive(data, rng)
+    import torch
+
+    content = torch.load(io.BytesIO(data), weights_only=True)
+    for _ in range(int(rng.integers(1, 4))):
+        content = _swapped(content, rng, odd=_odd_tensor)
+    out = io.BytesIO()
+    torch.save(content, out)
+    return out.getvalue()
+
+
+def mutate_tail(data: bytes, rng: np.random.Generator) -> bytes:
+    """Damage a packet behind the count of its parts, which the client's library believes."""
+    return data[:24] + mutate(data[24:], rng)
+
+
+def _odd_tensor(value: Any, rng: np.random.Generator) -> Any:
+    """A tensor like one, but for its shape, type or numbers; or one of far more entries than are stored."""
+    import torch
+
+    if not isinstance(value, torch.Tensor):
+        return _VALUES[int(rng.integers(len(_VALUES)))]
+    makers: tuple[Callable[[], Any], ...] = (
+        value.double,
+        lambda: value[None],
+        lambda: value.flatten()[:1],
+        lambda: torch.full_like(value, 1) * _FLOATS[int(rng.integers(len(_FLOATS)))],
+        lambda: value.flatten()[:1].expand(int(10 ** rng.uniform(3.0, 12.0))),
+        lambda: torch.zeros(1).expand(value.shape),
+        lambda: torch.zeros(()),
+        lambda: torch.zeros(0),
+        value.to_sparse,
+        lambda: value.to(torch.complex64),
+        lambda: [value],
+        lambda: None,
+    )
+    return makers[int(rng.integers(len(makers)))]()
+
+
+def _swapped(
+    value: Any, rng: np.random.Generator, odd: Callable[[Any, np.random.Generator], Any] | None = None
+) -> Any:
+    """Nested tables in which one value, wherever it is, is another, is missing, or is there twice."""
+    entries: list[tuple[Any, Any]] = []
+    if isinstance(value, dict | list):
+        entries = list(value.items() if isinstance(value, dict) else enumerate(value))
+    if not entries or rng.random() < 0.15:
+        return odd(value, rng) if odd is not None else _VALUES[int(rng.integers(len(_VALUES)))]
+    key, entry = entries[int(rng.integers(len(entries)))]
+    changed = value.copy()
+    kind = rng.random()
+    if kind < 0.1:
+        del changed[key]
+    elif kind < 0.15 and isinstance(changed, list):
+        changed.insert(key, entry)
+    else:
+        changed[key] = _swapped(entry, rng, odd)
+    return changed
+
+
+def _damaged_array(array: np.ndarray[Any, Any], rng: np.random.Generator) -> np.ndarray[Any, Any]:
+    """An array of another type or shape, or with other numbers."""
+    kind = int(rng.integers(6))
+    if kind == 0:
+        return np.zeros(array.shape, _DTYPES[int(rng.integers(len(_DTYPES)))])
+    if kind == 1:
+        return array[: int(rng.integers(len(array) + 1))] if array.ndim else array[None]
+    if kind == 2:
+        return np.repeat(array, 2, axis=int(rng.integers(array.ndim))) if array.ndim else array
+    if kind == 3:
+        return np.swapaxes(array, 0, -1)[..., None] if array.ndim > 1 else array.reshape(1, -1)
+    changed = np.frombuffer(bytearray(array.tobytes()), np.uint8)
+    if not len(changed):
+        return array
+    if kind == 4 and array.dtype == np.float64:
+        numbers = changed.view(np.float64)
+        numbers[int(rng.integers(len(numbers)))] = _FLOATS[int(rng.integers(len(_FLOATS)))]
+    else:
+        changed[int(rng.integers(len(changed)))] = int(rng.integers(256))
+    return changed.view(array.dtype).reshape(array.shape)
 
 
 def _place(data: bytearray, rng: np.random.Generator) -> int:

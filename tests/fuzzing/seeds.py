@@ -15,8 +15,10 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit, attach
 from gloves.layout import load_layout, save_layout, starter_layout
+from gloves.takes import columns as table
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
-from gloves.takes.take import STATUSES, RigidBody, Take
+from gloves.takes.growing import GrowingArchive, growing_path
+from gloves.takes.take import STATUSES, RigidBody, Take, keypoints_of, load_take, take_header, worn_arrays
 from handsim.hand.model import HandModel
 from handsim.hand.shape import sample_shape
 from handsim.space.objects import named_object
@@ -54,13 +56,15 @@ def capture() -> Capture:
 
 
 def trc(folder: Path) -> list[Path]:
-    """As we write it, and with commas, twice as many delimiters in line 3 and trajectories without a name."""
+    """As we write it; with commas, twice as many in line 3 trajectories without a name; as Excel's."""
     write_capture(folder / "take.trc", capture())
     lines = (folder / "take.trc").read_text().splitlines()
     lines[2] = lines[2].replace("\t", "\t\t")
     lines[3] = "\t".join(lines[3].split("\t")[: 2 + 3 * 5])
     (folder / "commas.trc").write_text("\n".join(lines).replace("\t", ",") + "\n")
-    return [folder / "take.trc", folder / "commas.trc"]
+    european = (folder / "take.trc").read_text().replace(".", ",").encode("utf-16")
+    (folder / "excel.trc").write_bytes(european)
+    return [folder / "take.trc", folder / "commas.trc", folder / "excel.trc"]
 
 
 def c3d(folder: Path) -> list[Path]:
@@ -75,13 +79,17 @@ def c3d(folder: Path) -> list[Path]:
 
 
 def csv(folder: Path) -> list[Path]:
-    """Two of Motive, with labels of rows and as we write it, and one of Vicon behind another section."""
+    """Two of Motive, with labels of rows and as we write it, one of Vicon among others; two European."""
+    from tests.gloves.captures.test_text import rewritten
     from tests.gloves.captures.test_vicon_csv import DEVICES, nexus
 
     (folder / "take.csv").write_text(MOTIVE)
     write_capture(folder / "ours.csv", capture())
     (folder / "vicon.csv").write_text(DEVICES + nexus() + "\n")
-    return [folder / "take.csv", folder / "ours.csv", folder / "vicon.csv"]
+    (folder / "quoted.csv").write_text(rewritten(MOTIVE, ",", quoted=True, commas=True))
+    (folder / "semicolons.csv").write_text(rewritten(nexus(), ";", commas=True))
+    names = ("take.csv", "ours.csv", "vicon.csv", "quoted.csv", "semicolons.csv")
+    return [folder / name for name in names]
 
 
 def tsv(folder: Path) -> list[Path]:
@@ -202,6 +210,25 @@ def tracked(folder: Path) -> list[Path]:
     return [folder / "take.npz"]
 
 
+def recording(folder: Path) -> list[Path]:
+    """A recording that was cut off, as it grows."""
+    (path,) = tracked(folder)
+    take = load_take(path)
+    path.unlink()
+    header = take_header(take.hands, take.bodies, None, {"glove": "sparse13"})
+    sizes = {"H": len(take.hands), "B": len(take.bodies)}
+    columns = [column.sized(sizes) for column in (*table.FRAMES, table.NUMBERS, table.KEYPOINTS)]
+    keypoints = keypoints_of(take.hands, take.qpos)
+    growing = growing_path(path)
+    growing.unlink(missing_ok=True)
+    with GrowingArchive(growing, header, worn_arrays(take.hands, take.bodies), columns) as archive:
+        for row in range(take.num_frames):
+            values = {column.name: getattr(take, column.name)[row] for column in table.FRAMES}
+            archive.add(values | {"numbers": row, "keypoints": keypoints[row]}, COLUMNS)
+            archive.flush()
+    return [growing]
+
+
 def user(folder: Path) -> list[Path]:
     User(hands(), "calibrated").save(folder / "user.json")
     return [folder / "user.json"]
@@ -224,6 +251,13 @@ def packets(folder: Path) -> list[Path]:
     for name, content in contents.items():
         (folder / name).write_bytes(content)
     return [folder / name for name in contents]
+
+
+def qualisys_packets(folder: Path) -> list[Path]:
+    from tests.track.streams.test_qualisys import frame
+
+    (folder / "packet").write_bytes(frame(7)[8:])  # without the header of the stream
+    return [folder / "packet"]
 
 
 def photos(folder: Path) -> list[Path]:

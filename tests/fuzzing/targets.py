@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ import numpy as np
 
 from gloves.captures.formats import read_capture
 from gloves.layout import load_layout
-from gloves.takes.corrections import load_corrections
+from gloves.takes.corrections import applied_corrections, load_corrections
 from gloves.takes.take import load_take
 from handsim.errors import HandSimError, HandSimWarning
 from handsim.files.json_files import claim, load_json
@@ -26,7 +27,7 @@ from render.scenery.photographs import draw_photo, photo_files
 from render.subject import PoseFile, load_subject
 from tests.fuzzing import seeds
 from tests.fuzzing.engine import Target
-from tests.fuzzing.mutations import mutate_archive
+from tests.fuzzing.mutations import mutate_archive, mutate_checkpoint, mutate_tail, mutate_take
 from track.bodies.body_file import load_body
 from track.streams.natnet import DamagedPacket, Kind, parse_frame, parse_server_info, unpack
 from track.user import load_user
@@ -37,6 +38,25 @@ _CLOUD: Final = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.07, 0.0], [
 def _read_settings(path: Path) -> None:
     load_json(path)
     claim(path, seeds.SETTINGS, noun="training set", error=HandSimError)
+
+
+def _read_take(path: Path) -> None:
+    """Every part of it, as commands use them."""
+    take = load_take(path)
+    assert take.capture().num_frames == take.num_frames
+    assert all(take.poses_alone().status.shape)
+    assert len(take.without_body().label_names) <= len(take.label_names)
+    applied_corrections(take)
+
+
+def _read_qualisys(path: Path) -> None:
+    """A data packet, which comes by TCP: what the client's library makes of it."""
+    from qtm_rt import QRTPacket
+
+    from track.streams.qualisys import frame_of
+
+    frame = frame_of(QRTPacket(path.read_bytes()))
+    assert frame.points.shape == (len(frame.ids), 3)
 
 
 def _read_packet(path: Path) -> None:
@@ -118,16 +138,18 @@ _ALL: Final = (
     Target("poses", seeds.own_poses, lambda path: load_subject(PoseFile(path), seed=0), mutate_archive),
     Target("body", seeds.body, load_body),
     Target("mesh", seeds.mesh, load_object),
-    Target("truth", seeds.truth, load_take, mutate_archive),
-    Target("tracked", seeds.tracked, load_take, mutate_archive),
+    Target("truth", seeds.truth, _read_take, mutate_take),
+    Target("tracked", seeds.tracked, _read_take, mutate_take),
+    Target("recording", seeds.recording, _read_take),
     Target("corrections", seeds.corrections, load_corrections),
     Target("user", seeds.user, load_user),
     Target("weights", seeds.weights, _read_weights),
     Target("onnx", seeds.onnx, _read_onnx),
     Target("dataset", seeds.dataset, _read_dataset),
-    Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_archive),
+    Target("checkpoint", seeds.checkpoint, _read_checkpoint, mutate_checkpoint),
     Target("settings", seeds.settings, _read_settings),
     Target("packet", seeds.packets, _read_packet, refusals=(DamagedPacket,)),
+    Target("qualisys", seeds.qualisys_packets, _read_qualisys, mutate_tail, (struct.error, ValueError)),
     Target("photo", seeds.photos, _read_photo),
 )
 TARGETS: Final = {target.name: target for target in _ALL}

@@ -253,3 +253,11 @@ def test_good_text_loads(tmp_path: Path) -> None:
     path = tmp_path / "glove.toml"
     path.write_text(text())
     assert load_layout(path).names == ("m0", "m1", "m2", "m3", "m4")
+
+
+def test_pinky_is_another_name_of_the_little_finger(tmp_path: Path) -> None:
+    text = starter_layout()
+    assert "little_distal" in text
+    (tmp_path / "glove.toml").write_text(text.replace('"little_', '"pinky_'))
+    (tmp_path / "same.toml").write_text(text)
+    assert load_layout(tmp_path / "glove.toml") == load_layout(tmp_path / "same.toml")

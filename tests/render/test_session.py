@@ -9,19 +9,20 @@ import resource
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from handsim.errors import CaptureError, HandSimError
-from handsim.space.camera import preset
+from handsim.space.camera import look_at, pinhole, preset
 from render.cameras.viewpoints import ViewConfig
 from render.config import RenderConfig
 from render.drawing import Drawing, draw
 from render.formats.png_depth import read_depth
 from render.sensors.depth_noise import DepthNoiseConfig
-from render.session import SHEET, left_out_frames, render_take
+from render.session import SHEET, cut_off_pictures, left_out_frames, render_take
 from render.skin.look import TONES
 from render.subject import subject_of_take
 from train.simulation.takes import simulate_take
@@ -147,12 +148,34 @@ def test_a_rendering_without_any_frame_is_told(path, tmp_path):
         render_take(take.qpos[24:26], tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
 
 
+def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):
+    config = dataclasses.replace(
+        PLAIN, view=ViewConfig("anywhere"), every=1, frames_per_shard=64, vary="frame"
+    )
+    render_take(path, tmp_path / "out", ["png"], config, workers=1)
+    for frame in draw(path, config=config, frames=[0, 7, 30]):
+        (file,) = (tmp_path / "out").glob(f"images/shard-*/{frame.key}.png")
+        written = cv2.imread(str(file))
+        np.testing.assert_array_equal(written[..., ::-1], frame.rgb)
+
+
+def test_pictures_that_lack_a_hand_are_told(path, tmp_path):
+    take = load_take(path)
+    hand = take.qpos[0, 0, :3]
+    eye = pinhole("eye", (64, 48), 120.0).at(look_at(hand - [0.0, 0.3, 0.0], hand))
+    models = tuple(fit.model for fit in take.hands)
+    qpos = take.qpos[[0, 0]].copy()
+    qpos[1, 1, 0] += 3.0
+    config = dataclasses.replace(PLAIN, view=ViewConfig(), every=1)
+    render_take(qpos, tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
+    assert "eye_000001" in cut_off_pictures(tmp_path / "out")
+
+
 def test_depth_sensors_see_hands_of_all_tones_alike(path):
     seen = []
     for tone in ("very light", "dark"):
-        config = dataclasses.replace(
-            PLAIN, tones=TONES[tone], depth_sensor=DepthNoiseConfig(("azure_kinect",))
-        )
+        sensor, view = DepthNoiseConfig(("azure_kinect",)), ViewConfig(distance=(0.6, 0.8))
+        config = dataclasses.replace(PLAIN, tones=TONES[tone], depth_sensor=sensor, view=view)
         frame = drawn(path, config)[0]
         hands = (frame.ideal.instances == 1) | (frame.ideal.instances == 2)
         seen.append((frame.noisy.depth[hands] > 0.0).mean())
@@ -165,12 +188,18 @@ def test_a_rendering_goes_on_where_it_stopped_and_comes_out_the_same(path, tmp_p
     assert (whole / SHEET).is_file()
     told = []
     render_take(path, parted, ["coco", "png"], PLAIN, workers=1)
-    victim = next((parted / "png").glob("shard-00001"))
+    victim = next((parted / "png" / "images").glob("shard-00001"))
     for file in victim.iterdir():
         file.unlink()
     victim.rmdir()
     render_take(path, parted, ["coco", "png"], PLAIN, workers=1, progress=lambda *counts: told.append(counts))
-    assert told == [(8, 8)]
+    assert told[0] == (4, 8) and told[-1] == (8, 8) and told == sorted(told)
+    sheet = (parted / SHEET).stat().st_mtime_ns
+    again: list[tuple[int, int]] = []
+    assert (
+        render_take(path, parted, ["coco", "png"], PLAIN, workers=1, progress=lambda *n: again.append(n)) == 8
+    )
+    assert again == [(8, 8)] and (parted / SHEET).stat().st_mtime_ns == sheet, "it is complete already"
     names = sorted(file.relative_to(whole) for file in whole.rglob("*") if file.is_file())
     assert names == sorted(file.relative_to(parted) for file in parted.rglob("*") if file.is_file())
     for name in names:
@@ -181,7 +210,8 @@ def test_a_full_disk_is_one_sentence_and_finished_tars_are_kept(path, tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def fill(done: int, wanted: int) -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+        if done >= 4:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
 
     try:
         with pytest.raises(HandSimError, match=r"writing shard 1 failed: File too large; shards that were"):
@@ -219,7 +249,7 @@ def test_no_driver_is_one_sentence_where_opengl_is_wanted(path, tmp_path):
 
 def test_depth_on_disk_is_in_meters(path, tmp_path):
     render_take(path, tmp_path / "out", ["png"], dataclasses.replace(PLAIN, passes=("depth",)), workers=1)
-    depth = read_depth(next((tmp_path / "out").rglob("*depth*.png")))
+    depth = read_depth(next((tmp_path / "out").rglob("depth/*/*.png")))
     assert 0.2 < depth.min() < 1.0 < np.median(depth) < 6.0
 
 

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from handsim.errors import HandSimError
 from handsim.hand.model import HandModel, join_qpos
-from render import PictureStream, RenderConfig
+from render import PictureStream, RenderConfig, render_take
 from render.sensors.shutter import ShutterConfig
 from train.simulation.takes import simulate_take
 
@@ -89,6 +89,38 @@ def test_own_poses_and_takes():
     assert one["keypoints"].shape == (2, 21, 2) and one["ids"].max() == 3, "two hands and a pen"
 
 
+def test_own_photographs_are_mixed_in(tmp_path):
+    config = RenderConfig(passes=("rgb", "depth", "ids"))
+    qpos = join_qpos(np.full((40, 20), 0.2))
+    assert render_take(qpos, tmp_path, "coco", config, model="M", workers=1) == 40
+    mixed = {"config": config, "photographs": tmp_path / "annotations.json", "photograph_share": 0.5}
+    alone = taken(12, config=config, crop=64)
+    pictures = taken(12, crop=64, **mixed)
+    assert {bool(one["drawn"]) for one in pictures} == {True, False}
+    for one, drawn in zip(pictures, alone, strict=True):
+        assert one.keys() == pictures[0].keys() and one["rgb"].shape == (3, 64, 64)
+        if one["drawn"]:
+            assert torch.equal(one["rgb"], drawn["noisy_rgb"]), "the others are what they would be without"
+            continue
+        keypoints = one["keypoints"].numpy()
+        assert 0.3 < np.nanmax(np.ptp(keypoints, axis=0)) / 64 < 0.8 and one["side"] == 1
+        columns, rows = keypoints[one["visible"].numpy()].astype(int).T
+        assert ((columns >= 0) & (columns < 64) & (rows >= 0) & (rows < 64)).all()
+    batches = DataLoader(PictureStream(crop=64, batch=4, **mixed), batch_size=4, num_workers=2)
+    numbers = [batch["number"].tolist() for batch in itertools.islice(batches, 3)]
+    assert numbers == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]]
+
+
+def test_people_and_tones_are_told():
+    pictures = taken(
+        8, crop=32, people=4, sitting=100, config=RenderConfig(passes=("rgb",), color_sensor=None)
+    )
+    people = [int(one["person"]) for one in pictures]
+    tones = [float(one["tone"]) for one in pictures]
+    assert people[:4] == people[4:] and len(set(people)) == 4 and tones[:4] == tones[4:]
+    assert all(-60.0 < tone < 70.0 for tone in tones)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -100,6 +132,8 @@ def test_own_poses_and_takes():
         ({"fill": 0.5}, "fill is 0.5, expected two numbers"),
         ({"poses": "no"}, "poses is 'no', expected an array"),
         ({"takes": 5}, "takes is 5, expected a Take"),
+        ({"photograph_share": 2.0}, "photograph_share is 2, expected a number from 0 to 1"),
+        ({"photographs": "none.json"}, "none.json"),
         ({"config": "fast"}, "config is 'fast', expected a RenderConfig"),
         ({"camera": 3}, "camera is 3, expected a Camera or the name of a preset"),
         ({"config": RenderConfig(shutter=ShutterConfig())}, "poses without times have no motion to blur"),

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from gloves.fit import attach
+from gloves.takes.take import Take
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning
 from handsim.hand.keypoints import hand_keypoints
@@ -22,7 +24,7 @@ from render.config import RenderConfig
 from render.drawing import Drawing
 from render.sensors.shutter import ShutterConfig
 from render.session import render_take
-from render.subject import PoseFile, load_subject
+from render.subject import PoseFile, load_subject, source_of
 
 K = np.array([[300.0, 0, 161.5], [0, 302.0, 118.25], [0, 0, 1]])
 D = np.array([[-0.2, 0.06, 0.001, -0.0015, 0.01]])
@@ -111,6 +113,39 @@ def test_angles_with_wrist_transforms_are_the_same(tmp_path, qpos):
     signs = np.sign((read[:, 3:7] * qpos[:, 3:7]).sum(axis=1, keepdims=True))
     read[:, 3:7] *= signs
     np.testing.assert_allclose(read, qpos, atol=1e-12)
+
+
+def test_a_table_of_an_exported_take_is_drawn_as_its_poses(tmp_path, qpos):
+    both = np.stack([qpos, qpos], axis=1)
+    both[:, 1, 0] += 0.2
+    both[1, 0] = np.nan
+    fits = [attach("dense19", HandModel.named("M", side=side)) for side in ("left", "right")]
+    Take.of_poses(fits, both, rate=30.0).export(tmp_path / "poses.csv")
+    for source in (PoseFile(tmp_path / "poses.csv"), source_of(str(tmp_path / "poses.csv"))):
+        subject = load_poses(source)
+        assert [fit.side for fit in subject.take.hands] == ["left", "right"] and subject.is_motion
+        assert subject.take.rate == pytest.approx(30.0)
+        np.testing.assert_allclose(subject.take.qpos, both, atol=1e-8)
+    right = load_poses(PoseFile(tmp_path / "poses.csv", ("right",)))
+    np.testing.assert_allclose(right.take.qpos[:, 0], qpos + np.eye(27)[0] * 0.2, atol=1e-8)
+
+
+def test_a_table_is_drawn_by_its_name(tmp_path, qpos, cameras):
+    Take.of_poses([attach("dense19", HandModel.named("M"))], qpos[:, None], rate=1.0).export(
+        tmp_path / "p.csv"
+    )
+    line = ["render", str(tmp_path / "p.csv"), "--cameras", str(cameras), "--format", "png", "--workers", "1"]
+    assert main([*line, "--passes", "depth", "--out", str(tmp_path / "out")]) == 0
+    records = [json.loads(path.read_text()) for path in sorted((tmp_path / "out").rglob("left_*.json"))]
+    assert len(records) == len(qpos)
+    for record, pose in zip(records, qpos, strict=True):
+        np.testing.assert_allclose(record["hands"][0]["qpos"], pose, atol=1e-8)
+
+
+def test_a_table_without_poses_is_told(tmp_path):
+    (tmp_path / "table.csv").write_text("frame,time_s,hand,x\n0,0,right,1\n")
+    with pytest.raises(HandSimError, match=r"no column 'wrist_x_m'; of a \.csv are read frame, time_s, hand"):
+        render_take(str(tmp_path / "table.csv"), tmp_path / "out", "png")
 
 
 def test_two_hands_one_of_them_absent(tmp_path, qpos):

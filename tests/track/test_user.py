@@ -66,7 +66,7 @@ def test_a_user_s_hand_leaves_with_its_markers(hands, tmp_path, capsys):
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'hand.xml'}: right hand of")
     for name, hand in (("left.xml", hands[0]), ("hand.xml", hands[1])):
         assert mujoco.MjModel.from_xml_path(str(tmp_path / name)).nsite == hand.layout.num_markers
-    with pytest.raises(ArgumentError, match=r"expected a name that ends in \.xml, \.urdf, \.glb"):
+    with pytest.raises(ArgumentError, match=r"expected a name that ends in \.xml, \.urdf, \.osim, \.glb"):
         user.export(tmp_path / "hand.stl")
 
 

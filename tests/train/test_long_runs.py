@@ -12,7 +12,7 @@ import torch
 
 from handsim.app.interrupts import Stopped
 from handsim.cli.main import main
-from handsim.errors import ArgumentError, WeightsError
+from handsim.errors import WeightsError
 from train.config import SetLabelerConfig, TrainConfig
 from train.data.shards import Dataset
 from train.glove_labeler import load_labeler
@@ -21,7 +21,6 @@ from train.loop import CHECKPOINT, train_labeler
 from train.simulation.dataset_config import DatasetConfig
 from train.simulation.frame_scenes import SceneMix
 from train.simulation.generation import make_dataset
-from train.threads import TrainingThreads, label_on, labeling_threads
 from train.training_state import TrainingError
 
 SMALL = SetLabelerConfig(width=8, gates=2, depth=1)
@@ -163,20 +162,6 @@ def test_a_full_disk_is_one_sentence_and_the_checkpoint_stays(dataset, tmp_path,
     load_labeler(tmp_path / "run")
 
 
-class Machine:
-    """A clock, and a step that takes as long as the number of torch's threads makes it."""
-
-    def __init__(self, seconds: dict[int, float]) -> None:
-        self.seconds, self.time, self.steps = seconds, 0.0, []
-
-    def step(self):
-        self.steps.append(torch.get_num_threads())
-        self.time += self.seconds[torch.get_num_threads()]
-
-    def now(self):
-        return self.time
-
-
 @pytest.fixture
 def two_threads():
     before = torch.get_num_threads()
@@ -185,58 +170,12 @@ def two_threads():
     torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(
-    ("seconds", "chosen", "steps"),
-    [
-        ({1: 0.5, 2: 4.0}, 1, [1, 1, 1, 2]),  # a busy machine: one slow step is enough
-        ({1: 0.5, 2: 0.3}, 2, [1, 1, 1, 2]),  # an idle one
-        ({1: 0.5, 2: 0.49}, 1, [1, 1, 1, 2, 2, 2]),  # no clear gain
-    ],
-)
-def test_threads_are_chosen_by_measurement(two_threads, seconds, chosen, steps):
-    machine = Machine(seconds)
-    threads = TrainingThreads(None, machine.step, now=machine.now)
-    with threads.in_use():
-        threads.renew()
-        assert threads.count == torch.get_num_threads() == chosen
-        threads.renew()
-        assert machine.steps == steps, "not measured again at once"
-        machine.time += threads.AGAIN + 1.0
-        machine.seconds = {1: 0.5, 2: 0.2}
-        threads.renew()
-        assert threads.count == 2, "others have ended their work"
-    assert torch.get_num_threads() == 2
-
-
-def test_a_given_number_of_threads_holds(two_threads):
-    machine = Machine({})
-    threads = TrainingThreads(1, machine.step)
-    with threads.in_use():
-        threads.renew()
-        assert torch.get_num_threads() == 1 and machine.steps == []
-    for wrong in (0, -2):
-        with pytest.raises(ArgumentError, match=f"threads is {wrong}, expected 1 to"):
-            TrainingThreads(wrong, machine.step)
-
-
 def test_a_measurement_leaves_the_run_as_it_is(dataset, tmp_path, two_threads, monkeypatch):
     monkeypatch.setattr("train.threads._GAIN", 1e9)  # one thread is chosen whatever is measured
     train_labeler(dataset, tmp_path / "measured", CONFIG)
     train_labeler(dataset, tmp_path / "given", CONFIG, threads=1)
     measured, given = ((tmp_path / name / WEIGHTS).read_bytes() for name in ("measured", "given"))
     assert measured == given
-
-
-def test_labelers_use_one_thread_unless_told(two_threads):
-    label_on(2)
-    try:
-        with labeling_threads():
-            assert torch.get_num_threads() == 2
-    finally:
-        label_on(1)
-    with labeling_threads():
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == 2
 
 
 OPTION_ERRORS = {

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from handsim.kernels.kernel import kernel
 from track.association.candidates import DigitCandidates
 from track.association.digit_hypotheses import IMPOSSIBLE, DigitHypotheses
+from train.matching.assignment import assign
 
 
 def match_log_odds(
@@ -61,18 +61,15 @@ def match_points(
         Marker of each point, -1 for none, and the confidence in it [0, 1], which weighs the alternatives of
         both.
     """
-    labels = np.full(len(log_odds), -1)
+    _, labels = assign(-log_odds, np.zeros(len(log_odds)))
     if 0 in log_odds.shape:
         return labels, np.ones(len(log_odds))
-    gain = np.maximum(log_odds, 0.0)
-    rows, columns = linear_sum_assignment(-gain)
     weights = np.exp(np.minimum(log_odds, 50.0))
     alternatives = 1.0 + weights.sum(axis=1, keepdims=True) + weights.sum(axis=0) - weights
     share = weights / alternatives
-    matched = gain[rows, columns] > 0.0
-    labels[rows[matched]] = columns[matched]
     confidence = 1.0 - (weights / (1.0 + weights.sum(axis=1, keepdims=True))).sum(axis=1)
-    confidence[rows[matched]] = share[rows[matched], columns[matched]]
+    matched = np.flatnonzero(labels >= 0)
+    confidence[matched] = share[matched, labels[matched]]
     return labels, confidence
 
 

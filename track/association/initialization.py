@@ -14,35 +14,51 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fclusterdata
 
 from gloves.fit import GloveFit
 from handsim.hand.model import join_qpos
+from handsim.hand.topology import NUM_JOINTS
 from poses.shapes.library import LIBRARIES, gestures_of
 from track.association.assignment import match_log_odds, match_points, peak_log_odds
 from track.association.frame_state import targets_of
 from track.association.hand_state import HandState
+from track.association.point_groups import linked_groups, longest_links
 from track.config import TrackerConfig
-from track.finder.measures import longest_link
-from track.kinematics.pose_solver import PoseFit
-from train.labelers.protocol import Labeler, Labeling
+from track.kinematics.joint_prior import resting_prior
+from track.kinematics.pose_solver import PoseFit, PoseSolver
+from train.labelers.protocol import Labeler
 
 MOST_POINTS: Final = 100
 """Largest number of points of a group that may be a hand."""
 _LINK_DISTANCE: Final = 0.085  # [m] between neighboring markers of one hand, or more where its glove needs it
 _LINKED: Final = 0.99  # share of gestures in which all markers of a hand are linked
 _LEAST_SHARE: Final = 0.45  # of a hand's markers that must be labeled
-_FEWEST_POINTS: Final = 4  # labeled points of a hand; a pose needs as many
-_SPARE_POINTS: Final = 6  # beyond a hand's markers, from which on a group may be two hands that touch
-_CUTS: Final = 12  # directions along which a group is cut, even over half a sphere
+FEWEST_POINTS: Final = 4
+"""Least number of labeled points of a hand; a pose needs as many."""
+SPARE_POINTS: Final = 6
+"""Points beyond a hand's markers from which on a group may be two hands that touch."""
+CUTS: Final = 12
+"""Directions along which a group is cut, even over half a sphere."""
+CUTS_PER_FRAME: Final = 6
+"""Directions tried in a frame of a capture in motion: with all, touching hands would take 20 ms."""
+_STRIDE: Final = 5  # between directions tried one after another, so that a few are even over half a sphere
 _MOST_FITS: Final = 8  # labeled clouds that are fitted, the most confident first
+_FIRST_STEPS: Final = 6  # from each starting pose of a first fit: enough to tell a hand from its mirror image
+_OUTLIER_DISTANCE: Final = 0.01  # [m] of a labeled point from a robust fit, from which on the label is wrong
+_LEAST_KEPT: Final = 0.75  # share of the labels that a robust fit keeps of a hand; a mirrored one loses more
+_POSE_WEIGHT: Final = 0.25  # log-odds of a pose for each squared deviation beyond the usual
+_MOST_POSE_PENALTY: Final = 20.0  # log-odds, because people do unusual things
 _REFINEMENTS: Final = 2  # rounds of assigning points to the markers of a fitted hand
 _SEARCH_FACTOR: Final = 4.0  # spread of the markers in these rounds over that of the fit
 _SEARCH_LEAST, _SEARCH_MOST = 0.003, 0.012  # [m] bounds of that spread
 _FREE_COORDINATES: Final = 20.0  # degrees of freedom that a pose takes from its points, in effect
-_LEAST_SPREAD: Final = 0.0003  # [m] that is estimated from a fit
+_USUAL_SPREAD: Final = 0.002  # [m] of markers around a fitted pose, as long as few of them tell
+_SUPPOSED: Final = 6.0  # coordinates that this spread counts for
 _LEAST_SCORE: Final = 50.0  # log-odds of a hand: about those of twelve points that are 5 mm off
-_CERTAIN_SCORE: Final = 10.0  # log-odds per marker after which no further cloud is tried
+_LEAST_PER_MARKER: Final = 5.0  # log-odds of a hand with few markers, for each of them
+_CERTAIN_SCORE: Final = 6.5  # log-odds per marker after which no further cloud is tried
+_HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from which on a hand is mirrored
+_HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # in which a known hand must fit as well as before; 0.5 s at 120 Hz
 
 
@@ -67,6 +83,7 @@ class HandInitializer:
         states: The user's hands.
         labeler: Labels the points of a cloud of one hand; does not know left from right.
         config: Largest RMS distance of a pose, and the density of strays.
+        cuts: Directions along which a group is cut in one call; the next ones follow in the next call.
     """
 
     def __init__(
@@ -74,14 +91,20 @@ class HandInitializer:
         states: Sequence[HandState],
         labeler: Labeler,
         config: TrackerConfig = TrackerConfig(),  # noqa: B008
+        *,
+        cuts: int = CUTS_PER_FRAME,
     ) -> None:
+        self._cuts, self._first_cut = cuts, 0
         self._states = states
         self._labeler = labeler
         self._config = config
-        self._link_distance = max([_LINK_DISTANCE, *(_link_distance(one.hand) for one in states)])
+        links = [_link_distance(one.hand) for one in states[:1]]  # the other hand is its mirror image
+        self._link_distance = max([_LINK_DISTANCE, *links])
+        self._prior = resting_prior()
+        self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
-        spread = np.arange(_CUTS) + 0.5
-        height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
+        spread = np.arange(CUTS) + 0.5
+        height, azimuth = 1.0 - spread / CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
         flat = np.sqrt(1.0 - height**2)
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
@@ -93,6 +116,7 @@ class HandInitializer:
             hands: Indices of the hands that are looked for.
         """
         initialized: list[InitializedHand] = []
+        self._first_cut += self._cuts
         for group in self._groups(points, hands):
             done = {hand.index for hand in initialized}
             rest, missing = group, [index for index in hands if index not in done]
@@ -111,7 +135,7 @@ class HandInitializer:
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
         """Log-odds of labeled points being a hand against their being strays.
 
-        Few points that fit closely can have a higher score than many that fit roughly.
+        Few points fit any pose; what a pose takes from them does not count.
 
         Args:
             count: Labeled points.
@@ -119,28 +143,23 @@ class HandInitializer:
             spread: Known standard deviation around the markers in each direction [m]; estimated from the fit
                 when not given.
         """
-        freedom = max(3.0 * count - _FREE_COORDINATES, 1.0)
-        estimated = max(rms * np.sqrt(count / freedom), _LEAST_SPREAD)
-        peak = peak_log_odds(
-            np.array([(estimated if spread is None else spread) ** 2]), self._config.stray_density
-        )
-        loss = 1.5 if spread is None else 0.5 * rms**2 / spread**2
-        return count * float(peak[0] - loss)
+        taken = min(_FREE_COORDINATES, 3.0 * count)
+        square = count * rms**2
+        variance = (square + _SUPPOSED * _USUAL_SPREAD**2) / (3.0 * count - taken + _SUPPOSED)
+        variance = variance if spread is None else spread**2
+        peak = peak_log_odds(np.array([variance]), self._config.stray_density)
+        return float(count * peak[0] - 0.5 * (square / variance + taken))
 
     def _groups(self, points: NDArray[np.float64], hands: Sequence[int]) -> list[NDArray[np.int64]]:
         """Points that are linked and enough for a hand, the largest group first."""
         least = min((self._least(index) for index in hands), default=0)
-        if len(points) < max(least, 2):
-            return []
-        cluster = fclusterdata(points, self._link_distance, criterion="distance", method="single")
-        groups = [np.flatnonzero(cluster == number) for number in np.unique(cluster)]
-        groups = [group for group in groups if least <= len(group) <= MOST_POINTS]
-        return sorted(groups, key=len, reverse=True)
+        groups = linked_groups(np.ascontiguousarray(points), self._link_distance)
+        return [group for group in groups if least <= len(group) <= MOST_POINTS]
 
     def _least(self, index: int) -> int:
         """Least number of labeled points of a hand."""
         share = _LEAST_SHARE * self._states[index].num_markers
-        return max(_FEWEST_POINTS, int(np.ceil(share)))
+        return max(FEWEST_POINTS, int(np.ceil(share)))
 
     def _best(
         self, points: NDArray[np.float64], group: NDArray[np.int64], hands: Sequence[int]
@@ -151,8 +170,13 @@ class HandInitializer:
         confidence = [float(one.confidence[one.labels >= 0].sum()) for one in labelings]
         best: InitializedHand | None = None
         for number in np.argsort(confidence)[::-1][:_MOST_FITS]:
-            for index in hands:
-                hand = self._fit(index, points, group, clouds[number], labelings[number])
+            labels = np.full(len(points), -1)
+            labels[clouds[number]] = labelings[number].labels
+            fits = [self._first_fit(index, points, labels) for index in hands]
+            for first in sorted((fit for fit in fits if fit is not None), key=lambda fit: -fit.score):
+                if best is not None and _is_mirrored(first, best):
+                    continue
+                hand = self._improve(first, points, group)
                 if hand is not None and (best is None or hand.score > best.score):
                     best = hand
             if best is not None:
@@ -166,25 +190,31 @@ class HandInitializer:
     ) -> list[NDArray[np.int64]]:
         """The group, and its halves along each direction if it has points of more than one hand."""
         clouds = [group]
-        if len(group) > markers + _SPARE_POINTS:
+        if len(group) > markers + SPARE_POINTS:
             half = len(group) // 2
-            for direction in self._directions:
+            for number in range(self._cuts):
+                direction = self._directions[_STRIDE * (self._first_cut + number) % CUTS]
                 order = group[np.argsort(points[group] @ direction)]
                 clouds += [order[:half], order[half:]]
         return clouds
 
-    def _fit(
-        self,
-        index: int,
-        points: NDArray[np.float64],
-        group: NDArray[np.int64],
-        cloud: NDArray[np.int64],
-        labeling: Labeling,
+    def _first_fit(
+        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64]
     ) -> InitializedHand | None:
-        """Fit a hand to a labeled cloud, then to the points of the whole group that match its markers."""
-        state, labels = self._states[index], np.full(len(points), -1)
-        labels[cloud] = labeling.labels
-        hand = self._trim(index, points, labels, None)
+        """A hand fitted to all labeled points; None where they are too few for one."""
+        if (labels >= 0).sum() < self._least(index):
+            return None
+        state = self._states[index]
+        targets = targets_of(points, labels, state.num_markers)
+        fit = state.solver.solve(targets[None], iterations=_FIRST_STEPS)
+        return self._scored(index, fit, labels)
+
+    def _improve(
+        self, first: InitializedHand, points: NDArray[np.float64], group: NDArray[np.int64]
+    ) -> InitializedHand | None:
+        """A hand without labels that do not fit, then fitted to the points of the group that do."""
+        index, state = first.index, self._states[first.index]
+        hand = self._trim(first, points) or self._trim(self._without_outliers(first, points), points)
         for _ in range(_REFINEMENTS):
             if hand is None:
                 return None
@@ -195,37 +225,74 @@ class HandInitializer:
             labels = np.full(len(points), -1)
             log_odds = match_log_odds(points[group], positions, covariances, self._config.stray_density)
             labels[group], _ = match_points(log_odds)
-            hand = self._trim(index, points, labels, hand.fit)
+            if (labels == hand.labels).all():
+                break
+            hand = self._trim(self._refit(index, points, labels, hand.fit), points)
         return hand
 
-    def _trim(
-        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], start: PoseFit | None
-    ) -> InitializedHand | None:
-        """Fit labeled points, and drop the label with the largest residual while that improves the score."""
-        state, best = self._states[index], None
-        while (labels >= 0).sum() >= self._least(index):
-            targets = targets_of(points, labels, state.num_markers)
-            fit = state.solver.solve(targets[None], None if start is None else start.qpos)
-            count, rms = int((labels >= 0).sum()), float(fit.rms[0])
-            known = self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS
-            hand = InitializedHand(
-                index, fit, labels, self.score(count, rms, state.spread if known else None)
-            )
-            if best is not None and hand.score <= best.score:
-                break
-            best, start = hand, fit
-            labeled = np.flatnonzero(labels >= 0)
-            squares = (fit.residuals[0, labels[labeled]] ** 2).sum(axis=1)
-            labels = labels.copy()
+    def _trim(self, hand: InitializedHand | None, points: NDArray[np.float64]) -> InitializedHand | None:
+        """Drop the worst label while that improves the score; None where it is no hand."""
+        best: InitializedHand | None = None
+        while hand is not None and (best is None or hand.score > best.score):
+            best = hand
+            labeled = np.flatnonzero(hand.labels >= 0)
+            squares = (hand.fit.residuals[0, hand.labels[labeled]] ** 2).sum(axis=1)
+            labels = hand.labels.copy()
             labels[labeled[squares.argmax()]] = -1
+            hand = self._refit(hand.index, points, labels, hand.fit)
         accepted = (
-            best is not None and best.fit.rms[0] <= self._config.most_rms and best.score >= _LEAST_SCORE
+            best is not None
+            and best.fit.rms[0] <= self._config.most_rms
+            and best.score >= min(_LEAST_SCORE, _LEAST_PER_MARKER * self._states[best.index].num_markers)
         )
         return best if accepted else None
+
+    def _without_outliers(
+        self, first: InitializedHand, points: NDArray[np.float64]
+    ) -> InitializedHand | None:
+        """The hand without labels that a robust fit leaves aside; None where these are many.
+
+        One wrong label can bend a whole first fit.
+        """
+        state = self._states[first.index]
+        targets = targets_of(points, first.labels, state.num_markers)
+        fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_STEPS)
+        distances = np.linalg.norm(fit.residuals[0], axis=-1)
+        kept = (first.labels >= 0) & (distances[first.labels] < _OUTLIER_DISTANCE)
+        if kept.sum() < _LEAST_KEPT * (first.labels >= 0).sum():
+            return None
+        return self._refit(first.index, points, np.where(kept, first.labels, -1), fit)
+
+    def _refit(
+        self, index: int, points: NDArray[np.float64], labels: NDArray[np.int64], near: PoseFit
+    ) -> InitializedHand | None:
+        """A hand fitted to labeled points from a near pose; None where they are too few."""
+        if (labels >= 0).sum() < self._least(index):
+            return None
+        state = self._states[index]
+        targets = targets_of(points, labels, state.num_markers)
+        return self._scored(index, state.solver.solve(targets[None], near.qpos), labels)
+
+    def _scored(self, index: int, fit: PoseFit, labels: NDArray[np.int64]) -> InitializedHand:
+        """A fit with its score; a hand that was seen lately must fit as well as then."""
+        known = self._attempts[index] < _KNOWN_SPREAD_ATTEMPTS
+        spread = self._states[index].spread if known else None
+        count, rms = int((labels >= 0).sum()), float(fit.rms[0])
+        offset = fit.qpos[0, 7:] - self._prior.angles
+        unusual = float(offset @ self._prior.precision @ offset) - NUM_JOINTS
+        penalty = np.clip(_POSE_WEIGHT * unusual, 0.0, _MOST_POSE_PENALTY)
+        return InitializedHand(index, fit, labels, self.score(count, rms, spread) - float(penalty))
+
+
+def _is_mirrored(first: InitializedHand, best: InitializedHand) -> bool:
+    """Whether labels fit another hand so much better that they are not of this one."""
+    kept = ((first.labels >= 0) & (best.labels == first.labels)).sum()
+    much_better = first.fit.rms[0] > _HOPELESS_FACTOR * best.fit.rms[0]
+    return bool(much_better and kept >= _HOPELESS_SHARE * (first.labels >= 0).sum())
 
 
 def _link_distance(hand: GloveFit) -> float:
     """Distance within which the neighboring markers of a hand are, while all are seen [m]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
     markers, _ = hand.markers(join_qpos(gestures))
-    return float(np.quantile([longest_link(one) for one in markers], _LINKED))
+    return float(np.quantile(longest_links(markers), _LINKED))

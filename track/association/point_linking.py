@@ -13,15 +13,17 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from handsim.space.transforms import rigid_fit
 from track.association.frame_state import FrameState, Numbering
+from train.matching.assignment import assign
 
 _LASTING_SHARE: Final = 0.5  # of the last frame's IDs must be there again for the stream's IDs to be used
 # Distance of a point from its prediction [m], before hands are aligned and after each alignment.
 _DISTANCES: Final = (0.04, 0.025, 0.015)
 _FEWEST_ALIGNED: Final = 5  # points with which a hand is aligned
+_NEIGHBORS: Final = 0.06  # [m] between markers whose distance hardly changes from frame to frame
+_FEWEST_NEIGHBORS: Final = 3  # pairs of these that tell something
 _BESIDE_DISTANCE: Final = 0.06  # [m] from a hand's points within which a point without a label moves with it
 
 
@@ -160,6 +162,20 @@ def _assign(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Points and predicted points, one to one, within a distance [m]."""
     squares = ((points[:, None] - predicted) ** 2).sum(axis=-1)
-    rows, columns = linear_sum_assignment(np.minimum(squares, distance**2))
-    near = squares[rows, columns] < distance**2
-    return rows[near], columns[near]
+    _, labels = assign(squares, np.full(len(points), distance**2))
+    near = np.flatnonzero(labels >= 0)
+    return near, labels[near]
+
+
+def change_of_distances(before: Float[np.ndarray, "O 3"], points: Float[np.ndarray, "P 3"]) -> float:
+    """Median change of the distances of neighboring points from a frame to the next [m].
+
+    About 2 mm where one frame follows from the other, also of fast hands, and 8 mm and more of hands in poses
+    that have nothing to do with each other; infinite where points cannot be linked.
+    """
+    rows, columns = _assign(points, before, _DISTANCES[0])
+    first, second = np.triu_indices(len(rows), 1)
+    was = np.linalg.norm(before[columns[first]] - before[columns[second]], axis=-1)
+    now = np.linalg.norm(points[rows[first]] - points[rows[second]], axis=-1)
+    near = was < _NEIGHBORS
+    return float(np.median(np.abs(now - was)[near])) if near.sum() >= _FEWEST_NEIGHBORS else np.inf

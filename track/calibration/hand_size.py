@@ -6,6 +6,7 @@ the markers follow as far as the frames tell. `user_calibration` finds the rest 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -34,6 +35,12 @@ _SHORTEST, _LONGEST = 0.125, 0.225  # [m], 0.6 of an adult's to beyond the longe
 _BREADTHS: Final = (0.88, 1.12)  # from the usual breadth of a length; three standard deviations
 _FAR: Final = 0.012  # [m] from the length that the labels were found with
 _PRECISION: Final = 0.001  # [m] of length
+_GOLDEN, _SQRT_EPSILON = 0.5 * (3.0 - math.sqrt(5.0)), math.sqrt(2.2e-16)  # of the search
+_USUAL_LENGTH, _LENGTH_SPREAD = 0.187, 0.012  # [m] of adults, women and men, ANSUR II
+_BREADTH_SPREAD: Final = 0.04  # from the usual breadth of a length
+_MARKER_SPREAD: Final = 0.002  # [m] per axis of glued markers around their places
+_INDEPENDENT: Final = 4.0  # frames' worth of evidence: what glue and flesh do repeats from frame to frame
+_PROBE: Final = 0.006  # [m] of length to either side, where the cost tells how sure the length is
 _FRAMES: Final = 8  # of each hand with which length and breadth are searched
 _PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted to
 _FEWEST: Final = 3  # frames with which a size is trusted
@@ -43,6 +50,7 @@ _PATIENCE: Final = 20  # frames with enough points for a hand, but none, after w
 _WINDOWS: Final = 8  # parts of a capture that are looked at
 _WINDOW: Final = 30  # frames of each
 _FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
+_UNSURE: Final = 0.003  # [m] standard deviation of the length from which on it is told
 _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
 
@@ -54,6 +62,8 @@ class _Measured(NamedTuple):
     """Of each hand (F, M, 3) [m]; NaN where missing."""
     measures: tuple[float, float]
     """Length and breadth [m]."""
+    spread: float
+    """Standard deviation of the length [m]."""
 
 
 class SizeFit(NamedTuple):
@@ -63,10 +73,13 @@ class SizeFit(NamedTuple):
     """The right one; a left hand is its mirror image."""
     rms: float
     """Median RMS distance of the markers from this hand [m]."""
+    spread: float
+    """Standard deviation of its length [m]."""
 
     def __str__(self) -> str:
         shape = self.hand.shape
-        return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm"
+        unsure = f", unsure by {1e3 * self.spread:.0f} mm" if self.spread > _UNSURE else ""
+        return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm{unsure}"
 
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
         """The measured hands of these sides."""
@@ -102,7 +115,8 @@ def fit_size(
         ):  # the labels are better with its own size
             found = _measure_from(found.measures[0], frames, layout, sides, labeler) or found
         if found is not None:
-            return SizeFit(*_fit_proportions(found.markers, _hand(*found.measures, layout, "right")))
+            hand, rms = _fit_proportions(found.markers, _hand(*found.measures, layout, "right"))
+            return SizeFit(hand, rms, found.spread)
     return None
 
 
@@ -116,7 +130,7 @@ def _measure_from(
     """What is measured on hands that are labeled as hands of a length [m]."""
     users = [_hand(length, usual_breadth(length), layout, side) for side in sides]
     markers = {side: some for side, some in _label(frames, users, labeler) if len(some) >= _FEWEST}
-    return _Measured(markers, _search(markers, layout)) if markers else None
+    return _Measured(markers, *_search(markers, users)) if markers else None
 
 
 def usual_breadth(length: float) -> float:
@@ -159,29 +173,80 @@ def _spread_out(markers: NDArray[np.float64], most: int) -> NDArray[np.float64]:
     return chosen
 
 
-def _search(markers: dict[Side, NDArray[np.float64]], layout: MarkerLayout) -> tuple[float, float]:
-    """The length and breadth [m] with the least RMS distance: length, then breadth, then length again."""
+def _search(
+    markers: Mapping[Side, Float[np.ndarray, "F M 3"]], users: Sequence[GloveFit]
+) -> tuple[tuple[float, float], float]:
+    """The likeliest length and breadth [m], and the standard deviation of the length [m].
+
+    Few markers fit hands of many sizes, so that the sizes of people count too. Length comes first, then
+    breadth, then length again.
+
+    Args:
+        markers: Labeled markers of each hand [m]; NaN where missing.
+        users: The hands that they were labeled as.
+    """
+    layout = users[0].layout
     few = {side: _spread_out(some, _FRAMES) for side, some in markers.items()}
+    starts = {hand.side: PoseSolver(hand).solve(few[hand.side]).qpos for hand in users if hand.side in few}
+    seen = np.mean([np.isfinite(some[..., 0]).sum(axis=1).mean() for some in few.values()])
+    evidence = _INDEPENDENT * float(seen) / _MARKER_SPREAD**2  # [1/m^2]
 
-    def rms(length: float, breadth: float) -> float:
-        fits = [
-            PoseSolver(_hand(length, breadth, layout, side)).solve(some).rms for side, some in few.items()
-        ]
-        return float(np.median(np.concatenate(fits)))
+    def cost(length: float, breadth: float) -> float:
+        solvers = {side: PoseSolver(_hand(length, breadth, layout, side)) for side in few}
+        fits = [solvers[side].solve(some, starts[side]).rms for side, some in few.items()]
+        beyond = (length - _USUAL_LENGTH) / _LENGTH_SPREAD
+        broad = (breadth / usual_breadth(length) - 1.0) / _BREADTH_SPREAD
+        square = float(np.median(np.concatenate(fits))) ** 2
+        return 0.5 * (evidence * square + beyond**2 + broad**2)
 
-    length = _least(lambda tried: rms(tried, usual_breadth(tried)), _SHORTEST, _LONGEST)
+    length = _least(lambda tried: cost(tried, usual_breadth(tried)), _SHORTEST, _LONGEST)
     usual = usual_breadth(length)
-    breadth = _least(lambda tried: rms(length, tried), _BREADTHS[0] * usual, _BREADTHS[1] * usual)
-    length = _least(lambda tried: rms(tried, breadth), 0.95 * length, 1.05 * length)
-    return length, breadth
+    breadth = _least(lambda tried: cost(length, tried), _BREADTHS[0] * usual, _BREADTHS[1] * usual)
+    length = _least(lambda tried: cost(tried, breadth), 0.95 * length, 1.05 * length)
+    around = [cost(length + step, breadth) for step in (-_PROBE, 0.0, _PROBE)]
+    curvature = (around[0] - 2.0 * around[1] + around[2]) / _PROBE**2
+    return (length, breadth), max(curvature, _LENGTH_SPREAD**-2) ** -0.5
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
-    """The argument between two bounds [m] with the least value of a function."""
-    from scipy.optimize import minimize_scalar
+    """The argument between two bounds [m] with the least value of a function, by Brent's method (1973).
 
-    result = minimize_scalar(function, bounds=(low, high), method="bounded", options={"xatol": _PRECISION})
-    return float(result.x)
+    The same steps as scipy's, which takes longer to load than to search.
+    """
+    best = second = third = low + _GOLDEN * (high - low)  # arguments with the least values so far
+    values = {best: function(best)}
+    step = before = 0.0  # the last step and the one before it
+    while True:
+        middle, least = 0.5 * (low + high), _SQRT_EPSILON * abs(best) + _PRECISION / 3.0
+        if abs(best - middle) <= 2.0 * least - 0.5 * (high - low):
+            return best
+        first = (best - second) * (values[best] - values[third])
+        other = (best - third) * (values[best] - values[second])
+        over = (best - third) * other - (best - second) * first
+        under = 2.0 * (other - first)
+        over, under = (-over if under > 0.0 else over), abs(under)
+        if (
+            abs(before) > least
+            and abs(over) < abs(0.5 * under * before)
+            and under * (low - best) < over < under * (high - best)
+        ):  # the lowest point of a parabola through all three
+            before, step = step, over / under
+            if min(best + step - low, high - best - step) < 2.0 * least:
+                step = math.copysign(least, middle - best)
+        else:
+            before = low - best if best >= middle else high - best
+            step = _GOLDEN * before
+        tried = best + math.copysign(max(abs(step), least), step)
+        values[tried] = function(tried)
+        if values[tried] <= values[best]:
+            low, high = (best, high) if tried >= best else (low, best)
+            best, second, third = tried, best, second
+        else:
+            low, high = (tried, high) if tried < best else (low, tried)
+            if values[tried] <= values[second] or second == best:
+                second, third = tried, second
+            elif values[tried] <= values[third] or third in (best, second):
+                third = tried
 
 
 def _fit_proportions(

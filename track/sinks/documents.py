@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -46,6 +47,7 @@ def frame_document(message: LiveMessage, *, points: bool = False) -> dict[str, A
         "number": int(message.number),
         "time": float(message.time),
         "silent": message.silent,
+        "lag": None if math.isnan(message.lag) else round(message.lag, _DECIMALS),
         "hands": [_hand(hand) for hand in message.hands],
         "bodies": [_body(body) for body in message.bodies],
     }

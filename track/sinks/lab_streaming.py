@@ -90,6 +90,7 @@ def channels_of(header: LiveHeader) -> Iterator[Channel]:
         yield Channel(f"{body}_status", "", "Status")
         for label, unit in _POSE:
             yield Channel(f"{body}_{label}", unit, _kind(label))
+    yield Channel("lag", "seconds", "Lag")
 
 
 def sample_of(message: LiveMessage) -> np.ndarray:
@@ -100,6 +101,7 @@ def sample_of(message: LiveMessage) -> np.ndarray:
         parts += [hand.position, hand.quaternion, hand.angles, hand.positions.ravel()]
     for body in message.bodies:
         parts += [[STATUSES.index(body.status)], body.position, body.quaternion]
+    parts.append([message.lag])
     return np.concatenate(parts)
 
 

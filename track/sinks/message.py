@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from time import monotonic
 from typing import Final, Protocol
 
 import numpy as np
@@ -93,6 +94,8 @@ class LiveMessage:
     """All points of the frame [m]."""
     labels: Int[np.ndarray, "N"]
     """Marker of each point, an index into `header.markers`; -1 for none."""
+    lag: float
+    """Time from the frame's arrival on this machine to this message [s]; NaN where it did not come live."""
 
 
 class LiveSink(Protocol):
@@ -142,7 +145,15 @@ class MessageEncoder:
             LiveBody(body.name, body.status, body.translation, body.rotation) for body in tracked.bodies
         )
         return LiveMessage(
-            self.header, frame.number, frame.time, frame.silent, hands, bodies, frame.points, tracked.labels
+            self.header,
+            frame.number,
+            frame.time,
+            frame.silent,
+            hands,
+            bodies,
+            frame.points,
+            tracked.labels,
+            monotonic() - frame.arrived,
         )
 
     def _hand(self, number: int, hand: TrackedHand) -> LiveHand:

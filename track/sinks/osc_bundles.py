@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from typing import Any, Final
@@ -44,6 +45,8 @@ class OscEncoder:
         """A frame; of a hand or a body without a pose only the status."""
         number = message.number & _MOST_NUMBER
         contents: list[_Content] = [("/handsim/frame", "idi", [number, message.time, int(message.silent)])]
+        if not math.isnan(message.lag):
+            contents.append(("/handsim/lag", "f", [message.lag]))
         for hand in message.hands:
             address = f"/handsim/{hand.side}"
             contents.append(_strings(f"{address}/status", [hand.status.value]))

@@ -9,7 +9,8 @@ from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError
 from track.network_address import split_address
-from track.streams.frame_source import SILENCE, FrameSource, LiveStream, SourceStream
+from track.streams.frame_source import FrameSource
+from track.streams.live_stream import SILENCE, LiveStream, SourceStream
 from track.streams.point_stream import open_stream
 from track.streams.qualisys import PORT, QualisysSource
 
@@ -25,7 +26,7 @@ def open_source(
     """Open a live stream, the frames of which are iterated in a `with` block.
 
     A frame has `points` (N, 3) [m], `ids` (N,) and a `time` [s] that never goes back, as `Tracker.step` takes
-    them.
+    them. Frames that are not kept up with are dropped, oldest first, see `LiveStream`.
 
     Args:
         address: As in `VALID`; `module:name?option=value` gives options to a source of the user's own.
@@ -39,7 +40,7 @@ def open_source(
     check_type("address", address, str, f"one of {', '.join(VALID)}")
     scheme = address.partition("://")[0] if "://" in address else ""
     if scheme == "natnet":
-        return LiveStream(open_stream(address, silence=silence, ended=ended))
+        return LiveStream(open_stream(address), silence=silence, ended=ended)
     if scheme == "qtm":
         parts = split_address(address, options={}, port=PORT)
         return _read(QualisysSource(parts.host, parts.port), address, silence, ended)
@@ -50,4 +51,4 @@ def open_source(
 
 
 def _read(source: FrameSource, name: str, silence: float, ended: Callable[[], bool]) -> LiveStream:
-    return LiveStream(SourceStream(source, name, silence=silence, ended=ended))
+    return LiveStream(SourceStream(source, name), silence=silence, ended=ended)

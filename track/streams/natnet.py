@@ -24,7 +24,7 @@ NEWEST: Final[Version] = (4, 1)
 """The newest known layout; servers are asked for it."""
 _SIZED: Final[Version] = (4, 1)
 """The first version whose sections have a size, and with assets and a finer clock."""
-_FARTHEST: Final = 1e3  # [m]: a lost marker is sent as a point beyond
+_LOST: Final = 9e6  # [m]: a lost marker is sent as a point beyond
 _OCCLUDED, _SEEN, _FILLED, _UNLABELED = 1, 2, 4, 16  # flags of a marker
 _NAME: Final = 256  # bytes of a program's name
 _BODY: Final = 38  # bytes of a rigid body: ID, position, orientation, error, flags
@@ -197,7 +197,7 @@ def _seen(
     once[first] = True
     once[: len(markers)] &= ~filled_in
     with np.errstate(invalid="ignore"):
-        once &= (np.abs(points) < _FARTHEST).all(axis=1)
+        once &= (np.abs(points) < _LOST).all(axis=1)
     return points[once].astype(np.float64), ids[once]
 
 

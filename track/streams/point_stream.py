@@ -7,26 +7,23 @@ import math
 import os
 import select
 import socket
+import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Final, Self
 from urllib.parse import urlsplit
 
-import numpy as np
-
 from handsim.errors import CaptureError
 from track.streams import natnet
-from track.streams.frame_order import Arrival, FrameOrder
-from track.streams.frame_source import SILENCE, StreamedFrame
+from track.streams.frame_source import StreamedFrame
 from track.streams.natnet import COMMAND_PORT, DamagedPacket, Kind, MarkerFrame, ServerInfo, Version
 
 _PATIENCE: Final = 3.0  # [s] to wait for a server
 _RETRY: Final = 0.5  # [s] between requests to a server that does not answer
 _KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
 _DRAIN: Final = 1.0  # [s] to read the packets that have arrived at the end, at most: others keep coming
-_STOP: Final = 0.2  # [s] between two looks at whether the stream shall end
+_STOP: Final = 0.1  # [s] between two looks at whether the stream shall end
 _BUFFER: Final = 1 << 20  # bytes of frames that may wait for the reader
 
 
@@ -34,16 +31,12 @@ def open_stream(
     url: str,
     *,
     local: str | None = None,
-    silence: float = SILENCE,
-    ended: Callable[[], bool] = lambda: False,
 ) -> PointStream:
     """Connect to a NatNet server.
 
     Args:
         url: `natnet://host` or `natnet://host:port`, with the port for commands.
         local: Address of the network card to listen at; the one that leads to the host when not given.
-        silence: Time without a frame after which the stream yields a silent frame [s].
-        ended: The stream ends when this is true; it is asked several times a second.
 
     Raises:
         CaptureError: The address is invalid, no server answers, or its NatNet is older than 3.0.
@@ -61,24 +54,16 @@ def open_stream(
     except BaseException:
         commands.close()
         raise
-    return PointStream(sockets, address, info, silence, ended)
+    return PointStream(sockets, address, info)
 
 
 class PointStream(Iterator[StreamedFrame]):
-    """Iterator of the frames of a stream; the end of a `with` block or `close` ends it.
+    """Iterator of the frames of a stream as they arrive, in any order; a `LiveStream` puts them in order.
 
-    Packets are taken from the server's address, and its ports for commands and for data, only. When frames
-    are read more slowly than they arrive, up to a megabyte of them waits.
+    Packets are taken from the server's address, and its ports for commands and for data, only.
     """
 
-    def __init__(
-        self,
-        sockets: list[socket.socket],
-        address: tuple[str, int],
-        server: ServerInfo,
-        silence: float,
-        ended: Callable[[], bool],
-    ) -> None:
+    def __init__(self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo) -> None:
         self.server = server
         """The server's description of itself."""
         self.packets = 0
@@ -87,51 +72,35 @@ class PointStream(Iterator[StreamedFrame]):
         """Number of damaged packets, which were left out."""
         self.foreign = 0
         """Number of packets of other senders, which were left out."""
-        self.order = FrameOrder()
-        """Counts frames that are missing, came late or had a wild time."""
-        self._sockets, self._address, self._silence, self._ended = sockets, address, silence, ended
+        self._sockets, self._address = sockets, address
         self._version = min(server.version, natnet.NEWEST)
-        self._last: StreamedFrame | None = None
-        self._ready: deque[Arrival] = deque()
         self._kept_alive = self._heard = time.monotonic()
-        self._drained = False
-
-    @property
-    def late(self) -> int:
-        """Number of frames that came twice or after newer ones, which were left out."""
-        return self.order.late
+        self._ended = threading.Event()
+        self._drained_until = math.inf
 
     @property
     def counts(self) -> dict[str, int]:
-        """What became of the frames so far, as a take records it."""
-        order = self.order
-        return {
-            "missing_frames": order.missed,
-            "late_frames": order.late,
-            "frames_with_wild_times": order.wild,
-            "restarts": order.restarts,
-            "damaged_packets": self.damaged,
-            "foreign_packets": self.foreign,
-        }
+        """What became of other packets so far, as a take records it."""
+        return {"damaged_packets": self.damaged, "foreign_packets": self.foreign}
 
     def __next__(self) -> StreamedFrame:
-        """Wait for the next frame; after each period of silence a silent frame."""
-        quiet = time.monotonic() + self._silence
+        """Wait for the next frame, until `end`."""
         while self._sockets:
-            if self._ready:
-                self._last = _streamed(self._ready.popleft())
-                return self._last
-            if self._ended():
-                if self._drain():
-                    continue
-                break
-            self._receive(self._keep_alive(quiet))
-            now = time.monotonic()
-            self._ready.extend(self.order.expire(now))
-            if now >= quiet and not self._ready:
-                number, last = (self._last.number, self._last.time) if self._last else (0, 0.0)
-                return StreamedFrame(number, last, np.empty((0, 3)), np.empty(0, dtype=np.int64), silent=True)
+            if self._ended.is_set():
+                self._drained_until = min(self._drained_until, time.monotonic() + _DRAIN)
+                received = self._receive(0.0) if time.monotonic() < self._drained_until else None
+                if received is None:
+                    break
+            else:
+                received = self._receive(self._keep_alive())
+            frame = None if received is None else self._take(*received)
+            if frame is not None:
+                return frame
         raise StopIteration
+
+    def end(self) -> None:
+        """No frame is wanted but those that have arrived; may be called from another thread."""
+        self._ended.set()
 
     def close(self) -> None:
         """Disconnect from the server; no further frame comes."""
@@ -149,7 +118,7 @@ class PointStream(Iterator[StreamedFrame]):
     ) -> None:
         self.close()
 
-    def _keep_alive(self, quiet: float) -> float:
+    def _keep_alive(self) -> float:
         """Send a keep-alive packet when it is due; returns how long to wait for a packet [s]."""
         now = time.monotonic()
         if now >= self._kept_alive + _KEEP_ALIVE:
@@ -157,46 +126,32 @@ class PointStream(Iterator[StreamedFrame]):
             if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
                 _send(self._sockets[0], natnet.pack_connect(), self._address)
             self._kept_alive = now
-        due = min(quiet, self._kept_alive + _KEEP_ALIVE, self.order.deadline, now + _STOP)
-        return max(0.0, due - now)
+        return max(0.0, min(self._kept_alive + _KEEP_ALIVE - now, _STOP))
 
-    def _drain(self) -> bool:
-        """Take all packets that have arrived until now, once; return whether there are more frames."""
-        if not self._drained:
-            self._drained = True
-            until = time.monotonic() + _DRAIN
-            while self._receive(0.0) and time.monotonic() < until:
-                pass
-        self._ready.extend(self.order.expire(math.inf))
-        return bool(self._ready)
-
-    def _receive(self, seconds: float) -> bool:
-        """Wait for a packet, and line up the frames that go on with it; return whether one came."""
+    def _receive(self, seconds: float) -> tuple[bytes, tuple[str, int]] | None:
+        """Wait for a packet and its sender; None if none came."""
         ready, _, _ = select.select(self._sockets, [], [], seconds)
-        received = _receive(ready[0]) if ready else None
-        if received is not None:
-            self._take(*received)
-        return received is not None
+        return _receive(ready[0]) if ready else None
 
-    def _take(self, packet: bytes, sender: tuple[str, int]) -> None:
-        """Line up the frames that go on with a packet."""
+    def _take(self, packet: bytes, sender: tuple[str, int]) -> StreamedFrame | None:
+        """The frame of a packet, if it holds one."""
         self.packets += 1
         if sender[0] != self._address[0] or sender[1] not in (self._address[1], self.server.data_port):
             self.foreign += 1
-            return
+            return None
         try:
             kind, payload = natnet.unpack(packet)
             if kind == Kind.SERVER_INFO and sender == self._address:
                 self.server = natnet.parse_server_info(payload)
                 self._version = min(self.server.version, natnet.NEWEST)
             if kind != Kind.FRAME:
-                return
+                return None
             frame = self._parse(payload)
         except DamagedPacket:
             self.damaged += 1
-            return
+            return None
         self._heard = time.monotonic()
-        self._ready.extend(self.order.add(frame, self._heard))
+        return StreamedFrame(frame.number, frame.time, frame.points, frame.ids, arrived=self._heard)
 
     def _parse(self, payload: bytes) -> MarkerFrame:
         """A frame of the server's version, or of the other layout: some servers send an older one."""
@@ -207,11 +162,6 @@ class PointStream(Iterator[StreamedFrame]):
             frame = natnet.parse_frame(payload, other)
             self._version = other
             return frame
-
-
-def _streamed(arrival: Arrival) -> StreamedFrame:
-    frame = arrival.frame
-    return StreamedFrame(frame.number, frame.time, frame.points, frame.ids, restarted=arrival.restarted)
 
 
 def _split(url: str) -> tuple[str, int]:

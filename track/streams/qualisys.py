@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import logging
 from collections.abc import Iterator
 from typing import Any, Final
@@ -56,12 +57,17 @@ class QualisysSource:
     def __iter__(self) -> Iterator[StreamedFrame]:
         """The frames in the order of their times, until `close`."""
         self._subscribe()
+        again = False
         while (arrived := self._loop.run_until_complete(self._arrived.get())) != _CLOSED:
             if isinstance(arrived, StreamedFrame):
-                yield arrived
+                yield dataclasses.replace(arrived, restarted=True) if again else arrived
+                again = False
             elif not self._loop.run_until_complete(self._reconnect()):
                 break
-        self._connection.disconnect()
+            else:
+                again = True
+        if self._connection.has_transport():
+            self._connection.disconnect()
 
     def close(self) -> None:
         """End the frames."""
@@ -90,7 +96,10 @@ class QualisysSource:
 
     async def _reconnect(self) -> bool:
         """Connect as soon as QTM is there again; returns whether before `close`."""
-        while self._arrived.empty():
+        while True:
+            while not self._arrived.empty():  # an attempt that failed is told as lost, too
+                if self._arrived.get_nowait() == _CLOSED:
+                    return False
             try:
                 self._connection = await self._connect()
             except CaptureError:
@@ -98,7 +107,6 @@ class QualisysSource:
                 continue
             self._subscribe()
             return True
-        return False
 
     def _react(self, event: Any) -> None:
         """QTM's frames end with a measurement: ask for those of the next one."""

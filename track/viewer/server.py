@@ -19,6 +19,11 @@ if TYPE_CHECKING:
 
 """The address that only this machine reaches."""
 _HINT: Final = "install it with: pip install 'handsim[view]'"
+_DARK_OR_LIGHT: Final = """<!doctype html><html><script>
+location.replace("/?" + (matchMedia("(prefers-color-scheme: dark)").matches ? "darkMode" : "light"))
+</script></html>
+"""
+"""What `/` answers: only a browser knows whether it is dark, and viser reads that from the address."""
 _PORTS: Final = range(8080, 8100)
 """Ports that are tried in this order where none is named."""
 
@@ -98,7 +103,7 @@ def _is_loopback(host: str) -> bool:
 
 @contextmanager
 def _guarded(host: str) -> Iterator[None]:
-    """Servers of websockets that are started in the block refuse other pages than their own.
+    """Servers of websockets that are started in the block refuse other pages, and follow a dark browser.
 
     viser passes nothing on that could do this.
     """
@@ -113,6 +118,11 @@ def _guarded(host: str) -> Iterator[None]:
             headers = request.headers
             if not is_own_page(headers.get("Origin"), headers.get("Host"), host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "another page's connection is refused\n")
+            if request.path == "/" and headers.get("Upgrade") != "websocket":
+                page = connection.respond(HTTPStatus.OK, _DARK_OR_LIGHT)
+                del page.headers["Content-Type"]  # plain text; assigning would add a second one
+                page.headers["Content-Type"] = "text/html; charset=utf-8"
+                return page
             answer: Response | None = process_request(connection, request)
             return answer
 

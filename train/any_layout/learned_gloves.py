@@ -7,6 +7,7 @@ version. The least recently used ones go when there are too many.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import os
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import platformdirs
 from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
@@ -25,21 +25,10 @@ from handsim.files.inputs import checksum
 from handsim.space.cameras import CameraRig, as_rig
 from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import SHIPPED, WEIGHTS, LayoutLabeler
+from train.labelers.storage import LEARNED, learned_folder, learned_gloves
 
 MOST: Final = 32
 """Labelers that are kept; one takes about four megabytes."""
-_SUFFIX: Final = ".safetensors"
-
-
-def cache_folder() -> Path:
-    """Where learned gloves are kept; `XDG_CACHE_HOME` moves it."""
-    return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
-
-
-def learned_gloves() -> tuple[Path, ...]:
-    """The files of the gloves that are kept, the most recently used first."""
-    files = cache_folder().glob(f"*{_SUFFIX}")
-    return tuple(sorted(files, key=lambda file: file.stat().st_mtime, reverse=True))
 
 
 def is_learned(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> bool:
@@ -70,14 +59,19 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
 
 
 def _file_of(layout: MarkerLayout, rig: CameraRig | str) -> Path:
+    return learned_folder() / f"{_digest(layout, rig)}{LEARNED}"
+
+
+@functools.lru_cache(maxsize=MOST)
+def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
+    """Of all that decides a labeler."""
     decides = {
         "layout": dataclasses.asdict(layout),
         "rig": as_rig(rig).record(),
         "weights": checksum(SHIPPED / WEIGHTS),
         "version": __version__,
     }
-    text = json.dumps(decides, sort_keys=True)
-    return cache_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}{_SUFFIX}"
+    return hashlib.sha256(json.dumps(decides, sort_keys=True).encode()).hexdigest()[:32]
 
 
 def _read(file: Path, layout: MarkerLayout) -> LayoutLabeler | None:

@@ -29,16 +29,18 @@ _PATIENCE: Final = 5.0  # [s] that the other processes have when one has failed
 
 Progress = Callable[[int, int, float], None]
 """Called with samples done, samples expected, and the loss."""
+Tell = Callable[[str], None]
+"""Called with what is done beside the steps, when it begins."""
 
 
 class Job(Protocol):
     """What every process does; the first one's result counts."""
 
-    def __call__(self, *, progress: Progress) -> Any:
+    def __call__(self, *, progress: Progress, told: Tell) -> Any:
         """Do it, and report the progress; the result must survive a pipe."""
 
 
-def in_local_processes(job: Job, count: int, *, progress: Progress | None) -> Any:
+def in_local_processes(job: Job, count: int, *, progress: Progress | None, told: Tell | None = None) -> Any:
     """Have each of some processes do a job together and return the result of the first.
 
     The environment tells each of them its number as torchrun does. A signal to end goes on to all of them.
@@ -47,6 +49,7 @@ def in_local_processes(job: Job, count: int, *, progress: Progress | None) -> An
         job: What to do; the processes are spawned and unpickle it.
         count: Number of processes.
         progress: Called in this process.
+        told: Called in this process.
 
     Raises:
         Exception: What ended the first process that failed on its own.
@@ -64,7 +67,7 @@ def in_local_processes(job: Job, count: int, *, progress: Progress | None) -> An
         try:
             while not ended:
                 wait([*(ours for ours, _ in pipes), *started.sentinels], timeout=_LOOK)
-                _listen(pipes, words, progress)
+                _listen(pipes, words, progress, told)
                 if interrupted() and not passed_on:
                     passed_on = True
                     _terminate(started)
@@ -75,7 +78,7 @@ def in_local_processes(job: Job, count: int, *, progress: Progress | None) -> An
             _terminate(started)
             for process in started.processes:
                 process.join()
-        _listen(pipes, words, progress)
+        _listen(pipes, words, progress, told)
     return _result(words, interrupted.number, death)
 
 
@@ -85,7 +88,10 @@ def _terminate(started: ProcessContext) -> None:
 
 
 def _listen(
-    pipes: list[tuple[Connection, Connection]], words: dict[int, Any], progress: Progress | None
+    pipes: list[tuple[Connection, Connection]],
+    words: dict[int, Any],
+    progress: Progress | None,
+    told: Tell | None,
 ) -> None:
     """Hand on the progress that there is, and keep the last word of each process."""
     for rank, (ours, _) in enumerate(pipes):
@@ -93,6 +99,9 @@ def _listen(
             is_last, word = ours.recv()
             if is_last:
                 words[rank] = word
+            elif isinstance(word, str):
+                if told is not None:
+                    told(word)
             elif progress is not None:
                 progress(*word)
 
@@ -136,7 +145,7 @@ def _live(rank: int, job: Job, rendezvous: Path, channels: list[Connection]) -> 
         with signals_raise():
             if hasattr(signal, "pthread_sigmask"):  # the parent's death sends one, too
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGHUP})
-            tell(True, job(progress=report))
+            tell(True, job(progress=report, told=lambda step: tell(False, step)))
             return
     except KeyboardInterrupt as stop:
         word: Exception | Stopped = stop if isinstance(stop, Stopped) else Stopped()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import io
 import json
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
-from safetensors.numpy import load, save
 
 from handsim._version import __version__
 from handsim.errors import HandSimError, WeightsError
@@ -24,6 +24,7 @@ from train.labelers.cnn_labeler import CNNLabeler
 from train.labelers.protocol import Labeling, checked_names, label_by_scores, label_in_batches, pad_clouds
 from train.labelers.views import MeanHand
 from train.matching.pose_prior import PosePrior
+from train.matching.verification import matching_constants
 
 if TYPE_CHECKING:
     import onnx
@@ -33,7 +34,8 @@ if TYPE_CHECKING:
 _NAMES: Final = "handsim.marker_names"  # key of the marker names in the file's metadata
 _DIGEST: Final = "handsim.sha256"  # key of the file's SHA-256, as if this were 64 zeros
 _CNN: Final = "handsim.cnn"  # key of the settings of the paper's network
-_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: safetensors in base64
+_PRIOR: Final = "handsim.pose_prior"  # key of the pose prior: an .npz in base64
+_MATCHING: Final = "handsim.matching"  # key of the constants that labels are chosen by, for other programs
 _IMAGES: Final = "images"  # its input
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
@@ -84,7 +86,10 @@ class OnnxLabeler:
             content = path.read_bytes()
             if sign_model(content) != content:  # onnxruntime crashes on some damaged files
                 raise ValueError("the SHA-256 is another one")
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+            # Without its fallback, which prints on standard output.
+            self._session = onnxruntime.InferenceSession(
+                content, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
             metadata = self._session.get_modelmeta().custom_metadata_map
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
             self.prior = _unpacked(metadata[_PRIOR]) if _PRIOR in metadata else None
@@ -135,7 +140,15 @@ class OnnxLabeler:
 
 def _unpacked(text: str) -> PosePrior:
     """The pose prior in a file's metadata."""
-    return PosePrior.of_tensors(load(base64.b64decode(text, validate=True)))
+    with np.load(io.BytesIO(base64.b64decode(text, validate=True))) as tables:  # unpickles nothing
+        return PosePrior.of_tensors(dict(tables))
+
+
+def _packed(prior: PosePrior) -> str:
+    """The pose prior as text."""
+    file = io.BytesIO()
+    np.savez(file, **prior.tensors())  # type: ignore[arg-type]
+    return base64.b64encode(file.getvalue()).decode()
 
 
 def _place_of_digest(content: bytes) -> slice:
@@ -190,7 +203,8 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         axes |= {_OUTPUTS[0]: {0: "frames", 1: "points"}, _OUTPUTS[1]: {0: "frames", 2: "points_and_none"}}
         prior = getattr(network, "prior", None)
         if isinstance(prior, PosePrior):
-            properties[_PRIOR] = base64.b64encode(save(prior.tensors())).decode()
+            properties[_PRIOR] = _packed(prior)
+            properties[_MATCHING] = json.dumps(matching_constants())
     with atomic_write(path) as temporary, warnings.catch_warnings():
         # The newer exporter needs another package and fixes the sizes of expanded arrays.
         warnings.simplefilter("ignore")

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import platformdirs
 from numpy.typing import NDArray
 
 from gloves.layout import list_layouts
@@ -32,6 +33,8 @@ from train.matching.pose_prior import PosePrior
 if TYPE_CHECKING:
     from torch import nn
 
+LEARNED: Final = ".safetensors"
+"""How the files in `learned_folder` end."""
 WEIGHTS: Final = "labeler.safetensors"
 CARD: Final = "labeler.json"
 _ANY_LAYOUT: Final = "any_layout"  # weights of the network for any layout
@@ -42,6 +45,17 @@ _LEAST_BYTES: Final = 4  # of a number of a network
 _MOST_CARD: Final = 1 << 24  # bytes
 _CONFIGS: Final[dict[Kind, type[NetworkConfig]]] = {"set": SetLabelerConfig, "cnn": CNNConfig}
 _SHIPPED: Final = Path(__file__).parents[1] / "weights"
+
+
+def learned_folder() -> Path:
+    """Where labelers of learned gloves are kept, see `train.any_layout`; `XDG_CACHE_HOME` moves it."""
+    return Path(platformdirs.user_cache_dir("handsim", appauthor=False)) / "gloves"
+
+
+def learned_gloves() -> tuple[Path, ...]:
+    """The files of the gloves that are kept, the most recently used first."""
+    files = learned_folder().glob(f"*{LEARNED}")
+    return tuple(sorted(files, key=lambda file: file.stat().st_mtime, reverse=True))
 
 
 def shipped_labelers() -> tuple[str, ...]:

@@ -16,6 +16,8 @@ _WEIGHT: Final = 0.65
 """Weight of each of the two scores: 0.5 if they held the same information, 1 if they were independent."""
 _ROUNDS: Final = 20
 _NEVER: Final = 1e-30  # a probability whose logarithm is still a number
+SINKHORN: Final = {"score_weight": _WEIGHT, "sinkhorn_rounds": _ROUNDS, "least_probability": _NEVER}
+"""What `pair_probabilities` goes by, for other programs that do the same."""
 IMPOSSIBLE: Final = 1e6
 """Cost of a pair that cannot be."""
 FloatArray = NDArray[np.float64]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from handsim.kernels.kernel import kernel
 from train.matching.assignment import (
     IMPOSSIBLE,
+    SINKHORN,
     assign,
     assignment_costs,
     match_probabilities,
@@ -44,6 +45,25 @@ _NEAR: Final = 80  # components that count for the labelings around the likelies
 _TEMPERATURE: Final = 0.25  # of the odds between labelings, for the confidence
 _LEAST: Final = 4  # labeled points of a hand
 _LEAST_DENSITY: Final = 2.5  # of a hand, for each coordinate; true labels of real hands have 2.8 to 4.2
+
+
+def matching_constants() -> dict[str, float]:
+    """What `match_scores` goes by, for other programs that do the same: docs/how_to/onnx.md has one."""
+    return {
+        **SINKHORN,
+        "impossible": IMPOSSIBLE,
+        "sure": _SURE,
+        "most_unsure": _MOST_UNSURE,
+        "rounds": _ROUNDS,
+        "width": _WIDTH,
+        "farthest": _FARTHEST,
+        "prior_weight": _WEIGHT,
+        "ghost": _GHOST,
+        "near": _NEAR,
+        "nearest": NEAREST,
+        "least_points": _LEAST,
+        "least_density": _LEAST_DENSITY,
+    }
 
 
 def match_scores(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, SOFT, LINE, BAND, CARD = "#23272f", "#5b6270", "#c3c8d0", "#e0e4e9", "#f4f5f7"
-BLUE, PALE, WARM = "#3f7396", "#a9c3d4", "#b8572b"
+BLUE, PALE, WARM, GREEN, VIOLET = "#3f7396", "#a9c3d4", "#b8572b", "#5b8c5a", "#7a5ba0"
 _STYLE: Final[dict[str, Any]] = {
     "font.size": 9.0,
     "text.color": INK,

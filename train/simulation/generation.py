@@ -187,6 +187,7 @@ def _settings(config: DatasetConfig, layout: MarkerLayout, rig: CameraRig) -> di
     settings = {
         **dataclasses.asdict(known),
         "rig": rig_setting(rig),
+        "rig_digest": rig.digest(),  # a shipped rig may be another one in another release
         "layout": dataclasses.asdict(layout),
     }
     if config.sampler is None:

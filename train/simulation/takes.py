@@ -18,7 +18,7 @@ from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import MarkerLayout, list_layouts, load_layout
 from gloves.takes.take import Take
 from handsim._checks import check_type, fill_settings
-from handsim.errors import ArgumentError, PoseError, choices
+from handsim.errors import ArgumentError, LayoutError, PoseError, choices
 from handsim.hand.topology import SIDES, Side
 from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
 from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
@@ -62,7 +62,7 @@ class TakeConfig:
     """The optical system, where it differs from the one fitted to this kind of capture."""
     hands: tuple[Side, ...] = BOTH
     """Hands to simulate: right, left, or both, which meet or hold an object together in the kinds hand-hand,
-    hand-pen, hand-controller and real-like."""
+    hand-pen, hand-controller and real-like. Of a glove for one hand that hand alone."""
 
     def __post_init__(self) -> None:
         check_type("kind", self.kind, str, "the name of a kind of capture", SIMULATED_KINDS)
@@ -120,7 +120,7 @@ def simulate_take(
             for calibration touches and 40 s of free motion.
         rig: The cameras, or the name or path of a rig.
         seed: Seed of people, motion and losses.
-        hands: Both, or for single-hand, calibration and free one of them.
+        hands: Both, or for single-hand, calibration and free one of them; of a glove for one hand that hand.
         optics: What differs from the optical system fitted to this kind, as `handsim simulate --help` lists
             it: `{"blob_loss": 0.1}`.
 
@@ -155,8 +155,7 @@ def record_config(config: TakeConfig) -> Take:
     key = SIMULATED_KINDS.index(kind), TWINS[kind].draw if kind in TWINS else 0
     rng = np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=key))
     rig, layout = as_rig(config.rig), load_layout(config.glove)
-    for side in config.hands:
-        layout.check_side(side)
+    config = dataclasses.replace(config, hands=_worn_hands(config, layout))
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
     scene = _sample_scene(config, layout, rng)
     optics = config.optics.applied(config.room.optics).worn(layout.radius)
@@ -171,6 +170,24 @@ def record_config(config: TakeConfig) -> Take:
     if set(config.hands) == set(BOTH):
         del settings["hands"]
     return record_take(scene, rig, room, settings, rng=rng)
+
+
+def _worn_hands(config: TakeConfig, layout: MarkerLayout) -> tuple[Side, ...]:
+    """The hands that a capture asks for and the glove is for.
+
+    Raises:
+        LayoutError: The glove is for the other hand, or this kind of capture needs both.
+    """
+    if len(layout.sides) == 1 and set(config.hands) == set(BOTH):
+        if config.kind not in APART:
+            raise LayoutError(
+                f"glove '{layout.name}' is for a {layout.sides[0]} hand only (its file's `sides`), and "
+                f"{config.kind} needs both; kinds of capture for one hand: {', '.join(APART)}"
+            )
+        return layout.sides
+    for side in config.hands:
+        layout.check_side(side)
+    return config.hands
 
 
 def sample_scene(

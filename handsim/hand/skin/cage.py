@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from handsim.hand.skeleton import build_skeleton
 from handsim.hand.skin.cage_topology import (
     AROUND,
     CARPUS,
@@ -26,6 +25,7 @@ from handsim.hand.skin.cage_topology import (
     palmar,
 )
 from handsim.hand.topology import DIGITS
+from handsim.space.transforms import euler_matrix
 
 if TYPE_CHECKING:
     from handsim.hand.shape import HandShape
@@ -129,13 +129,16 @@ class CageHands(NamedTuple):
     @classmethod
     def of(cls, shapes: Sequence[HandShape]) -> Self:
         """The measures of some hands, whatever their sides."""
+        frames = np.tile(np.eye(4), (len(shapes), len(DIGITS), 1, 1))
+        frames[..., :3, :3] = euler_matrix(np.stack([shape.base_angles for shape in shapes]))
+        frames[..., :3, 3] = knuckles = np.stack([shape.knuckles for shape in shapes])
         return cls(
             np.array([shape.breadth for shape in shapes]),
             np.array([shape.palm_thickness for shape in shapes]),
             np.stack([shape.bone_lengths for shape in shapes]),
-            np.stack([shape.knuckles for shape in shapes]),
+            knuckles,
             np.stack([shape.radii for shape in shapes]),
-            np.stack([build_skeleton(shape.with_side("right")).rest_transforms()[1::3] for shape in shapes]),
+            frames,
         )
 
     def ring_girths(self) -> Float[np.ndarray, "B R"]:

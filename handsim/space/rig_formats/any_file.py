@@ -11,7 +11,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from handsim.errors import HandSimError, HandSimWarning, RigError
+from handsim.errors import HandSimError, HandSimWarning, RigError, shortened
 from handsim.space.camera import Camera
 from handsim.space.rig_file import checked_cameras, read_rig_file
 from handsim.space.rig_formats import motive_mcal, qualisys_calibration, vicon_xcp
@@ -121,8 +121,8 @@ def _of_xml(path: Path) -> tuple[LabCamera, ...]:
     reader = next((_READERS[tag] for tag in tags if tag in _READERS), None)
     if reader is None:
         raise RigError(
-            f"{path}: its XML begins with <{root.tag[:40]}>, expected <{'>, <'.join(_READERS)}>: Vicon's, "
-            "Qualisys' or Motive's calibration"
+            f"{path}: its XML begins with <{shortened(root.tag)}>, expected <{'>, <'.join(_READERS)}>: "
+            "Vicon's, Qualisys' or Motive's calibration"
         )
     try:
         read = reader(root)
@@ -130,7 +130,7 @@ def _of_xml(path: Path) -> tuple[LabCamera, ...]:
         raise RigError(f"{path}: {error}") from error
     skipped = [one for one in read if isinstance(one, Skipped)]
     if skipped:
-        named = ", ".join(f"{one.name[:40]} {one.why}" for one in skipped[:8])
+        named = ", ".join(f"{shortened(one.name)} {one.why}" for one in skipped[:8])
         more = f" and {len(skipped) - 8} more" if len(skipped) > 8 else ""
         told = f"{path}: {len(skipped)} of {len(read)} cameras are left out: {named}{more}"
         warnings.warn(told, HandSimWarning, stacklevel=3)

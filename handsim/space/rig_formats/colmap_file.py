@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError, RigError, choices
+from handsim.errors import HandSimError, RigError, choices, shortened
 from handsim.files.inputs import read_bytes
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
@@ -74,7 +74,7 @@ def _lines(path: Path, *, keep_empty: bool = False) -> list[str]:
 def _lens(path: Path, line: str) -> tuple[str, Camera]:
     """`CAMERA_ID MODEL WIDTH HEIGHT PARAMS...`."""
     number, *rest = line.split()
-    owner = f"{path}: camera {number[:20]}"
+    owner = f"{path}: camera {shortened(number)}"
     if len(rest) < 3:
         raise RigError(f"{owner} has {1 + len(rest)} values, expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS")
     model = rest[0]
@@ -115,10 +115,10 @@ def _image(path: Path, line: str, lenses: dict[str, Camera]) -> Camera:
     words = line.split(maxsplit=9)
     if len(words) != 10:
         raise RigError(
-            f"{path}: the line '{line[:40]}' has {len(words)} values, expected "
+            f"{path}: the line '{shortened(line)}' has {len(words)} values, expected "
             "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points after it"
         )
-    owner = f"{path}: image {words[0][:20]}"
+    owner = f"{path}: image {shortened(words[0])}"
     pose = np.array(_numbers(owner, words[1:8]))
     length = float(np.linalg.norm(pose[:4]))
     if abs(length - 1.0) > 1e-3:
@@ -148,7 +148,7 @@ def _numbers(owner: str, words: list[str]) -> list[float]:
             except ValueError:
                 value = np.nan
             if not abs(value) < 1e9:
-                raise RigError(f"{owner}: '{word[:40]}' is no number that fits")
+                raise RigError(f"{owner}: '{shortened(word)}' is no number that fits")
             yield value
 
     return list(each())

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from handsim.errors import HandSimError, RigError
+from handsim.errors import HandSimError, RigError, shortened
 from handsim.files.inputs import read_bytes
 from handsim.space.camera import Camera
 from handsim.space.lens import Lens
@@ -104,7 +104,7 @@ def _many(values: Values, sections: Sections) -> list[Camera]:
                 raise RigError("no R and T, the rotation and translation from the world to the camera")
             cameras.append(_camera(common | own, name, _K, _D, _pose(own)))
         except HandSimError as error:
-            raise RigError(f"camera '{given[:40]}': {error}") from error
+            raise RigError(f"camera '{shortened(given)}': {error}") from error
     return cameras
 
 

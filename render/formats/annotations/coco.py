@@ -2,12 +2,13 @@
 
 Keypoints count pixels from the first one's center, boxes from the picture's corner: this is how COCO's own
 files and their readers have it. Beyond COCO's fields an image has its camera (`K` for such pixels, the lens,
-the pose) and an annotation its side and its keypoints in the camera's axes [m].
+the pose), who is in it and every random choice; an annotation has its side, its keypoints in the camera's
+axes [m], its pose, its shape and its skin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -15,8 +16,17 @@ import numpy as np
 from handsim._version import __version__
 from handsim.hand.keypoints import KEYPOINT_NAMES, SKELETON
 from handsim.space.camera import Camera
-from render.formats.annotations.common import CENTER, hand_mask, is_seen, rounded, run_lengths
+from render.formats.annotations.common import (
+    CENTER,
+    hand_mask,
+    is_seen,
+    keypoint_flags,
+    rounded,
+    run_lengths,
+    shape_record,
+)
 from render.frames import HandTruth, RenderedFrame
+from render.skin.look import SkinLook, tone_name
 
 INFO: Final[dict[str, Any]] = {
     "description": "Hands drawn by handsim; keypoints count pixels from the first one's center",
@@ -45,7 +55,10 @@ def picture_record(frame: RenderedFrame, file_name: str) -> dict[str, Any]:
         "K": _centered(camera),
         "lens": {"kind": camera.lens.kind, "coefficients": list(camera.lens.coefficients)},
         "T_world_camera": camera.T_world_camera.tolist(),
+        "choices": frame.choices,
     }
+    if "person" in frame.choices:
+        image["person"] = frame.choices["person"]
     hands = [_hand_record(frame, number, hand) for number, hand in enumerate(frame.hands) if is_seen(hand)]
     return {"image": image, "annotations": hands}
 
@@ -73,19 +86,29 @@ def _hand_record(frame: RenderedFrame, number: int, hand: HandTruth) -> dict[str
         "iscrowd": 0,
         "side": hand.shape.side,
         "xyz": rounded(frame.camera.local(hand.keypoints_world), 9),
+        "qpos": hand.qpos.tolist(),
+        "shape": shape_record(hand.shape),
     }
+    looks = frame.choices.get("people", ())
+    if number < len(looks):
+        record["look"], record["skin_tone"] = looks[number], _skin_tone(looks[number]["skin"])
     if mask is not None:
         record["segmentation"] = {"size": list(mask.shape), "counts": run_lengths(mask)}
     return record
 
 
+def _skin_tone(skin: Mapping[str, Any]) -> dict[str, Any]:
+    """The class of a person's skin, and its individual typology angle [deg]."""
+    angle = SkinLook(**skin).typology_angle
+    return {"class": tone_name(angle), "typology_angle": round(angle, 3)}
+
+
 def _keypoints(camera: Camera, hand: HandTruth) -> tuple[list[float], int]:
     """COCO's 21 x (u, v, flag): 0 outside the picture, 1 hidden, 2 seen; and how many are not 0."""
-    inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < camera.size), axis=1)  # never so for NaN
-    flags = np.where(inside, np.where(hand.visible, 2, 1), 0)
-    pixels = np.where(inside[:, None], hand.keypoints - CENTER, 0.0)
+    flags = keypoint_flags(hand, camera.size)
+    pixels = np.where(flags[:, None] > 0, hand.keypoints - CENTER, 0.0)
     rows = zip(rounded(pixels, 5), flags.tolist(), strict=True)
-    return [value for (u, v), flag in rows for value in (u, v, flag)], int(inside.sum())
+    return [value for (u, v), flag in rows for value in (u, v, flag)], int((flags > 0).sum())
 
 
 def _centered(camera: Camera) -> list[list[float]]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from handsim.errors import HandSimError
@@ -36,7 +36,7 @@ def centered_K(camera: Camera) -> NDArray[np.float64]:
     if camera.lens.kind != "pinhole":
         raise HandSimError(
             f"camera '{camera.name}' has a lens '{camera.lens.kind}', which this format cannot hold; "
-            "expected a pinhole camera, or the format webdataset, coco, exr or png"
+            "expected a pinhole camera, or the format webdataset, coco, yolo, exr or png"
         )
     K = camera.K.copy()
     K[:2, 2] -= CENTER
@@ -59,6 +59,13 @@ def as_sensed(frame: RenderedFrame) -> Pictures:
 def is_seen(hand: HandTruth) -> bool:
     """Whether any of the hand is in the picture."""
     return bool(np.isfinite(hand.box).all())
+
+
+def keypoint_flags(hand: HandTruth, size: tuple[int, int]) -> Int[np.ndarray, "21"]:
+    """COCO's flags of keypoints in a picture of this size [px]: 0 outside it, 1 hidden, 2 seen."""
+    inside = np.all((hand.keypoints >= 0.0) & (hand.keypoints < size), axis=1)  # never so for NaN
+    flags: NDArray[np.intp] = np.where(inside, np.where(hand.visible, 2, 1), 0)
+    return flags
 
 
 def hand_mask(frame: RenderedFrame, hand: int) -> Bool[np.ndarray, "H W"] | None:

@@ -122,9 +122,9 @@ def test_what_we_write_is_laid_out_as_motive_lays_it_out(tmp_path: Path) -> None
 
 def test_blank_cells_are_gaps() -> None:
     lines = motive(LABELED, UNLABELED).splitlines()
-    lines[-3] = "1,0,0.1,0.2,0.3,,,"
-    lines[-2] = "2,0,,,,0.4,0.5,0.6"
-    lines[-1] = "3,0,,,,,,"
+    lines[-3] = "1,0.000000,0.1,0.2,0.3,,,"
+    lines[-2] = "2,0.008333,,,,0.4,0.5,0.6"
+    lines[-1] = "3,0.016667,,,,,,"
     positions = read_motive_csv("\r\n".join(lines).encode()).positions
     nan = [np.nan] * 3
     np.testing.assert_allclose(positions, [[[0.1, 0.2, 0.3], nan], [nan, [0.4, 0.5, 0.6]], [nan, nan]])
@@ -136,7 +136,9 @@ BAD = {
     "only rigid bodies": motive(BODY, BODY_MARKER),
     "no columns": motive(),
     "unknown unit": motive(LABELED, unit="Feet"),
-    "no rate": motive(LABELED, first="Format Version,1.23").replace("Export Frame Rate,120.000000", "x,y"),
+    "no rate": motive(LABELED, rows=2, first="Format Version,1.23").replace(
+        "Export Frame Rate,120.000000", "x,y"
+    ),
     "no frames": motive(LABELED, rows=0),
     "header cut": GOOD[: GOOD.index("Frame,")],
     "header cut in its last row": GOOD[: GOOD.index("Frame,") + 12],

@@ -135,3 +135,10 @@ def test_warnings_of_a_capture_are_lines_of_the_command(hand, tmp_path, capsys):
     expected = f"handsim label: warning: {path}: 3 points at exactly (0, 0, 0) are read as missing"
     said = capsys.readouterr().err
     assert said.startswith(expected) and said.count("\n") == 1
+
+
+def test_all_points_at_the_origin_are_told(tmp_path):
+    path = tmp_path / "take.trc"
+    write_capture(path, Capture(("a", "b"), np.zeros((20, 2, 3)), 120.0))
+    with pytest.raises(CaptureError, match=r"all points are at the origin, \(0, 0, 0\), expected positions"):
+        read_capture(path)

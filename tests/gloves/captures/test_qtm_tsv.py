@@ -96,7 +96,7 @@ BAD = {
     "no names": GOOD.replace("MARKER_NAMES", "MARKERS"),
     "no name": qtm(names=(), columns=False),
     "fewer markers than names": qtm(markers="1"),
-    "no number of hertz": qtm(frequency="EXT"),
+    "no number of hertz": qtm(frequency="EXT", leading=False, columns=False),
     "fewer frames than stated": qtm(stated="4"),
     "no frames": qtm(rows=0),
     "header cut": GOOD[: GOOD.index("MARKER_NAMES") + 15],

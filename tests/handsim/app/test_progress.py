@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress
 
-from handsim.app.progress import _line, _lines, _Speed, progress_bar
+from handsim.app.progress import _line, _lines, _Speed, named_steps, progress_bar
 from tests.waiting import wait_for
 
 
@@ -48,3 +48,13 @@ def test_a_short_command_writes_no_line(capsys):
     with progress_bar("frames") as (bar, task):
         bar.update(task, completed=1, total=2)
     assert capsys.readouterr().err == ""
+
+
+def test_a_log_gets_a_line_a_step_and_not_one_a_count(capsys):
+    with named_steps("starting") as step:
+        for done in range(100):
+            step(f"generating frames: {done} of 1,000")
+        step("drawing")
+        assert capsys.readouterr().err.splitlines() == [
+            "starting", "generating frames: 0 of 1,000", "drawing"
+        ]  # fmt: skip

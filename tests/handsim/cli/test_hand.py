@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import mujoco
@@ -38,6 +39,13 @@ def test_model_opens_and_moves_as_ours_does(side: str, tmp_path: Path, rng: np.r
     np.testing.assert_allclose(sites, attach_markers(layout, model).points, atol=1e-5)
 
 
+def test_an_opensim_model_has_the_markers_of_the_glove(tmp_path: Path) -> None:
+    out = tmp_path / "hand.osim"
+    assert main(["hand", "--out", str(out), "--side", "left", "--glove", "dense19"]) == 0
+    names = {marker.get("name") for marker in ET.parse(out).iter("Marker")}
+    assert names > {*load_layout("dense19").names, "left:ThumbTip", "left_wrist", "left_little_tip"}
+
+
 @pytest.mark.parametrize("suffix", ["glb", "obj"])
 def test_mesh_is_the_skin(suffix: str, tmp_path: Path) -> None:
     mesh = tmp_path / f"hand.{suffix}"
@@ -52,7 +60,7 @@ def test_mesh_is_the_skin(suffix: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["--out", "hand.txt"], "ends in .xml, .urdf, .glb"),
+        (["--out", "hand.txt"], "ends in .xml, .urdf, .osim, .glb"),
         (["--mesh", "hand.fbx"], "ends in .glb, .obj, .ply, .stl"),
         (["--glove", "dense18"], "did you mean 'dense19'?"),
     ],
@@ -137,6 +145,8 @@ def test_servos_go_where_they_are_told(tmp_path: Path, rng: np.random.Generator)
         (["--take", "one.truth.npz", "--side", "right"], "unknown hand 'right'; valid names: left"),
         (["--shape", "user.json", "--glove", "dense19"], "given --glove dense19 and --shape user.json"),
         (["--out", "hand.urdf", "--actuators"], "expected an --out that ends in .xml with it"),
+        (["--out", "hand.osim", "--actuators"], "expected an --out that ends in .xml with it"),
+        (["--out", "hand.urdf", "--glove", "dense19"], "an --out that ends in .xml or .osim with it"),
         (["--out", "hand.glb", "--mesh", "hand.glb"], "expected two files"),
         (["--shape", "nobody.json"], "nobody.json: cannot be read"),
     ],

@@ -16,6 +16,7 @@ import pytest
 from gloves.takes.take import load_take
 from handsim.cli.main import main
 from tests.waiting import LONG
+from track.streams.live_stream import LiveStream
 from track.streams.natnet_server import LOOPBACK
 from track.streams.point_stream import open_stream
 
@@ -68,7 +69,7 @@ def test_a_capture_is_tracked_as_a_stream(capture, ending, tmp_path, replay):
 
 def test_a_loop_goes_on_with_new_numbers_and_ids(capture, replay):
     process, _, url = replay(capture, "--loop", "--rate", "600")
-    stream = open_stream(url)
+    stream = LiveStream(open_stream(url))
     frames = [next(stream) for _ in range(3 * FRAMES)]
     stream.close()
     process.send_signal(signal.SIGINT)

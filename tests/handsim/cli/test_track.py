@@ -82,7 +82,9 @@ def test_a_user_is_calibrated_from_unlabeled_points(user, capsys):
     assert take.sides == ("right",) and take.settings["user"] == "user.json"
     assert np.nanmedian(take.rms) < 0.0005
     np.testing.assert_array_equal(take.hands[0].attachment.points, found.attachment.points)
-    assert "right hand: tracked" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert said.startswith(f"{folder / 'user.json'}: hands in the glove 'dense19'\n")
+    assert "right hand: tracked" in said
 
 
 def test_users_that_do_not_fit_are_told(user, capture, tmp_path, capsys):
@@ -279,13 +281,16 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeyp
     with ReplayServer(capture.with_suffix(".truth.npz")) as server:
         assert main(["track", "--live", server.url, "--seconds", "0.3", "--out", str(out)]) == 0
     take = load_take(out)
-    assert take.num_frames == 37 and take.rate == pytest.approx(120.0, rel=1e-3)
+    assert 2 <= take.num_frames <= FRAMES and take.rate == pytest.approx(120.0, rel=1e-3)
     assert take.settings["capture"] == server.url
-    assert set(take.settings["stream"].values()) == {0}
-    np.testing.assert_array_equal(take.numbers, np.arange(37))
+    stream = take.settings["stream"]
+    assert stream["received_frames"] >= take.num_frames
+    assert (stream["missing_frames"], stream["doubled_frames"], stream["restarts"]) == (0, 0, 0)
+    np.testing.assert_array_equal(take.numbers, np.arange(take.num_frames))
     assert (take.status[-1] != LOST).all()
     told = capsys.readouterr()
-    assert "right hand: tracked" in told.out and "missing" not in told.out
+    assert "right hand: tracked" in told.out and "; 0 missing" in told.out
+    assert "frames received: " in told.out and " ms behind the arrival of frames" in told.out
     assert told.out.startswith("size of the hands: ") and take.settings["user"].startswith("auto, ")
     lines = told.err.splitlines()
     assert lines[0] == "waiting for hands, to measure their size" and lines[1].startswith("size of the hands")

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gloves.takes.take import load_take
 from handsim.cli.main import main
 from track.streams.natnet_server import ReplayServer
 from track.viewer import live_view
@@ -64,7 +65,9 @@ def test_a_file_is_served_until_ctrl_c(capture, capfd):
     assert b"<html" in pages[0]
 
 
-def test_a_live_tracker_is_shown_and_frames_are_never_dropped(capture, capsys, monkeypatch):
+def test_a_live_tracker_is_shown_and_recorded_and_frames_are_never_dropped(
+    capture, tmp_path, capsys, monkeypatch
+):
     shown: list[live_view.LiveView] = []
     offered: list[int] = []
     plain = live_view.LiveView.offer
@@ -77,12 +80,17 @@ def test_a_live_tracker_is_shown_and_frames_are_never_dropped(capture, capsys, m
     monkeypatch.setattr(live_view.LiveView, "offer", offer)
     with ReplayServer(capture.with_suffix(".truth.npz")) as server:
         thread = ended_after(lambda: len(offered) > 60 and shown[-1].pictures > 5)
-        assert main(["view", "--live", server.url, "--size", "L", "--port", "0"]) == 0
+        out = tmp_path / "take.npz"
+        assert main(["view", "--live", server.url, "--size", "L", "--port", "0", "--out", str(out)]) == 0
         thread.join()
-    assert offered == list(range(offered[0], offered[0] + len(offered))), "every frame is tracked"
-    told = re.search(r"(\d+) frames tracked, (\d+) of them", capsys.readouterr().out)
+    assert offered == sorted(set(offered)), "a slow machine drops frames, and no frame comes twice"
+    said = capsys.readouterr().out
+    told = re.search(r"(\d+) frames tracked, (\d+) of them", said)
     frames, pictures = map(int, told.groups())
     assert frames == len(offered) and 5 < pictures < frames
+    take = load_take(out)
+    assert list(take.numbers) == offered and f"{out}: {frames} frames" in said
+    assert take.settings["stream"]["missing_frames"] == 0
 
 
 def test_a_video_is_drawn_without_a_page(capture, tmp_path, capsys):
@@ -119,8 +127,8 @@ def test_what_cannot_be_shown_is_told_in_one_line(tmp_path, capture, capsys):
         ([], "neither a file nor --live, expected a file or --live natnet://host"),
         ([str(capture), "--live", "natnet://127.0.0.1"], "and --live natnet://127.0.0.1, expected a file or"),
         (
-            ["--live", "natnet://127.0.0.1", "--out", str(tmp_path / "x.npz")],
-            "nothing of a live view is saved",
+            ["--live", "natnet://127.0.0.1", "--out", str(tmp_path / "x.toml")],
+            "expected a file name that ends in .npz",
         ),
         ([str(tmp_path / "take.xyz")], "a file of another kind, expected a marker layout or camera rig"),
         (["dense91"], "no such file, folder or shipped name"),

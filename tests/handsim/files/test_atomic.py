@@ -145,3 +145,22 @@ def test_an_error_names_the_file_that_was_asked_for(tmp_path):
     with pytest.raises(OSError) as caught, atomic_write(tmp_path / "take.c3d") as temporary:
         raise OSError(errno.ENOSPC, "No space left on device", str(temporary))
     assert caught.value.filename == str(tmp_path / "take.c3d")
+
+
+def test_a_link_is_written_through(tmp_path):
+    (tmp_path / "there").mkdir()
+    file, link = tmp_path / "there" / "real.txt", tmp_path / "link.txt"
+    for content in ("first", "second"):  # it points to nothing at first
+        if not link.is_symlink():
+            link.symlink_to(file)
+        with atomic_write(link) as temporary:
+            temporary.write_text(content)
+        assert link.is_symlink() and file.read_text() == content
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["link.txt", "real.txt", "there"]
+
+
+def test_a_file_in_the_place_of_a_folder_is_told(tmp_path):
+    (tmp_path / "take.c3d").write_text("")
+    with pytest.raises(NotADirectoryError, match=r"take\.c3d is a file, not a folder"):
+        with atomic_write(tmp_path / "take.c3d" / "x.c3d"):
+            pass

@@ -71,7 +71,7 @@ def test_an_archive_of_far_more_bytes_than_its_file_is_refused(tmp_path):
         with archive.open("points.npy", "w") as file:
             for _ in range(300):
                 file.write(bytes(1 << 20))
-    with pytest.raises(ValueError, match="1 arrays of 314572800 bytes, expected at most 268435456 bytes"):
+    with pytest.raises(ValueError, match="1 members of 314572800 bytes, expected at most 268435456 bytes"):
         read_npz(tmp_path / "a.npz")
 
 

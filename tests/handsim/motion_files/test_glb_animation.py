@@ -153,6 +153,40 @@ def test_faces_look_outwards_once_and_normals_are_of_length_one(glb, motion):
     assert all(material["doubleSided"] is False for material in glb.json["materials"])
 
 
+def test_each_hand_has_a_skeleton_of_its_own(glb, motion):
+    """Programs take the nearest node over all bones of a skin for its skeleton: hands must not share it."""
+    nodes, parents = glb.json["nodes"], {}
+    for number, node in enumerate(nodes):
+        for child in node.get("children", []):
+            parents[child] = number
+    for hand, skin in zip(motion.hands, glb.json["skins"], strict=True):
+        root = glb.named(f"{hand.side}_skeleton")
+        assert skin["skeleton"] == root in glb.json["scenes"][0]["nodes"]
+        assert skin["name"] == nodes[root]["name"]
+        for joint in skin["joints"]:
+            assert nodes[joint]["name"].startswith(f"{hand.side}_")
+            above = joint
+            while above in parents:
+                above = parents[above]
+            assert above == root
+
+
+def test_blender_makes_an_armature_of_each_hand(motion, tmp_path):
+    bpy = pytest.importorskip("bpy")
+    pytest.importorskip("pxr")
+    for name in ("hands.glb", "hands.usdc"):
+        motion.export(tmp_path / name)
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        read = bpy.ops.import_scene.gltf if name.endswith("glb") else bpy.ops.wm.usd_import
+        read(filepath=str(tmp_path / name))
+        for side in ("right", "left"):
+            armature, skin = bpy.data.objects[f"{side}_skeleton"], bpy.data.objects[f"{side}_hand"]
+            assert armature.type == "ARMATURE" and len(armature.data.bones) == 16
+            assert all(bone.name.startswith(f"{side}_") for bone in armature.data.bones)
+            assert [modifier.object for modifier in skin.modifiers] == [armature]
+            assert skin.data.materials[0].name.partition(".")[0] == "skin"
+
+
 def test_keys_turn_the_short_way(glb):
     """Neighboring quaternions have one sign: readers that do not look for the shorter way turn right too."""
     for sampler in glb.json["animations"][0]["samplers"]:

@@ -5,9 +5,10 @@ import csv
 import numpy as np
 import pytest
 
+from handsim.errors import CaptureError
 from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
 from handsim.hand.topology import JOINT_NAMES
-from handsim.motion_files.joint_table import write_joint_csv, write_joint_parquet
+from handsim.motion_files.joint_table import read_joint_csv, write_joint_csv, write_joint_parquet
 from handsim.motion_files.motion import posed_hands
 
 
@@ -47,3 +48,46 @@ def test_a_row_per_frame_and_hand_holds_the_pose(motion, tmp_path, name):
         found = [[float(row[f"{keypoint}_{axis}_m"]) for axis in "xyz"] for keypoint in KEYPOINT_NAMES]
         expected = hand_keypoints(hand.model, hand.qpos[frame : frame + 1])[0]
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9)
+
+
+def test_what_was_written_is_read(motion, tmp_path):
+    path = tmp_path / "poses.csv"
+    write_joint_csv(path, motion)
+    table = read_joint_csv(path)
+    assert table.sides == ("right", "left")
+    np.testing.assert_allclose(table.times, motion.times, atol=1e-6)
+    np.testing.assert_allclose(table.qpos, motion.qpos, rtol=1e-8, atol=1e-9)  # NaN where ours are
+
+
+def test_columns_may_come_in_any_order_and_be_more_or_fewer(motion, tmp_path):
+    write_joint_csv(tmp_path / "poses.csv", motion)
+    with (tmp_path / "poses.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = [name for name in reversed(rows[0]) if not name.startswith(("thumb_tip", "index_MCP_x"))]
+    with (tmp_path / "other.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*names, "note"], extrasaction="ignore", restval="ours, or not")
+        writer.writeheader()
+        writer.writerows(row for row in rows if row["hand"] == "left")
+    table = read_joint_csv(tmp_path / "other.csv")
+    assert table.sides == ("left",)
+    np.testing.assert_allclose(table.qpos[:, 0], motion.qpos[:, 1], rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("wrist_qw", "wrist_w", "no column 'wrist_qw'; of a .csv are read frame, time_s, hand, wrist_x_m to"),
+        ("0,100,right", "0,100,both", "line 2: unknown hand 'both'; valid names: left, right"),
+        ("0,100,left", "0,100,right", "line 3 has frame 0 of the right hand again"),
+        ("0,100,right,", "0,100,right,1 m", "line 2: could not convert string to float: '1 m"),
+    ],
+)
+def test_what_cannot_be_read_is_told(motion, tmp_path, old, new, words):
+    path = tmp_path / "poses.csv"
+    write_joint_csv(path, motion)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(CaptureError) as caught:
+        read_joint_csv(path)
+    assert words in str(caught.value)

@@ -26,9 +26,10 @@ def test_usd_skins_the_hands_as_we_do(stage, motion):
     for hand in posed_hands(motion):
         cache = UsdSkel.Cache()
         cache.Populate(UsdSkel.Root(stage.GetPrimAtPath(f"/hands/{hand.side}")), Usd.PrimDefaultPredicate)
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/hands/{hand.side}/skin"))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/hands/{hand.side}/{hand.side}_hand"))
         skinning = cache.GetSkinningQuery(mesh.GetPrim())
-        skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath(f"/hands/{hand.side}/skeleton")))
+        prim = stage.GetPrimAtPath(f"/hands/{hand.side}/{hand.side}_skeleton")
+        skeleton = cache.GetSkelQuery(UsdSkel.Skeleton(prim))
         expected = hand.model.skin(hand.qpos)
         for frame in range(motion.num_frames):
             points = mesh.GetPointsAttr().Get()
@@ -42,7 +43,8 @@ def test_things_units_and_axes(stage, motion):
     from pxr import UsdGeom
 
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Z"
-    assert stage.GetTimeCodesPerSecond() == 60.0 and stage.GetEndTimeCode() == pytest.approx(12.0)
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == 60.0
+    assert stage.GetStartTimeCode() == 0.0 and stage.GetEndTimeCode() == pytest.approx(12.0)
     for thing, name in zip(posed_bodies(motion), ("pen", "my_wand"), strict=True):
         prim = UsdGeom.Xformable(stage.GetPrimAtPath(f"/hands/things/{name}"))
         for frame in range(motion.num_frames):
@@ -52,6 +54,27 @@ def test_things_units_and_axes(stage, motion):
     assert stage.GetPrimAtPath("/hands/things/pen/mesh") and not stage.GetPrimAtPath(
         "/hands/things/my_wand/mesh"
     )
+
+
+def test_meshes_have_materials_and_skeletons_the_names_of_their_hands(stage, motion):
+    from pxr import UsdGeom, UsdShade, UsdSkel
+
+    prims = list(stage.Traverse())
+    for prim in (prim for prim in prims if prim.IsA(UsdGeom.Mesh)):
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        shader, _, _ = material.ComputeSurfaceSource()
+        assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
+        color = UsdGeom.Mesh(prim).GetDisplayColorAttr().Get()[0]
+        assert shader.GetInput("diffuseColor").Get() == color
+    skeletons = {prim.GetName(): UsdSkel.Skeleton(prim) for prim in prims if prim.IsA(UsdSkel.Skeleton)}
+    assert set(skeletons) == {"right_skeleton", "left_skeleton"}
+    for name, skeleton in skeletons.items():
+        side = name.partition("_")[0]
+        for path in skeleton.GetJointsAttr().Get():
+            assert all(part.startswith(f"{side}_") for part in path.split("/"))
+    for hand in posed_hands(motion):
+        kinds = {str(prim.GetName()) for prim in stage.GetPrimAtPath(f"/hands/{hand.side}").GetChildren()}
+        assert kinds == {f"{hand.side}_{kind}" for kind in ("hand", "skeleton", "motion")} | {"skin"}
 
 
 def test_without_usd_core_the_extra_is_named(motion, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tarfile
+from pathlib import Path
 
 import pytest
 from pycocotools.coco import COCO
@@ -50,11 +51,33 @@ def test_every_picture_is_there_once(tmp_path, make_frame, formats):
                     keys.append(name.partition(".")[0])
                     assert json.loads(opened.extractfile(name).read())["number"] == int(keys[-1])
     assert keys == [f"{number:06d}" for number in range(8)]
-    for kind, ending in (("png", ".png"), ("exr", ".exr")):
+    for kind, ending in (("png/images", ".png"), ("exr", ".exr")):
         for number in range(8):
             start = tmp_path / "c" / kind / f"shard-{number // 2:05d}" / f"small_{number:06d}"
             assert start.with_suffix(ending).is_file()
-            assert json.loads(start.with_suffix(".json").read_text())["number"] == number
+            record = json.loads(start.with_suffix(".json").read_text())
+            assert record["number"] == number
+            if ending == ".png":
+                copied, first = tmp_path / "c" / "png", tmp_path / ("a" if number < 4 else "b") / "png"
+                old = first / "ids" / f"shard-{number % 4 // 2:05d}" / f"small_{number % 4:06d}.png"
+                assert (copied / record["ids_file"]).read_bytes() == old.read_bytes()
+                assert record["ids_file"] == f"ids/shard-{number // 2:05d}/{start.name}.png"
+
+
+def test_labels_and_other_pictures_are_copied_with_their_photographs(tmp_path, make_frame):
+    folders = [rendering(tmp_path / name, make_frame, ("yolo",)) for name in "ab"]
+    merge_renderings(folders, tmp_path / "c")
+    images = json.loads((tmp_path / "c" / "annotations.json").read_text())["images"]
+    assert len(images) == 8 and (tmp_path / "c" / "data.yaml").is_file()
+    for image in images:
+        frame = image["frame"]
+        first = tmp_path / ("a" if frame < 4 else "b")
+        old = f"shard-{frame % 4 // 2:05d}/small_{frame % 4:06d}"
+        new = Path(image["file_name"]).with_suffix("")
+        assert image["depth_file"] == f"depth/{new}.png"
+        for kind, ending in (("labels", ".txt"), ("depth", ".png"), ("normals", ".png"), ("images", ".jpg")):
+            copied = (tmp_path / "c" / kind / f"{new}{ending}").read_bytes()
+            assert copied == (first / kind / f"{old}{ending}").read_bytes()
 
 
 def test_merged_renderings_can_be_merged(tmp_path, make_frame):
@@ -92,6 +115,6 @@ def test_mistakes_are_told(tmp_path, make_frame):
         merge_renderings([coco, tmp_path], out)
     assert not out.exists()
     other = rendering(tmp_path / "e", make_frame, ("png",))
-    next((png / "shard-00001").glob("*.png")).parent.joinpath("index.json").write_text("[{}]")
+    next((png / "images" / "shard-00001").glob("*.png")).parent.joinpath("index.json").write_text("[{}]")
     with pytest.raises(DatasetError, match="its index does not fit its files"):
         merge_renderings([other, png], out)

@@ -16,9 +16,10 @@ from handsim.errors import DatasetError, HandSimError
 from handsim.hand.model import HandModel
 from handsim.space.camera import look_at
 from render.formats.exr import read_exr
+from render.formats.folder_writers import BESIDE
 from render.formats.png_depth import decode_depth, read_depth
 from render.formats.writer import FORMATS, FrameWriter, open_writer
-from render.frames import RenderedFrame
+from render.frames import Pictures, RenderedFrame
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -72,7 +73,11 @@ def test_a_shard_may_be_written_anew(name: str, make_frame, tmp_path: Path) -> N
 def test_what_killed_writers_left_is_cleared(name: str, make_frame, tmp_path: Path) -> None:
     writer = open_writer(name, tmp_path)
     writer.write(0, [make_frame()])
-    (place,) = (path.parent for path in tmp_path.rglob("shard-00000*"))
+    (place,) = (
+        path.parent
+        for path in tmp_path.rglob("shard-00000*")
+        if path.relative_to(tmp_path).parts[0] not in BESIDE
+    )
     (place / ".shard-00000.tmp-1").mkdir()
     (place / ".shard-00000.tmp-1" / "rest.jpg").write_bytes(b"")
     (place / ".shard-00000.tmp-2.tar").write_bytes(b"")
@@ -87,7 +92,8 @@ def test_a_place_that_takes_no_files_is_told(name: str, make_frame, tmp_path: Pa
     (tmp_path / "file").write_text("")
     writer = open_writer(name, tmp_path / "file" / "set")
     with pytest.raises(
-        HandSimError, match="writing shard 0 failed: Not a directory; shards that were"
+        HandSimError,
+        match=r"writing shard 0 failed: (Not a directory|.*is a file, not a folder); shards that were",
     ) as told:
         writer.write(0, [make_frame()])
     assert "\n" not in str(told.value)
@@ -118,11 +124,11 @@ def test_a_full_disk_is_told_and_finished_shards_stay(
 
 
 def test_an_unknown_format_is_told(tmp_path: Path) -> None:
-    with pytest.raises(HandSimError, match=r"unknown format 'web'.*valid names: webdataset, coco, freihand"):
+    with pytest.raises(HandSimError, match=r"unknown format 'web'.*valid names: webdataset, coco, yolo"):
         open_writer("web", tmp_path)
 
 
-@pytest.mark.parametrize("name", ["coco", "freihand", "interhand"])
+@pytest.mark.parametrize("name", ["coco", "yolo", "freihand", "interhand"])
 @pytest.mark.parametrize("content", ["[{", "{}", "[1]"])
 def test_a_damaged_index_is_told(name: str, content: str, make_frame, tmp_path: Path) -> None:
     writer = open_writer(name, tmp_path)
@@ -136,21 +142,61 @@ def test_a_damaged_index_is_told(name: str, content: str, make_frame, tmp_path: 
         writer.finish()
 
 
-@pytest.mark.parametrize("name", ["png", "exr", "coco", "interhand"])
+@pytest.mark.parametrize("name", ["png", "exr", "coco", "yolo", "interhand"])
 def test_two_frames_of_one_name_are_told(name: str, make_frame, tmp_path: Path) -> None:
     with pytest.raises(HandSimError, match="two frames of a shard are called 'small_000001'"):
         open_writer(name, tmp_path).write(0, [make_frame(1), make_frame(1)])
 
 
+@pytest.mark.parametrize("name", ["png", "coco", "yolo", "interhand"])
+def test_only_photographs_lie_among_the_photographs(name: str, make_frame, tmp_path: Path) -> None:
+    """What trains on all pictures of a folder, as ultralytics does, must find no depth or ids there."""
+    writer = open_writer(name, tmp_path)
+    writer.write(0, [make_frame(number, noisy=True) for number in range(3)])
+    writer.finish()
+    pictures = [path for path in (tmp_path / "images").rglob("*") if path.suffix in (".png", ".jpg")]
+    assert sorted(path.stem for path in pictures) == [f"small_{number:06d}" for number in range(3)]
+    for picture in pictures:
+        assert cv2.imread(str(picture), cv2.IMREAD_UNCHANGED).dtype == np.uint8
+        for kind in ("depth", "depth_ideal", "ids", "normals"):
+            within = picture.relative_to(tmp_path / "images").with_suffix(".png")
+            assert (tmp_path / kind / within).is_file()
+
+
+@pytest.mark.parametrize("name", ["coco", "interhand"])
+def test_images_name_their_files_of_depth_and_ids(name: str, make_frame, tmp_path: Path) -> None:
+    frame = make_frame(2)
+    writer = open_writer(name, tmp_path)
+    writer.write(0, [frame])
+    writer.finish()
+    (file,) = (*tmp_path.glob("annotations.json"), *tmp_path.rglob("*_data.json"))
+    (image,) = json.loads(file.read_text())["images"]
+    np.testing.assert_allclose(read_depth(tmp_path / image["depth_file"]), frame.ideal.depth, atol=1e-4)
+    ids = cv2.imread(str(tmp_path / image["ids_file"]))
+    np.testing.assert_array_equal(ids[..., 1], frame.ideal.instances)
+    assert (tmp_path / image["normals_file"]).is_file() and "depth_ideal_file" not in image
+
+
+def test_a_shard_without_depth_replaces_one_with_depth(make_frame, tmp_path: Path) -> None:
+    frame, writer = make_frame(0), open_writer("coco", tmp_path)
+    writer.write(0, [frame])
+    writer.write(0, [dataclasses.replace(frame, ideal=Pictures(rgb=frame.ideal.rgb))])
+    assert [path.name for path in tmp_path.rglob("*.png")] == []
+
+
 def test_png_and_exr_hold_the_pictures(make_frame, tmp_path: Path) -> None:
     frame = make_frame(7, ("right", "left"), noisy=True)
-    for name in ("png", "exr"):
+    for name, inside in (("png", "images"), ("exr", ".")):
         open_writer(name, tmp_path / name).write(0, [frame])
-        record = json.loads((tmp_path / name / "shard-00000" / "small_000007.json").read_text())
+        record = json.loads((tmp_path / name / inside / "shard-00000" / "small_000007.json").read_text())
         assert [hand["side"] for hand in record["hands"]] == ["right", "left"]
-    start = str(tmp_path / "png" / "shard-00000" / "small_000007")
-    np.testing.assert_array_equal(cv2.imread(f"{start}.png")[..., ::-1], frame.noisy.rgb)
-    np.testing.assert_allclose(read_depth(f"{start}.depth.png"), frame.noisy.depth, atol=1e-4)
+        if name == "png":
+            depth = read_depth(tmp_path / "png" / record["depth_file"])
+            np.testing.assert_allclose(depth, frame.noisy.depth, atol=1e-4)
+            ideal = read_depth(tmp_path / "png" / record["depth_ideal_file"])
+            np.testing.assert_allclose(ideal, frame.ideal.depth, atol=1e-4)
+    picture = cv2.imread(str(tmp_path / "png" / "images" / "shard-00000" / "small_000007.png"))
+    np.testing.assert_array_equal(picture[..., ::-1], frame.noisy.rgb)
     back = read_exr(tmp_path / "exr" / "shard-00000" / "small_000007.exr")
     np.testing.assert_array_equal(back.ideal.depth, frame.ideal.depth)
 

@@ -10,6 +10,7 @@ import pytest
 
 from handsim.errors import HandSimError
 from render.scenery.backgrounds import KINDS, Background, BackgroundConfig, draw_background, sample_background
+from render.scenery.photographs import photos_beside
 
 SIZE = (160, 120)
 NOTHING = {"plain": 0.0, "gradient": 0.0, "noise": 0.0, "clutter": 0.0, "room": 0.0}
@@ -79,6 +80,22 @@ def test_photographs_fill_the_picture_and_broken_files_are_passed_over(photos: P
         assert picture[..., 2 if blue else 0].min() > 0.4
         assert picture[..., 0 if blue else 2].max() < 0.05
     assert seen == {"blue.png", "red.jpg"}
+
+
+def test_photographs_are_cut_and_neither_repeated_nor_mirrored(tmp_path: Path) -> None:
+    wide = np.repeat(np.linspace(20, 230, 400, dtype=np.uint8)[None], 100, axis=0)
+    cv2.imwrite(str(tmp_path / "ramp.png"), np.dstack([wide] * 3))
+    background = Background("photo", ((0.1, 0.1, 0.1),) * 2, 0, photo=str(tmp_path / "ramp.png"))
+    for seed in range(4):
+        picture = draw_background(dataclasses.replace(background, seed=seed), (64, 96))
+        assert (np.diff(picture[..., 0], axis=1) >= 0.0).all() and np.ptp(picture[0, :, 0]) > 0.0
+    several = tmp_path / "several"
+    several.mkdir()
+    for number in range(7):
+        cv2.imwrite(str(several / f"{number}.png"), np.full((40, 60, 3), 30 * number, np.uint8))
+    (several / "0broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photograph at all")
+    walls = photos_beside(several / "5.png", 6)
+    assert walls[0] == several / "5.png" and len(set(walls)) == 6 and several / "0broken.jpg" not in walls
 
 
 def test_folders_without_photographs_are_told(photos: Path, tmp_path: Path) -> None:

@@ -104,7 +104,8 @@ def test_takes_of_several_cameras_have_one_background(view: ViewConfig) -> None:
     assert cameras == (6 if view.placement == "rig" else 2) == len({frame.camera.name for frame in frames})
     for group in (frames[:cameras], frames[cameras:]):
         assert len({str(frame.choices["enclosure"]) for frame in group}) == 1
-        check_pair(group[0], group[1])
+        if view.placement != "rig":  # whose long lenses see other walls
+            check_pair(group[0], group[1])
     assert frames[0].choices["enclosure"] != frames[-1].choices["enclosure"]
 
 

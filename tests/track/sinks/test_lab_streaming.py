@@ -27,8 +27,9 @@ def test_a_lost_hand_is_nan(message):
     labels = [channel.label for channel in channels_of(one.header)]
     sample = sample_of(one)
     assert sample[labels.index("left_status")] == 3.0
-    left = [label.startswith(("left_", "mug_")) and not label.endswith("status") for label in labels]
-    assert np.isnan(sample[left]).all() and np.isfinite(sample[~np.array(left)]).all()
+    left = [label.startswith(("left_", "mug_", "lag")) and not label.endswith("status") for label in labels]
+    assert np.isnan(sample[left]).all(), "and it did not come live"
+    assert np.isfinite(sample[~np.array(left)]).all()
 
 
 def test_an_inlet_gets_samples_and_the_description(message, tmp_path):

@@ -11,8 +11,9 @@ import pytest
 
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-from tests.waiting import LONG
-from track.streams.frame_source import LiveStream, SourceStream, StreamedFrame, capture_frames
+from tests.waiting import LONG, wait_for
+from track.streams.frame_source import StreamedFrame, capture_frames
+from track.streams.live_stream import LiveStream, SourceStream
 
 
 def frame(number: int, points: object = None, **changes: object) -> StreamedFrame:
@@ -41,31 +42,38 @@ class Listed:
         self.closed.set()
 
 
+def live(source: Listed, **options: object) -> LiveStream:
+    return LiveStream(SourceStream(source, "mine"), **options)  # type: ignore[arg-type]
+
+
 def test_all_frames_arrive_and_the_end_ends_the_stream():
     sent = [frame(number) for number in range(1000)]  # more than wait at once
-    stream = SourceStream(Listed(*sent), "mine")
+    stream = live(Listed(*sent))
     time.sleep(0.05)
     assert [one.number for one in stream] == list(range(1000))
-    assert stream.counts == {"missing_frames": 0}
+    counts = stream.counts
+    assert counts.pop("received_frames") == counts.pop("frames_in_order") == 1000
+    assert set(counts.values()) == {0}
 
 
 def test_numbers_that_are_left_out_are_counted():
-    stream = SourceStream(Listed(frame(1), frame(5), frame(2), frame(3), frame(9, restarted=True)), "mine")
-    assert len(list(stream)) == 5 and stream.counts == {"missing_frames": 3}
+    stream = live(Listed(frame(1), frame(5), frame(2, restarted=True), frame(3), frame(9, restarted=True)))
+    assert len(list(stream)) == 5 and stream.counts["missing_frames"] == 3
 
 
 def test_points_that_are_missing_are_left_out():
-    (one,) = SourceStream(Listed(frame(0, [[np.nan] * 3, [1, 2, 3]], ids=[3, 7])), "mine")
+    (one,) = live(Listed(frame(0, [[np.nan] * 3, [1, 2, 3]], ids=[3, 7])))
     assert one.points.tolist() == [[1.0, 2.0, 3.0]] and one.ids.tolist() == [7]
 
 
 def test_a_silence_is_told_with_the_last_number():
     source = Listed(frame(3), waits=True)
-    stream = SourceStream(source, "mine", silence=0.05)
+    stream = live(source, silence=0.05)
     assert source.waiting.wait(LONG)
     first, second, third = itertools.islice(stream, 3)
     assert not first.silent and second.silent and third.silent
-    assert (second.number, second.time, second.points.shape) == (3, 0.03, (0, 3))
+    assert second.number == 3 and second.points.shape == (0, 3)
+    assert 0.03 < second.time < third.time
     stream.close()
     assert list(stream) == []
 
@@ -73,7 +81,7 @@ def test_a_silence_is_told_with_the_last_number():
 def test_it_ends_when_it_is_to_end_after_what_has_come():
     over = threading.Event()
     source = Listed(*map(frame, range(5)), waits=True)
-    stream = SourceStream(source, "mine", ended=over.is_set)
+    stream = live(source, ended=over.is_set)
     assert source.waiting.wait(LONG)
     over.set()
     assert [one.number for one in stream] == [0, 1, 2, 3, 4]
@@ -94,7 +102,7 @@ def test_it_ends_when_it_is_to_end_after_what_has_come():
     ],
 )
 def test_what_is_wrong_ends_the_stream_and_is_told(wrong, words):
-    stream = SourceStream(Listed(frame(0), wrong, frame(2)), "mine")
+    stream = live(Listed(frame(0), wrong, frame(2)))
     assert next(stream).number == 0
     with pytest.raises(CaptureError, match=rf"^mine: the stream failed \(.*{words}"):
         next(stream)
@@ -112,7 +120,7 @@ def test_a_close_that_fails_is_told_and_loses_nothing():
             super().close()
             raise OSError("stuck")
 
-    stream = SourceStream(Stuck(frame(0)), "mine")
+    stream = live(Stuck(frame(0)))
     assert next(stream).number == 0
     with pytest.warns(HandSimWarning, match=r"mine: close failed \(OSError: stuck\)"):
         stream.close()
@@ -128,20 +136,72 @@ def test_a_column_is_an_id_until_its_point_is_lost():
 
 
 class Arriving:
-    """Frames as they arrive, of which nothing is counted."""
+    """Frames that have arrived at given times, of which nothing else is counted."""
 
-    def __init__(self, times: list[float]) -> None:
+    def __init__(self, frames: list[StreamedFrame]) -> None:
         self.counts: dict[str, int] = {}
-        self.frames = iter([frame(number, time=time) for number, time in enumerate(times)])
+        self.frames = iter(frames)
 
     def __next__(self) -> StreamedFrame:
         return next(self.frames)
 
-    def close(self) -> None:
+    def end(self) -> None:
         self.frames = iter(())
+
+    def close(self) -> None:
+        self.end()
 
 
 def test_time_goes_on_when_a_recording_begins_anew():
-    with LiveStream(Arriving([5.0, 5.1, 5.2, 0.1, 0.2, 0.1])) as stream:
+    told = [*(5.0 + 0.1 * n for n in range(10)), *(0.1 + 0.1 * n for n in range(6))]
+    arriving = [frame(n, time=time, arrived=0.1 * n) for n, time in enumerate(told)]
+    with LiveStream(Arriving(arriving)) as stream:
         times = [one.time for one in stream]
-    np.testing.assert_allclose(times, [5.0, 5.1, 5.2, 5.21, 5.31, 5.32], atol=0.005)
+        assert stream.counts["restarts"] == 1
+    np.testing.assert_allclose(times, 5.0 + 0.1 * np.arange(16), atol=0.005)
+
+
+def test_points_out_of_range_are_left_out_and_counted():
+    points = np.array([[0.1, 0.2, 0.3], [1200.0, 0.0, 0.0]])
+    with live(Listed(*[frame(n, points) for n in range(10)])) as stream:
+        assert [len(one.points) for one in stream] == [1] * 10
+        assert stream.counts["points_out_of_range"] == 10 and stream.points == 20
+
+
+class Slow(Arriving):
+    """A live stream of which all frames but the last have waited for long when they are first asked for."""
+
+    def __init__(self, count: int) -> None:
+        now = time.monotonic()
+        super().__init__([frame(n, arrived=now - 60.0 + n / 100) for n in range(count)])
+        self.over = threading.Event()
+
+    def __next__(self) -> StreamedFrame:
+        try:
+            return next(self.frames)
+        except StopIteration:
+            self.over.wait()
+            raise
+
+    def end(self) -> None:
+        self.over.set()
+
+
+def test_what_is_not_kept_up_with_is_dropped_oldest_first_and_counted():
+    with LiveStream(Slow(500)) as stream:
+        wait_for(lambda: len(stream._arrived) == 500)
+        assert next(stream).number == 499
+        counts = stream.counts
+        assert (counts["received_frames"], counts["dropped_frames"], counts["missing_frames"]) == (
+            500,
+            499,
+            0,
+        )
+
+
+def test_a_lag_may_be_forgiven():
+    with LiveStream(Slow(500)) as stream:
+        wait_for(lambda: len(stream._arrived) == 500)
+        stream.forgive()
+        assert [next(stream).number for _ in range(3)] == [0, 1, 2]
+        assert stream.counts["dropped_frames"] == 0

@@ -19,6 +19,7 @@ from tests.waiting import LONG, wait_for
 from track.bodies.rigid_body import BodyTracker, RigidTemplate
 from track.streams import natnet, natnet_server
 from track.streams import point_stream as streaming
+from track.streams.live_stream import LiveStream
 from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import ReplayServer
 from track.streams.point_stream import open_stream
@@ -32,6 +33,11 @@ LOOPBACK = "127.0.0.1"
 def patient(monkeypatch):
     """A server is waited for, however busy the machine is."""
     monkeypatch.setattr(streaming, "_PATIENCE", LONG)
+
+
+def opened(url: str, **options: object) -> LiveStream:
+    """A server's frames in order."""
+    return LiveStream(open_stream(url), **options)  # type: ignore[arg-type]
 
 
 @functools.cache
@@ -88,10 +94,11 @@ def frame(number: int, version: tuple[int, int]) -> bytes:
 @pytest.mark.parametrize("version", [(3, 0), (4, 0), (4, 1)])
 def test_a_take_arrives_whole(version):
     take = twin()
-    with ReplayServer(take, version=version) as server, open_stream(server.url) as stream:
-        assert stream.server.version == version and stream.server.application == "handsim replay"
+    with ReplayServer(take, version=version) as server, opened(server.url) as stream:
+        info = stream._frames.server
+        assert info.version == version and info.application == "handsim replay"
         got = list(itertools.islice(stream, take.num_frames))
-        assert (stream.damaged, stream.late) == (0, 0)
+        assert (stream.counts["damaged_packets"], stream.counts["late_frames"]) == (0, 0)
     for number, one in enumerate(got):
         there = np.isfinite(take.points[number, :, 0])
         assert (one.number, one.silent) == (number, False)
@@ -103,7 +110,7 @@ def test_a_take_arrives_whole(version):
 def test_frames_are_played_at_their_rate(monkeypatch):
     take, now = twin(), [50.0]
     monkeypatch.setattr(natnet_server, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    with ReplayServer(take) as server, open_stream(server.url, silence=LONG) as stream:
+    with ReplayServer(take) as server, opened(server.url, silence=LONG) as stream:
         assert next(stream).number == 0
         for last in (1, 10, 11, 40):
             now[0] = 50.0 + (last + 0.5) / take.rate
@@ -116,7 +123,7 @@ def test_frames_are_played_at_their_rate(monkeypatch):
 def test_a_body_is_tracked_live():
     take = twin()
     tracker = BodyTracker(RigidTemplate.of(named_object("controller")))
-    with ReplayServer(take) as server, open_stream(server.url) as stream:
+    with ReplayServer(take) as server, opened(server.url) as stream:
         words = [
             tracker.step(one.points, one.ids, one.time).status
             for one in itertools.islice(stream, take.num_frames)
@@ -129,7 +136,7 @@ def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
     positions[1, 0] = np.nan
     with (
         ReplayServer(Capture(("a", "b"), positions, 100.0)) as server,
-        open_stream(server.url) as stream,
+        opened(server.url) as stream,
     ):
         ids = [list(one.ids) for one in itertools.islice(stream, 4)]
     assert ids == [[0, 1], [1], [2, 1], [2, 1]]
@@ -138,17 +145,17 @@ def test_ids_of_a_replayed_capture_last_until_a_marker_is_lost():
 def test_a_stream_that_stops_says_so():
     take = twin()
     server = ReplayServer(SimpleNamespace(points=take.points[:3], ids=take.ids[:3], rate=take.rate))
-    with server, open_stream(server.url, silence=0.2) as stream:
+    with server, opened(server.url, silence=0.2) as stream:
         wait_for(lambda: server.finished)
         got = list(itertools.islice(stream, 5))
     assert [one.silent for one in got] == [False] * 3 + [True] * 2
-    assert (got[3].number, got[3].time) == (2, got[2].time)
+    assert got[3].number == 2 and got[2].time < got[3].time < got[4].time
     assert got[3].points.shape == (0, 3) and got[3].ids.shape == (0,)
 
 
 def test_bad_packets_are_counted_and_left_out():
     rng = np.random.default_rng(0)
-    with Puppet(unicast((4, 0))) as server, open_stream(server.url, silence=LONG) as stream:
+    with Puppet(unicast((4, 0))) as server, opened(server.url, silence=LONG) as stream:
         for number in range(20):
             packet = frame(number, (4, 0))
             for bad in (
@@ -162,11 +169,11 @@ def test_bad_packets_are_counted_and_left_out():
             server.say(packet)
         got = list(itertools.islice(stream, 20))
     assert [one.number for one in got] == list(range(20))
-    assert stream.damaged >= 60
+    assert stream.counts["damaged_packets"] >= 60
 
 
 def test_only_bad_packets_are_silence():
-    with Puppet(unicast((4, 0))) as server, open_stream(server.url, silence=0.3) as stream:
+    with Puppet(unicast((4, 0))) as server, opened(server.url, silence=0.3) as stream:
         ended = threading.Event()
 
         def babble() -> None:
@@ -175,32 +182,32 @@ def test_only_bad_packets_are_silence():
 
         thread = threading.Thread(target=babble)
         thread.start()
-        while stream.damaged <= 10:
+        while stream.counts["damaged_packets"] <= 10:
             assert next(stream).silent
         ended.set()
         thread.join()
 
 
 def test_frames_out_of_order_are_left_out_but_a_take_may_start_again():
-    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=LONG) as stream:
-        for number in (500, 501, 501, 500, 502, 0, 1):
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
+        for number in (500, 501, 501, 500, 502, 503, 504, 0, 1, 2, 3, 4):
             server.say(frame(number, (4, 1)))
-        got = list(itertools.islice(stream, 5))
-    assert [one.number for one in got] == [500, 501, 502, 0, 1]
-    assert stream.late == 2
+        got = list(itertools.islice(stream, 10))
+    assert [one.number for one in got] == [500, 501, 502, 503, 504, 0, 1, 2, 3, 4]
+    assert stream.counts["doubled_frames"] == 2
 
 
 @pytest.mark.parametrize(("said", "spoken"), [((4, 1), (3, 1)), ((3, 1), (4, 1)), ((4, 7), (4, 1))])
 def test_a_server_that_speaks_another_layout_than_it_says_is_understood(said, spoken):
-    with Puppet(unicast(said)) as server, open_stream(server.url, silence=LONG) as stream:
+    with Puppet(unicast(said)) as server, opened(server.url, silence=LONG) as stream:
         for number in range(3):
             server.say(frame(number, spoken))
         assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
-        assert stream.damaged == 0
+        assert stream.counts["damaged_packets"] == 0
 
 
 def test_packets_of_others_are_not_heard():
-    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=LONG) as stream:
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             try:
                 stranger.bind(("127.0.0.2", 0))
@@ -213,9 +220,9 @@ def test_packets_of_others_are_not_heard():
 
 def test_the_client_listens_on_loopback_only_and_takes_leave():
     with Puppet(unicast((4, 1)), deaf=1) as server:
-        with open_stream(server.url) as stream:
+        with opened(server.url) as stream:
             assert server.client[0] == LOOPBACK
-            assert stream._sockets[0].getsockname()[0] == LOOPBACK
+            assert stream._frames._sockets[0].getsockname()[0] == LOOPBACK
         assert list(stream) == []
         wait_for(lambda: server.heard[-1] == Kind.DISCONNECT)
         calls = server.heard[:-1]
@@ -223,26 +230,25 @@ def test_the_client_listens_on_loopback_only_and_takes_leave():
 
 
 def test_a_quiet_server_is_greeted_anew(monkeypatch):
-    now, step = [50.0], [0.0]
-
-    def not_ended() -> bool:  # asked each time before the stream waits
-        now[0] += step[0]
-        return False
-
+    now = [50.0]
     monkeypatch.setattr(streaming, "_KEEP_ALIVE", 0.1)
     monkeypatch.setattr(streaming, "time", SimpleNamespace(monotonic=lambda: now[0]))
     with Puppet(unicast((4, 1))) as server:
-        with open_stream(server.url, silence=0.35, ended=not_ended) as stream:
-            step[0] = 0.06
-            assert next(stream).silent
-            wait_for(lambda: server.heard == [Kind.CONNECT, *[Kind.KEEP_ALIVE, Kind.CONNECT] * 3])
-            server.heard.clear()
-            step[0] = 0.0
-            server.say(frame(0, (4, 1)))  # it goes on when another follows it
-            for number in range(10):
-                server.say(frame(number + 1, (4, 1)))
-                assert next(stream).number == number
-                now[0] += 0.03
+        stream = open_stream(server.url)
+        for heard in (2, 4, 6):
+            now[0] += 0.11
+            server.say(natnet.pack(Kind.KEEP_ALIVE))  # good, but no frame
+            server.say(frame(heard, (4, 1)))
+            stream._heard = 0.0  # long ago
+            assert next(stream).number == heard
+            wait_for(lambda heard=heard: len(server.heard) == 1 + heard)
+        assert server.heard == [Kind.CONNECT, *[Kind.KEEP_ALIVE, Kind.CONNECT] * 3]
+        server.heard.clear()
+        for number in range(10):
+            server.say(frame(10 + number, (4, 1)))
+            assert next(stream).number == 10 + number
+            now[0] += 0.03
+        stream.close()
         wait_for(lambda: server.heard[-1:] == [Kind.DISCONNECT])
     assert set(server.heard[:-1]) == {Kind.KEEP_ALIVE}
 
@@ -255,7 +261,7 @@ def test_multicast_is_heard_on_loopback():
         port = sender.getsockname()[1]  # servers send from their data port
         with Puppet(ServerInfo("puppet", (4, 1), port, group)) as server:
             try:
-                stream = open_stream(server.url, silence=LONG)
+                stream = opened(server.url, silence=LONG)
                 sender.sendto(frame(0, (4, 1)), (group, port))
             except (CaptureError, OSError):
                 pytest.skip("no multicast on this machine's loopback")
@@ -282,22 +288,22 @@ def test_servers_that_cannot_be_used_are_told(monkeypatch):
             Puppet() as server,
             pytest.raises(CaptureError, match="no NatNet server answers; in Motive"),
         ):
-            open_stream(server.url)
+            opened(server.url)
         with (
             Puppet(b"", b"nonsense", natnet.pack(Kind.SERVER_INFO)) as server,
             pytest.raises(CaptureError, match="no Nat"),
         ):
-            open_stream(server.url)
+            opened(server.url)
     with (
         Puppet(unicast((2, 10))) as server,
         pytest.raises(CaptureError, match=r"speaks NatNet 2\.10, expected 3\.0"),
     ):
-        open_stream(server.url)
+        opened(server.url)
     with (
         Puppet(ServerInfo("x", (4, 1), 1511, "10.0.0.1")) as server,
         pytest.raises(CaptureError, match=r"10\.0\.0\.1"),
     ):
-        open_stream(server.url)
+        opened(server.url)
     with pytest.raises(CaptureError, match="cannot be reached"):
         open_stream("natnet://no-such-host.invalid")
     with pytest.raises(CaptureError, match="cannot be reached"):
@@ -324,7 +330,7 @@ def test_what_cannot_be_replayed_is_told():
 
 
 def test_only_the_server_s_ports_are_heard():
-    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=LONG) as stream:
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.bind((LOOPBACK, 0))
             for number in range(5):
@@ -332,26 +338,28 @@ def test_only_the_server_s_ports_are_heard():
         for number in range(3):
             server.say(frame(number, (4, 1)))
         assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
-        assert stream.foreign == 5
+        assert stream.counts["foreign_packets"] == 5
 
 
 def test_the_port_for_data_is_the_server_s_too():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as data:
         data.bind((LOOPBACK, 0))
         info = ServerInfo("puppet", (4, 1), data.getsockname()[1], None)
-        with Puppet(info) as server, open_stream(server.url, silence=LONG) as stream:
+        with Puppet(info) as server, opened(server.url, silence=LONG) as stream:
             for number in range(3):
                 data.sendto(frame(number, (4, 1)), server.client)
             assert [one.number for one in itertools.islice(stream, 3)] == [0, 1, 2]
 
 
 def test_one_wild_time_does_not_end_a_stream():
-    with Puppet(unicast((4, 1))) as server, open_stream(server.url, silence=LONG) as stream:
+    with Puppet(unicast((4, 1))) as server, opened(server.url, silence=LONG) as stream:
         for number in range(20):
             for wild in (1e9, 1e17, -5e3) if number % 5 == 2 else ():
                 server.say(natnet.pack_frame(MarkerFrame(number, wild, np.zeros((1, 3)), np.ones(1)), (4, 1)))
             server.say(frame(number, (4, 1)))
         got = list(itertools.islice(stream, 20))
+        stream.end()
+        assert not [one.number for one in stream]
         assert [one.number for one in got] == list(range(20))
         assert (stream.order.wild, stream.order.restarts, stream.order.missed) == (12, 0, 0)
 
@@ -360,7 +368,7 @@ def test_a_stream_ends_when_it_is_told_to():
     ended = threading.Event()
     with (
         Puppet(unicast((4, 1))) as server,
-        open_stream(server.url, ended=ended.is_set, silence=1.0) as stream,
+        opened(server.url, ended=ended.is_set, silence=1.0) as stream,
     ):
         for number in (0, 1, 3):  # the last one is held, because one is missing before it
             server.say(frame(number, (4, 1)))

@@ -11,7 +11,6 @@ import pytest
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.layout import starter_layout
-from gloves.takes.take import COASTING, LOST
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CaptureError, HandSimError
 from handsim.hand.model import HandModel
@@ -21,8 +20,7 @@ from track.user import User
 from track.viewer.contents import ACCEPTED, open_content
 from track.viewer.recordings.captures import CaptureRecording
 from track.viewer.recordings.datasets import DatasetRecording
-from track.viewer.recordings.recording import runs_of
-from track.viewer.recordings.takes import TakeRecording, doubts_of, frame_confidence
+from track.viewer.recordings.takes import TakeRecording
 from track.viewer.scene.rig_view import box_edges, camera_counts
 from train.data.shards import Dataset
 
@@ -138,26 +136,6 @@ def test_a_rig_of_a_take_is_shown_if_it_is_shipped_or_in_the_take(simulated):
     assert TakeRecording(own).rig == mixed_rig()
     for name in ("/etc/passwd", 3, None):
         assert TakeRecording(dataclasses.replace(simulated, settings={"rig": name})).rig is None
-
-
-def test_doubtful_frames_are_the_worst_of_their_runs(tracked):
-    assert runs_of(np.array([True, False, False, True, True])) == [(0, 0), (3, 4)]
-    assert runs_of(np.zeros(3, dtype=bool)) == [] == runs_of(np.zeros(0, dtype=bool))
-    status, confidence = tracked.status.copy(), tracked.confidence.copy()
-    confidence[4:7, 2], confidence[5, 7] = 0.8, 0.7
-    status[12:14, 1], status[0, 1] = COASTING, LOST
-    qpos = np.where((status == LOST)[..., None], np.nan, tracked.qpos)
-    take = dataclasses.replace(tracked, status=status, confidence=confidence, qpos=qpos)
-    assert [doubt[:3] for doubt in doubts_of(take)] == [
-        (25, 29, 25), (12, 13, 12), (10, 10, 10), (20, 20, 20), (4, 6, 5)
-    ], "the longest loss first; not there yet is not lost"  # fmt: skip
-    assert [doubt.words for doubt in doubts_of(take)][1::3] == [
-        "left coasting",
-        f"{tracked.label_names[7]} 70 %",
-    ]
-    certain = frame_confidence(tracked)
-    assert certain[10] == certain[25] == 0.0 and certain[20] == 0.4
-    assert (np.delete(certain, [10, 20, 25]) == 0.99).all(), "lost for long is no news"
 
 
 def test_places_are_counted_by_the_cameras_that_see_them():

@@ -10,7 +10,8 @@ import pytest
 from gloves.layout import load_layout
 from train.any_layout import learned_gloves
 from train.any_layout.fine_tuning import fine_tuned_labeler
-from train.any_layout.learned_gloves import cache_folder, is_learned, learned_labeler
+from train.any_layout.learned_gloves import is_learned, learned_labeler
+from train.labelers.storage import learned_folder
 
 CLOUD = np.random.default_rng(0).normal(0, 0.05, (8, 3))
 
@@ -43,7 +44,7 @@ def test_a_glove_is_learned_once(monkeypatch):
 def test_a_damaged_file_is_learned_anew():
     layout = load_layout("starter6")
     learned_labeler(layout)
-    (file,) = cache_folder().iterdir()
+    (file,) = learned_folder().iterdir()
     file.write_bytes(b"nothing")
     assert learned_labeler(layout).label_frames([CLOUD])[0].labels.shape == (8,)
     assert len(file.read_bytes()) > 1000

@@ -25,7 +25,7 @@ PROGRAM = """
 import os, sys, time
 sys.path.insert(0, ROOT)
 from train.devices.local_processes import in_local_processes
-def job(*, progress):
+def job(*, progress, told):
     os.write(1, f"{os.getpid()}\\n".encode())
     try:
         while True:
@@ -39,10 +39,11 @@ if __name__ == "__main__":
 """
 
 
-def sums(*, progress):
+def sums(*, progress, told):
     fabric = start_fabric(TrainConfig(), Path("unused"))
     total = float(fabric.all_reduce(torch.tensor(fabric.global_rank + 1.0), reduce_op="sum"))
     progress(1, 2, total)
+    told(f"step of {total:.0f}")
     return fabric.world_size, total, listening()
 
 
@@ -57,7 +58,7 @@ def listening():
     return {line[1].split(":")[0] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in sockets}
 
 
-def fails(*, progress):
+def fails(*, progress, told):
     ranks = Agreement(start_fabric(TrainConfig(), Path("unused")))
     mine = world_of().rank
 
@@ -70,7 +71,7 @@ def fails(*, progress):
         ranks.agree(attempt)
 
 
-def dies(*, progress):
+def dies(*, progress, told):
     fabric = start_fabric(TrainConfig(), Path("unused"))
     if world_of().rank == 1:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -78,7 +79,7 @@ def dies(*, progress):
         fabric.all_reduce(torch.ones(3))
 
 
-def waits_for_a_signal(*, progress):
+def waits_for_a_signal(*, progress, told):
     ranks = Agreement(start_fabric(TrainConfig(), Path("unused")))
     with ranks.signals_noted():
         ranks.agree(lambda: None)
@@ -91,10 +92,10 @@ def waits_for_a_signal(*, progress):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_processes_work_together_over_the_loopback_and_the_first_ones_result_counts():
-    told = []
-    result = in_local_processes(sums, 2, progress=lambda *step: told.append(step))
+    told, steps = [], []
+    result = in_local_processes(sums, 2, progress=lambda *step: told.append(step), told=steps.append)
     assert result == (2, 3.0, {"0100007F"})
-    assert told == [(1, 2, 3.0)] * 2
+    assert told == [(1, 2, 3.0)] * 2 and steps == ["step of 3"] * 2
 
 
 @pytest.mark.parametrize(

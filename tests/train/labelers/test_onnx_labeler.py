@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import itertools
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +14,20 @@ import torch
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import read_capture, write_capture
+from gloves.fit import attach
 from gloves.layout import load_layout
 from handsim.cli.main import main
 from handsim.errors import HandSimError, WeightsError
+from handsim.hand.model import HandModel
+from poses import sample_poses
+from train import Corruption, corrupt
 from train.config import CNNConfig, SetLabelerConfig
 from train.glove_labeler import load_labeler
 from train.labelers.kinds import labeler_of, new_network
 from train.labelers.onnx_labeler import OnnxLabeler, export_onnx, sign_model
 from train.labelers.views import MeanHand
 
+PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "onnx.md"
 NO_TORCH = """
 import sys
 
@@ -59,6 +67,40 @@ def test_a_capture_is_labeled_without_torch(exported, tmp_path, rng):
     program = NO_TORCH + f"from handsim.cli.main import main\nraise SystemExit(main({arguments!r}))"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
     assert read_capture(tmp_path / "out.trc").names[:19] == names
+
+
+def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exported):
+    """docs/how_to/onnx.md, on simulated hands with drops and ghosts."""
+    program = PAGE.read_text("utf-8").split("```python\n")[1].split("```")[0]
+    nodes = list(ast.walk(ast.parse(program)))
+    imported = [
+        one.names[0].name if isinstance(one, ast.Import) else one.module
+        for one in nodes
+        if isinstance(one, ast.Import | ast.ImportFrom)
+    ]
+    assert {name.partition(".")[0] for name in imported} == {
+        "base64",
+        "io",
+        "json",
+        "numpy",
+        "onnxruntime",
+        "scipy",
+    }
+    assert all(one.end_lineno - one.lineno < 40 for one in nodes if isinstance(one, ast.FunctionDef))
+    page = {}
+    exec(program, page)
+    labeler, clouds, rng = page["open_labeler"](str(exported)), [], np.random.default_rng(8)
+    for size, side in itertools.product(("XS", "S", "M", "L", "XL"), ("right", "left")):
+        model = HandModel.named(size, side=side)
+        markers, _ = attach("dense19", model).markers(sample_poses(model, 40, rng=rng))
+        cloud = corrupt(markers, Corruption(occlude=5, ghosts=2), rng=rng)
+        clouds += [points[there] for points, there in zip(cloud.points, cloud.present, strict=True)]
+    expected = load_labeler("dense19").label_frames(clouds)
+    same = [
+        np.array_equal(page["label"](cloud, *labeler), one.labels)
+        for cloud, one in zip(clouds, expected, strict=True)
+    ]
+    assert len(same) == 400 and np.mean(same) >= 0.999
 
 
 def test_damaged_files_are_told(exported, tmp_path):

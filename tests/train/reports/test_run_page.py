@@ -50,6 +50,13 @@ def run(dataset, tmp_path_factory):
     return out, train_labeler(dataset, out, SMALL)
 
 
+def test_what_takes_long_beside_the_samples_is_named(dataset, tmp_path):
+    told = []
+    train_labeler(dataset, tmp_path / "run", dataclasses.replace(SMALL, samples=256), told=told.append)
+    assert told[0] == "training set"
+    assert told[-4:] == ["checkpoint", "pose prior", "held-out frames", "weights and report"]
+
+
 def test_the_page_says_what_the_card_says(run):
     out, card = run
     text = (out / PAGE).read_text("utf-8")

@@ -249,6 +249,16 @@ def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
         make_dataset(dataclasses.replace(config, rig="six"), tmp_path / "set", workers=1)
 
 
+def test_a_set_of_a_rig_that_a_release_changed_is_not_resumed(tmp_path):
+    make_dataset(CONFIG, tmp_path / "set", workers=1)
+    settings = json.loads((tmp_path / "set" / "config.json").read_text())
+    digest = settings.pop("rig_digest")
+    for older in ({}, {"rig_digest": digest[::-1]}):
+        (tmp_path / "set" / "config.json").write_text(json.dumps(settings | older))
+        with pytest.raises(DatasetError, match=r"other settings \(rig_digest: .* there, .* here\)"):
+            make_dataset(CONFIG, tmp_path / "set", workers=1)
+
+
 def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(DatasetError, match="is not empty and holds no training set"):

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from handsim.hand.model import HandModel
 from handsim.space.cameras import CameraRig
+from track.take_summary import Doubt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,17 +51,6 @@ class Curve(NamedTuple):
 
     name: str
     values: Float[np.ndarray, "T"]
-
-
-class Doubt(NamedTuple):
-    """Frames that deserve a look."""
-
-    first: int
-    last: int
-    """The last one, which belongs to them."""
-    worst: int
-    """The one to look at."""
-    words: str
 
 
 class Recording(ABC):
@@ -106,9 +96,3 @@ class Recording(ABC):
     @abstractmethod
     def frame(self, index: int) -> ShownFrame:
         """One of the frames."""
-
-
-def runs_of(flags: Bool[np.ndarray, "T"]) -> list[tuple[int, int]]:
-    """The first and the last frame of each unbroken stretch of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(first), int(end) - 1) for first, end in edges.reshape(-1, 2)]

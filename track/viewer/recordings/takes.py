@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
-from jaxtyping import Float
-from numpy.typing import NDArray
 
-from gloves.takes.take import COASTING, LOST, STATUSES, RigidBody, Take
+from gloves.takes.take import STATUSES, RigidBody, Take
 from handsim.space.cameras import CameraRig, as_rig, list_rigs
-from track.viewer.recordings.recording import Curve, Doubt, Recording, ShownBody, ShownFrame, runs_of
-
-_CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
-_MOST_DOUBTS: Final = 12  # rows
+from track.take_summary import doubts_of, frame_confidence
+from track.viewer.recordings.recording import Curve, Recording, ShownBody, ShownFrame
 
 
 class TakeRecording(Recording):
@@ -79,49 +73,12 @@ class TakeRecording(Recording):
         return [*lines, f"{there.sum()} points, {(take.labels[index, there] < 0).sum()} without label"]
 
 
-def doubts_of(take: Take) -> tuple[Doubt, ...]:
-    """Spans in which a hand is lost or coasts, the longest first, then unsure labels, the worst first.
-
-    A hand that has not been seen yet is not lost.
-    """
-    found: list[tuple[float, int, Doubt]] = []
-    for number, side in enumerate(take.sides):
-        status = take.status[:, number]
-        known = np.logical_or.accumulate(status != LOST)
-        for first, last in runs_of(known & ((status == LOST) | (status == COASTING))):
-            state = LOST if (status[first : last + 1] == LOST).any() else COASTING
-            found.append((0.0, last - first, Doubt(first, last, first, f"{side} {STATUSES[state]}")))
-    sure = np.where(take.labels >= 0, take.confidence, 1.0)
-    least = sure.min(axis=1, initial=1.0)
-    for first, last in runs_of(least < _CERTAIN):
-        worst = first + int(least[first : last + 1].argmin())
-        label = take.label_names[take.labels[worst, sure[worst].argmin()]]
-        words = f"{label} {100 * least[worst]:.0f} %"
-        found.append((float(least[worst]), last - first, Doubt(first, last, worst, words)))
-    found.sort(key=lambda entry: (entry[0], -entry[1], entry[2].first))
-    return tuple(doubt for *_, doubt in found[:_MOST_DOUBTS])
-
-
 def _curves(take: Take) -> tuple[Curve, ...]:
     """RMS of each hand, and doubt; nothing where no pose was fitted, as of a truth."""
     if not np.isfinite(take.rms).any():
         return ()
     curves = [Curve(f"{side} RMS [mm]", 1e3 * take.rms[:, hand]) for hand, side in enumerate(take.sides)]
     return (*curves, Curve("doubt, 0 to 1", 1.0 - frame_confidence(take)))
-
-
-def frame_confidence(take: Take) -> Float[np.ndarray, "T"]:
-    """The least confidence of a frame's labels; 0 where a hand is coasting or has just been lost.
-
-    NaN in frames without labels.
-    """
-    labeled = take.labels >= 0
-    least: NDArray[np.float64] = np.where(labeled, take.confidence, np.inf).min(axis=1, initial=np.inf)
-    least[np.isinf(least)] = np.nan
-    lost = take.status == LOST
-    just_lost = lost & ~np.concatenate([np.ones_like(lost[:1]), lost[:-1]])
-    least[((take.status == COASTING) | just_lost).any(axis=1)] = 0.0
-    return least
 
 
 def shown_body(body: RigidBody) -> ShownBody:

@@ -35,8 +35,8 @@ def set_stage(server: ViserServer, points: Float[np.ndarray, "N 3"], *, ground: 
         height=200 * cell,
         cell_size=cell,
         section_size=10 * cell,
-        cell_color=(225, 225, 225),
-        section_color=(180, 180, 180),
+        cell_color=(180, 180, 180),  # on white as on black
+        section_color=(140, 140, 140),
         cell_thickness=0.6,
         section_thickness=1.0,
         fade_distance=30.0,

@@ -15,7 +15,13 @@ from handsim.hand.shape import (
     shape_from_measures,
 )
 from handsim.hand.skeleton import build_skeleton
-from handsim.hand.skin.surface import HandSurface, build_surface, linear_blend_skinning, vertex_normals
+from handsim.hand.skin.surface import (
+    HandSurface,
+    build_surface,
+    linear_blend_skinning,
+    rest_vertices,
+    vertex_normals,
+)
 from handsim.hand.topology import BONES, DIGITS, JOINTS, NUM_BONES
 from handsim.space.transforms import axis_angle_matrix, euler_matrix
 
@@ -302,3 +308,9 @@ def test_vertex_normals_are_the_area_weighted_means_of_their_faces():
         sums[face] += np.cross(b - a, c - a)  # twice the area along the normal
     expected = sums / np.linalg.norm(sums, axis=1, keepdims=True)
     np.testing.assert_allclose(vertex_normals(surface.vertices, surface.faces), expected, atol=1e-9)
+
+
+def test_many_skins_at_once_are_those_of_each_alone():
+    together = rest_vertices(EXTREME_SHAPES)
+    for shape, vertices in zip(EXTREME_SHAPES, together, strict=True):
+        assert_array_equal(vertices, build_surface(shape.with_side("right")).vertices)

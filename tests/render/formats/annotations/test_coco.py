@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 
 from handsim.hand.keypoints import KEYPOINT_NAMES
+from handsim.hand.shape import HandShape
 from render.formats.annotations.common import hand_mask
 from render.formats.writer import open_writer
 from render.frames import RenderedFrame
+from render.skin.look import SkinLook
 
 
 @pytest.fixture
@@ -59,6 +62,33 @@ def test_projections_agree(folder: Path, frames: list[RenderedFrame]) -> None:
         np.testing.assert_array_equal(flags == 2, hand.visible)
         np.testing.assert_array_equal(np.stack([u, v], 1)[~known], 0.0)
         np.testing.assert_allclose(np.stack([u, v], 1)[known] + 0.5, hand.keypoints[known], atol=1e-4)
+
+
+def test_records_name_who_is_in_the_picture(frames: list[RenderedFrame], tmp_path: Path) -> None:
+    looks = [{"skin": dataclasses.asdict(SkinLook(lightness=40.0 + number))} for number in range(2)]
+    chosen = {"person": 3, "people": looks, "seed": 7}
+    writer = open_writer("coco", tmp_path)
+    writer.write(0, [dataclasses.replace(frames[0], choices=chosen)])
+    writer.finish()
+    content = json.loads((tmp_path / "annotations.json").read_text())
+    (image,) = content["images"]
+    assert image["person"] == 3
+    assert image["choices"] == json.loads(json.dumps(chosen))
+    for number, (record, hand) in enumerate(zip(content["annotations"], frames[0].hands, strict=True)):
+        assert record["look"] == json.loads(json.dumps(looks[number]))
+        angle = np.rad2deg(np.arctan2(-10.0 + number, 17.0))
+        assert record["skin_tone"] == {
+            "class": "brown" if angle > -30.0 else "dark",
+            "typology_angle": round(angle, 3),
+        }
+        np.testing.assert_array_equal(record["qpos"], hand.qpos)
+        assert (
+            HandShape(**_arrays(record["shape"])) is not None and record["shape"]["side"] == hand.shape.side
+        )
+
+
+def _arrays(shape: dict) -> dict:
+    return {name: np.array(value) if isinstance(value, list) else value for name, value in shape.items()}
 
 
 def test_pycocotools_loads_it(folder: Path, frames: list[RenderedFrame]) -> None:

@@ -1,0 +1,61 @@
+"""`handsim report` from the file of a take: what it writes, what it says, and what it refuses."""
+
+from __future__ import annotations
+
+import csv
+
+import pytest
+
+from handsim.cli.main import main
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A simulated take's truth, and the take that was tracked of its points."""
+    folder = tmp_path_factory.mktemp("takes")
+    capture, out = str(folder / "take.c3d"), str(folder / "tracked.npz")
+    assert main(["simulate", "--kind", "hand-pen", "--num-frames", str(FRAMES), "--out", capture]) == 0
+    assert main(["track", capture, "--size", "M", "--out", out]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", ["tracked.npz", "take.truth.npz"])
+def test_a_page_and_its_tables_are_written(folder, name, tmp_path, capsys):
+    out = tmp_path / "new" / "page.html"
+    assert main(["report", str(folder / name), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"{out}: page on {folder / name}; tables in ") and said.count("\n") == 1
+    names = {path.name for path in out.parent.iterdir()}
+    assert names == {"page.html", "page.csv", "page.joints.csv", "page.markers.csv", "page.doubts.csv"}
+    assert all(one in said for one in names)
+    with (out.parent / "page.csv").open(newline="") as file:
+        assert len(list(csv.DictReader(file))) == 2 * FRAMES
+    page = out.read_text(encoding="utf-8")
+    assert f"<h1>Take {name}</h1>" in page and "Right hand: joint angles" in page
+    assert ("mean hands of size M" in page) == (name == "tracked.npz")
+
+
+@pytest.mark.parametrize(
+    ("source", "out", "words"),
+    [
+        ("tracked.npz", "page.pdf", "--out is page.pdf, expected a file name that ends in .html"),
+        ("missing.npz", "page.html", "cannot be read"),
+        ("take.c3d", "page.html", "take.c3d"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(folder, source, out, words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    given = str(folder / source) if (folder / source).exists() else source
+    assert main(["report", given, "--out", out]) == 1
+    said = capsys.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_output_that_is_the_take_is_refused(folder, tmp_path, capsys):
+    link = tmp_path / "page.markers.csv"
+    link.symlink_to(folder / "tracked.npz")
+    assert main(["report", str(folder / "tracked.npz"), "--out", str(tmp_path / "page.html")]) == 1
+    assert "is the input" in capsys.readouterr().err

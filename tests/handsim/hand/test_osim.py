@@ -1,0 +1,180 @@
+"""The OpenSim model against MuJoCo's hand: by a reading of the XML of its own, and by OpenSim where it is."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gloves.fit import attach
+from gloves.hand_files import write_hand
+from gloves.takes.take import Take
+from handsim.hand.keypoints import KEYPOINT_NAMES, hand_keypoints
+from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.osim import coordinate_names, hand_osim
+from handsim.hand.shape import sample_shape
+from handsim.hand.topology import BONE_NAMES
+
+FRAMES = 12
+PAGE = Path(__file__).parents[3] / "docs" / "how_to" / "opensim.md"
+
+
+@pytest.fixture(params=["right", "left"])
+def fit(request, rng):
+    return attach("dense19", HandModel(sample_shape(side=request.param, rng=rng)))
+
+
+@pytest.fixture
+def qpos(fit, rng):
+    """A hand on its way from one random pose to another."""
+    ranges, share = fit.model.skeleton.ranges, np.linspace(0.0, 1.0, FRAMES)[:, None]
+    ends = ranges[:, 0] + (0.1 + 0.8 * rng.random((2, 20))) * np.ptp(ranges, axis=1)
+    turns = Rotation.from_euler("XYZ", rng.uniform(-1.0, 1.0, 3) * (1.0 + share))
+    places = rng.normal(scale=0.3, size=3) + share * rng.normal(scale=0.1, size=3)
+    quaternions = turns.as_quat(scalar_first=True)
+    return join_qpos((1.0 - share) * ends[0] + share * ends[1], position=places, quaternion=quaternions)
+
+
+def numbers(element, tag):
+    return np.array(element.findtext(tag).split(), dtype=float)
+
+
+def values_of(fit, qpos):
+    """Coordinates by name, lengths in meters and angles in radians."""
+    turn = Rotation.from_quat(qpos[3:7], scalar_first=True).as_euler("XYZ")
+    return dict(zip(coordinate_names(fit.side), [*qpos[:3], *turn, *qpos[7:]], strict=True))
+
+
+def bodies_of(root, values):
+    """`T_ground_body` of every body, by the definition of OpenSim's custom joint."""
+    placed = {"/ground": np.eye(4)}
+    for joint in root.iterfind("Model/JointSet/objects/CustomJoint"):
+        (frame,) = joint.iterfind("frames/PhysicalOffsetFrame")
+        assert joint.findtext("socket_parent_frame") == frame.get("name")
+        T_parent_frame, T_frame_child = np.eye(4), np.eye(4)
+        T_parent_frame[:3, 3] = numbers(frame, "translation")
+        T_parent_frame[:3, :3] = Rotation.from_euler("XYZ", numbers(frame, "orientation")).as_matrix()
+        turn, move = np.eye(3), np.zeros(3)
+        axes = list(joint.iterfind("SpatialTransform/TransformAxis"))
+        kinds = [f"{kind}{number}" for kind in ("rotation", "translation") for number in (1, 2, 3)]
+        assert [axis.get("name") for axis in axes] == kinds
+        for number, axis in enumerate(axes):
+            value = 0.0
+            if axis.findtext("coordinates"):
+                assert numbers(axis, "LinearFunction/coefficients").tolist() == [1.0, 0.0]
+                value = values[axis.findtext("coordinates")]
+            along = numbers(axis, "axis")
+            if number < 3:
+                turn = turn @ Rotation.from_rotvec(value * along).as_matrix()
+            else:
+                move = move + value * along
+        T_frame_child[:3, :3], T_frame_child[:3, 3] = turn, move
+        parent = placed[frame.findtext("socket_parent")]
+        placed[joint.findtext("socket_child_frame")] = parent @ T_parent_frame @ T_frame_child
+    return placed
+
+
+def markers_of(root, placed):
+    markers = {}
+    for marker in root.iterfind("Model/MarkerSet/objects/Marker"):
+        pose = placed[marker.findtext("socket_parent_frame")]
+        markers[marker.get("name")] = pose[:3, :3] @ numbers(marker, "location") + pose[:3, 3]
+    return markers
+
+
+def test_bodies_and_markers_are_where_ours_are(fit, qpos):
+    sites = fit.attachment.sites(fit.model)
+    root = ET.fromstring(hand_osim(fit.model, sites))
+    for pose in qpos:
+        placed = bodies_of(root, values_of(fit, pose))
+        bones = fit.model.forward_kinematics(pose[None])[0]
+        for name, bone in zip(BONE_NAMES, bones, strict=True):
+            np.testing.assert_allclose(placed[f"/bodyset/{fit.side}_{name}"], bone, atol=1e-6)
+        markers = markers_of(root, placed)
+        for site in sites:
+            expected = bones[site.bone, :3, :3] @ site.position + bones[site.bone, :3, 3]
+            np.testing.assert_allclose(markers[site.name], expected, atol=1e-6)
+            np.testing.assert_allclose(markers[f"{fit.side}:{site.name}"], expected, atol=1e-6)
+        for name, expected in zip(KEYPOINT_NAMES, hand_keypoints(fit.model, pose[None])[0], strict=True):
+            np.testing.assert_allclose(markers[f"{fit.side}_{name}"], expected, atol=1e-6)
+
+
+def test_coordinates_are_those_of_the_mot(fit, qpos, tmp_path):
+    Take.of_poses([fit], qpos[:, None], rate=60.0).export(tmp_path / "angles.mot")
+    lines = (tmp_path / "angles.mot").read_text().splitlines()
+    named = set(lines[lines.index("endheader") + 1].split("\t")) - {"time"}
+    root = ET.fromstring(hand_osim(fit.model))
+    coordinates = {one.get("name"): one for one in root.iter("Coordinate")}
+    assert set(coordinates) == named
+    ranges = [numbers(coordinates[name], "range") for name in coordinate_names(fit.side)[6:]]
+    np.testing.assert_allclose(ranges, fit.model.skeleton.ranges, atol=1e-9)
+
+
+def test_masses_are_those_of_the_model(fit):
+    compiled = fit.model.mj_model
+    for number, body in enumerate(ET.fromstring(hand_osim(fit.model)).iter("Body"), 1):
+        xx, yy, zz, xy, xz, yz = numbers(body, "inertia")
+        moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        assert float(body.findtext("mass")) == pytest.approx(compiled.body_mass[number])
+        np.testing.assert_allclose(numbers(body, "mass_center"), compiled.body_ipos[number], atol=1e-9)
+        np.testing.assert_allclose(moments, np.sort(compiled.body_inertia[number]), rtol=1e-6)
+
+
+def test_cylinders_lie_along_the_capsules(fit):
+    """The spheres stand at the ends of the capsule; the cylinder, along its y, reaches them."""
+    capsules, count = fit.model.capsules, 0
+    for bone, body in enumerate(ET.fromstring(hand_osim(fit.model)).iter("Body")):
+        frames = list(body.iterfind("components/PhysicalOffsetFrame"))
+        ours = np.flatnonzero(capsules.bones == bone)
+        for index, middle, start, end in zip(ours, frames[::3], frames[1::3], frames[2::3], strict=True):
+            np.testing.assert_allclose(numbers(start, "translation"), capsules.starts[index], atol=1e-9)
+            np.testing.assert_allclose(numbers(end, "translation"), capsules.ends[index], atol=1e-9)
+            half = numbers(middle, "attached_geometry/Cylinder/half_height")[0]
+            turn = Rotation.from_euler("XYZ", numbers(middle, "orientation"))
+            reached = numbers(middle, "translation") + half * turn.apply([0.0, 1.0, 0.0])
+            np.testing.assert_allclose(reached, capsules.ends[index], atol=1e-9)
+            count += 1
+    assert count == len(capsules.bones)
+
+
+def test_opensim_has_bodies_and_markers_where_mujoco_has_them(fit, qpos, tmp_path):
+    opensim = pytest.importorskip("opensim")
+    write_hand(tmp_path / "hand.osim", fit)
+    write_hand(tmp_path / "hand.xml", fit)
+    model, ours = (
+        opensim.Model(str(tmp_path / "hand.osim")),
+        mujoco.MjModel.from_xml_path(str(tmp_path / "hand.xml")),
+    )
+    state, data = model.initSystem(), mujoco.MjData(ours)
+    for pose in qpos:
+        for name, value in values_of(fit, pose).items():
+            model.getCoordinateSet().get(name).setValue(state, value, False)
+        model.realizePosition(state)
+        data.qpos[:] = pose
+        mujoco.mj_kinematics(ours, data)
+        for name in BONE_NAMES:
+            at = model.getBodySet().get(f"{fit.side}_{name}").getPositionInGround(state)
+            np.testing.assert_allclose([at[axis] for axis in range(3)], data.body(name).xpos, atol=1e-5)
+        for name in fit.layout.names:
+            at = model.getMarkerSet().get(name).getLocationInGround(state)
+            np.testing.assert_allclose([at[axis] for axis in range(3)], data.site(name).xpos, atol=1e-5)
+
+
+def test_inverse_kinematics_of_opensim_on_our_trc_finds_our_angles(fit, qpos, tmp_path, monkeypatch):
+    """The program of docs/how_to/opensim.md, as it stands there."""
+    opensim = pytest.importorskip("opensim")
+    monkeypatch.chdir(tmp_path)
+    take = Take.of_poses([fit], qpos[:, None], rate=60.0)
+    take.export("joints.trc")
+    take.export("angles.mot")
+    write_hand(tmp_path / "hand.osim", fit)
+    exec(PAGE.read_text("utf-8").split("```py\n")[1].split("```")[0], {})
+    found, exported = (opensim.TimeSeriesTable(f"{name}.mot") for name in ("found", "angles"))
+    for name in coordinate_names(fit.side):
+        pair = [np.array(table.getDependentColumn(name).to_numpy()) for table in (found, exported)]
+        assert len(pair[0]) == FRAMES
+        np.testing.assert_allclose(*pair, atol=0.05 if "_wrist_t" not in name else 1e-4)  # [deg], [m]

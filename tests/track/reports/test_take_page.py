@@ -1,0 +1,189 @@
+"""The page on a take and its tables, against the numbers of the take."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gloves.takes.take import COASTING, LOST, STATUSES, TRACKED, Take
+from handsim.errors import ArgumentError
+from handsim.hand.topology import JOINT_NAMES, JOINTS
+from track.capture_tracking import track_capture
+from track.reports.hand_figures import hand_figures
+from track.reports.take_page import write_take_page
+from track.reports.take_tables import table_paths
+from train.simulation.takes import simulate_take
+
+FRAMES = 60
+
+
+@pytest.fixture(scope="module")
+def truth() -> Take:
+    return simulate_take(kind="single-hand", num_frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def take(truth) -> Take:
+    """A tracked take; its first hand coasts in two frames and is lost in the eight after them."""
+    tracked = track_capture(truth, hands=truth.hands, labeler="dense19")
+    status, qpos, rms = tracked.status.copy(), tracked.qpos.copy(), tracked.rms.copy()
+    labels = tracked.labels.copy()
+    status[20:22, 0], status[22:30, 0], qpos[22:30, 0], rms[22:30, 0] = COASTING, LOST, np.nan, np.nan
+    first = range(tracked.hands[0].layout.num_markers)
+    labels[22:30] = np.where(np.isin(labels[22:30], first), -1, labels[22:30])
+    settings = {**tracked.settings, "user": "auto, 180 x 80 mm", "capture": "<b>.c3d"}
+    return dataclasses.replace(tracked, status=status, qpos=qpos, rms=rms, labels=labels, settings=settings)
+
+
+def written(folder: Path, take: Take, source: str = "my take.npz") -> tuple[str, list[list[dict[str, str]]]]:
+    """The page, and the rows of its tables."""
+    paths = write_take_page(folder / "page.html", take, source=source)
+    assert sorted(folder.iterdir()) == sorted(paths)
+    tables = [list(csv.DictReader(path.open(encoding="utf-8", newline=""))) for path in paths[1:]]
+    return paths[0].read_text(encoding="utf-8"), tables
+
+
+def numbers(rows: list[dict[str, str]], column: str) -> np.ndarray:
+    return np.array([float(row[column] or "nan") for row in rows])
+
+
+def test_the_table_of_frames_has_the_numbers_of_the_take(take, tmp_path):
+    _, (frames, *_) = written(tmp_path, take)
+    assert len(frames) == FRAMES * len(take.hands)
+    for number, side in enumerate(take.sides):
+        rows = [row for row in frames if row["hand"] == side]
+        assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
+        np.testing.assert_allclose(numbers(rows, "time_s"), take.times, atol=1e-8)
+        assert [row["status"] for row in rows] == [STATUSES[one] for one in take.status[:, number]]
+        angles = np.column_stack([numbers(rows, f"{joint}_deg") for joint in JOINT_NAMES])
+        np.testing.assert_allclose(angles, np.rad2deg(take.qpos[:, number, 7:]), rtol=1e-5, atol=1e-5)
+        seen = np.isfinite(take.observed(side)[..., 0]).sum(axis=1)
+        np.testing.assert_array_equal(numbers(rows, "markers_seen"), seen)
+    assert np.isnan(angles).sum() == 0 and frames[2 * 25]["thumb_IP_flexion_deg"] == ""
+
+
+def test_the_range_of_motion_is_that_of_the_fitted_poses(take, tmp_path):
+    page, (_, joints, *_) = written(tmp_path, take)
+    fitted = np.r_[0:20, 30:FRAMES]  # neither coasting nor lost
+    for number, side in enumerate(take.sides):
+        rows = [row for row in joints if row["hand"] == side]
+        assert [row["joint"] for row in rows] == list(JOINT_NAMES)
+        degrees = np.rad2deg(take.qpos[fitted if number == 0 else slice(None), number, 7:])
+        expected = {
+            "least": degrees.min(axis=0),
+            "5th": np.percentile(degrees, 5.0, axis=0),
+            "median": np.median(degrees, axis=0),
+            "95th": np.percentile(degrees, 95.0, axis=0),
+            "largest": degrees.max(axis=0),
+            "model_low": np.array([joint.low for joint in JOINTS]),
+            "model_high": np.array([joint.high for joint in JOINTS]),
+        }
+        for name, values in expected.items():
+            np.testing.assert_allclose(numbers(rows, f"{name}_deg"), values, rtol=1e-5, atol=1e-5)
+    assert f"<td>{np.rad2deg(take.qpos[fitted, 0, 10].max()):.1f}</td>" in page
+    assert "Over the 50 frames" in page and "<td>-25 to 95</td>" in page
+
+
+def test_markers_have_their_gaps_and_residuals(take, tmp_path):
+    _, (_, _, markers, _) = written(tmp_path, take)
+    for number, (hand, side) in enumerate(zip(take.hands, take.sides, strict=True)):
+        rows = [row for row in markers if row["hand"] == side]
+        assert [row["marker"] for row in rows] == list(hand.layout.names)
+        observed = take.observed(side)
+        seen = np.isfinite(observed[..., 0])
+        np.testing.assert_allclose(numbers(rows, "seen_share"), seen.mean(axis=0), rtol=1e-5)
+        there = take.status[:, number] != LOST
+        off = 1e3 * np.linalg.norm(observed[there] - hand.markers(take.qpos[there, number])[0], axis=2)
+        np.testing.assert_allclose(numbers(rows, "residual_median_mm"), np.nanmedian(off, axis=0), rtol=1e-5)
+        high = np.nanpercentile(off, 95.0, axis=0)
+        np.testing.assert_allclose(numbers(rows, "residual_95th_mm"), high, rtol=1e-5)
+        lengths = [
+            [len(run) for run in re.findall("0+", "".join("01"[int(one)] for one in column).strip("0"))]
+            for column in seen.T
+        ]
+        assert numbers(rows, "gaps").tolist() == [len(runs) for runs in lengths]
+        longest = numbers(rows, "longest_gap_frames")
+        assert longest.tolist() == [max(runs, default=0) for runs in lengths]
+        np.testing.assert_allclose(numbers(rows, "longest_gap_s"), longest / take.rate, rtol=1e-5)
+        if number == 0:
+            assert (longest >= 8).all(), "it was lost for eight frames"
+
+
+def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, tmp_path):
+    page, (*_, doubts) = written(tmp_path, take)
+    side = take.sides[0]
+    assert (doubts[0]["first_frame"], doubts[0]["last_frame"]) == ("20", "29")
+    assert (doubts[0]["of"], doubts[0]["why"], doubts[0]["frame"]) == (side, "lost", "20")
+    assert (
+        f"<td>20 to 29</td><td>{take.times[20]:.3f}</td><td>{take.times[29]:.3f}</td><td>{side}</td>" in page
+    )
+    assert f"<td>frame 20, {take.times[20]:.3f} s</td><td>handsim view &#x27;my take.npz&#x27;</td>" in page
+    assert "Capture &lt;b&gt;.c3d, glove dense19, hands right and left" in page
+    assert "size measured in the capture, 180 x 80 mm; 60 frames, 0.5 s at 120 Hz" in page
+    assert "are not calibrated" in page and "handsim calibrate minute.c3d" in page
+    assert not re.search(r"(src|href)=\"(?!data:)", page) and "<script" not in page
+    assert "prefers-color-scheme: dark" in page and "@media print" in page
+    assert page.count("<img ") == 3 * len(take.hands)
+
+
+def test_a_gap_shows_in_the_angles(take):
+    first, second = hand_figures(take)
+    assert np.isnan(first.angles[22:30]).all() and np.isfinite(first.angles[20:22]).all()
+    assert np.flatnonzero(~first.fitted).tolist() == list(range(20, 30)) and second.fitted.all()
+
+
+def test_whose_hands_they_are(take, tmp_path):
+    for user, words in {
+        "S": "mean hands of size S, in a glove as designed",
+        "user.json": "a user&#x27;s (user.json), as calibrated or given",
+        "": "a user's, as calibrated or given",
+    }.items():
+        page, _ = written(tmp_path, dataclasses.replace(take, settings={**take.settings, "user": user}))
+        assert words.replace("user&#x27;s", "user's") in page
+        assert ("handsim calibrate" in page) == (user == "S")
+
+
+def test_a_truth_has_no_doubt_and_residuals_of_its_noise(truth, tmp_path):
+    page, (frames, _, _, doubts) = written(tmp_path, truth)
+    assert doubts == [] and "every label is sure" in page and "nothing to calibrate" in page
+    for side, hand in zip(truth.sides, truth.hands, strict=True):
+        off = truth.observed(side) - hand.markers(truth.qpos[:, truth.hand(side)])[0]
+        rms = 1e3 * np.sqrt(np.nanmean(np.square(off).sum(axis=2), axis=1))
+        rows = [row for row in frames if row["hand"] == side]
+        np.testing.assert_allclose(numbers(rows, "residual_rms_mm"), rms, rtol=1e-5)
+
+
+def test_hands_that_are_not_there_and_points_that_are_not(take, truth, tmp_path):
+    lost = dataclasses.replace(
+        take,
+        status=np.full_like(take.status, LOST),
+        qpos=np.full_like(take.qpos, np.nan),
+        rms=np.full_like(take.rms, np.nan),
+        labels=np.full_like(take.labels, -1),
+    )
+    page, (frames, joints, markers, doubts) = written(tmp_path, lost)
+    assert (
+        page.count("It has no pose in any frame.") == 2 and "was never found" in page and "<img" not in page
+    )
+    assert {row["status"] for row in frames} == {"lost"} and doubts == []
+    assert np.isnan(numbers(joints, "median_deg")).all() and (numbers(markers, "gaps") == 0).all()
+    unseen = Take.of_poses(truth.hands, truth.qpos, rate=truth.rate)
+    page, (frames, *_) = written(tmp_path, unseen)
+    assert page.count("None of its markers has a point.") == 2
+    assert (numbers(frames, "markers_seen") == 0).all() and frames[0]["status"] == STATUSES[TRACKED]
+    one = truth.cut(0, 1)
+    assert len(written(tmp_path, one)[1][0]) == 2
+
+
+def test_a_page_of_another_name_is_refused(take, tmp_path):
+    with pytest.raises(ArgumentError, match=r"expected a file name that ends in \.html"):
+        write_take_page(tmp_path / "page.pdf", take, source="take.npz")
+    assert list(tmp_path.iterdir()) == []
+    assert [path.name for path in table_paths(Path("a.b.html"))] == [
+        "a.b.csv", "a.b.joints.csv", "a.b.markers.csv", "a.b.doubts.csv"
+    ]  # fmt: skip

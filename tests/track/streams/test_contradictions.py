@@ -1,0 +1,296 @@
+"""Every row of the table of contradictions in docs/marker_files.md, and a stream to which all happens."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gloves.captures.capture import Capture
+from gloves.captures.formats import read_capture, write_capture
+from handsim.errors import CaptureError, HandSimWarning
+from tests.track.streams.test_frame_source import Slow
+from tests.waiting import wait_for
+from track.streams.frame_order import FrameOrder
+from track.streams.frame_source import StreamedFrame
+from track.streams.live_stream import LiveStream, SourceStream
+
+RATE = 120.0
+FRAMES = 120
+PAGE = Path(__file__).parents[3] / "docs" / "marker_files.md"
+
+
+class Trc:
+    """A file of 120 frames at 120 Hz, whose columns of numbers and times and whose header can be changed."""
+
+    def __init__(self, folder: Path) -> None:
+        rng = np.random.default_rng(0)
+        positions = rng.normal(0.0, 0.05, (FRAMES, 8, 3)) + np.linspace(0.0, 0.1, FRAMES)[:, None, None]
+        self.path = folder / "take.trc"
+        write_capture(self.path, Capture(tuple("abcdefgh"), positions, RATE))
+        lines = self.path.read_text().split("\n")
+        self.header, self.rows = lines[:6], [line.split("\t") for line in lines[6:-1]]
+        self.numbers, self.times = np.arange(1, FRAMES + 1), np.arange(FRAMES) / RATE
+        self.rate, self.count = "120", str(FRAMES)
+        self.kept = np.ones(FRAMES, dtype=bool)
+
+    def read(self) -> tuple[Capture, list[str]]:
+        """The capture, and what was told."""
+        values = self.header[2].split("\t")
+        values[0], values[2] = self.rate, self.count
+        rows = [
+            "\t".join([str(number), f"{time:.6f}", *row[2:]])
+            for number, time, row, kept in zip(self.numbers, self.times, self.rows, self.kept, strict=True)
+            if kept
+        ]
+        lines = [*self.header[:2], "\t".join(values), *self.header[3:], *rows]
+        self.path.write_text("\n".join(lines) + "\n")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", HandSimWarning)
+            read = read_capture(self.path)
+        return read, [str(one.message) for one in caught]
+
+    def refused(self) -> str:
+        with pytest.raises(CaptureError) as caught:
+            self.read()
+        return str(caught.value)
+
+
+def gaps(trc: Trc) -> None:
+    trc.kept[40:80] = False
+    for numbers in (trc.numbers, np.cumsum(trc.kept)):
+        trc.numbers = numbers
+        capture, told = trc.read()
+        missing = np.isnan(capture.positions[..., 0]).all(axis=1)
+        assert capture.num_frames == FRAMES and np.flatnonzero(missing).tolist() == list(range(40, 80))
+        assert len(told) == 1 and "40 of 120 frames are missing (41 to 80)" in told[0]
+
+
+def cut(trc: Trc) -> None:
+    path = trc.path.with_suffix(".csv")
+    write_capture(path, trc.read()[0])
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-40]))
+    with pytest.raises(CaptureError, match="truncated: Total Exported Frames is 120, and 80 frames are"):
+        read_capture(path)
+
+
+def shortened(trc: Trc) -> None:
+    trc.kept[80:] = False
+    capture, told = trc.read()
+    assert capture.num_frames == 80 and "NumFrames is 120, and 80 frames are there" in told[0]
+
+
+def more_than_stated(trc: Trc) -> None:
+    trc.count = "100"
+    capture, told = trc.read()
+    assert capture.num_frames == FRAMES and "NumFrames is 100, and 120 frames are there" in told[0]
+
+
+def another_rate(trc: Trc) -> None:
+    trc.rate = "60"
+    assert "DataRate is 60 Hz, and by their times the frames are at 120" in trc.refused()
+    for decimals in (2, 3):  # rounded times are no contradiction, and tell it still
+        trc.times = np.round(np.arange(FRAMES) / RATE, decimals)
+        trc.rate = "120"
+        assert trc.read()[1] == []
+        trc.rate = "60"
+        assert "DataRate is 60 Hz" in trc.refused()
+
+
+def no_rate(trc: Trc) -> None:
+    trc.rate = "0"
+    capture, told = trc.read()
+    assert capture.rate == pytest.approx(RATE, rel=1e-3) and "by the column of times it is 120" in told[0]
+
+
+def wild_rate(trc: Trc) -> None:
+    for trc.rate in ("0.5", "1e6", "1e17", "1e308"):
+        assert f"DataRate is {float(trc.rate):g} Hz, expected 1 to 5000 frames per second" in trc.refused()
+
+
+def two_rates(trc: Trc) -> None:
+    path = trc.path.with_suffix(".c3d")
+    write_capture(path, trc.read()[0])
+    data = bytearray(path.read_bytes())
+    data[20:24] = np.float32(60.0).tobytes()
+    path.write_bytes(data)
+    with pytest.raises(CaptureError, match="POINT:RATE is 120 Hz and the header's rate 60 Hz"):
+        read_capture(path)
+
+
+def times_back(trc: Trc) -> None:
+    trc.times = trc.times[::-1]
+    assert "the time goes back from" in trc.refused()
+    trc.times = np.full(FRAMES, 0.5)
+    assert "all 120 frames have the time 0.5 s, and DataRate is 120" in trc.refused()
+
+
+def numbers_back(trc: Trc) -> None:
+    trc.numbers[60:] -= 1
+    assert "frame 60 follows frame 60" in trc.refused()
+
+
+def numbers_ahead(trc: Trc) -> None:
+    trc.numbers[60:] += 5
+    said = trc.refused()
+    assert "the frame's number goes on by 6" in said and "from 0.491667 s to 0.5 s, by 1 frames" in said
+
+
+def far_jump(trc: Trc) -> None:
+    trc.times[60:] += 100.0
+    assert "12000 frames are missing behind frame 60, from 0.491667 s to 100.5 s" in trc.refused()
+
+
+def streamed(number: int, time: float, at: float, points: object = None) -> StreamedFrame:
+    points = np.zeros((1, 3)) if points is None else np.asarray(points)
+    return StreamedFrame(number, time, points, np.arange(len(points)), arrived=at)
+
+
+def ordered(order: FrameOrder, packets: list[tuple[int, float, float]]) -> list[int]:
+    """Numbers of the frames that go on, of packets (number, time, arrival)."""
+    gone = []
+    for packet in packets:
+        gone += [*order.expire(packet[2]), *order.add(streamed(*packet))]
+    gone += order.end()
+    assert order.received == order.passed + order.doubled + order.late + order.wild == len(packets)
+    return [frame.number for frame in gone]
+
+
+def regular(numbers: range, *, jump: int = 0) -> list[tuple[int, float, float]]:
+    return [(number + jump, (number + jump) / RATE, number / RATE) for number in numbers]
+
+
+def short_jump() -> None:
+    order, packets = FrameOrder(), regular(range(480))
+    wild = [(n + 10**6, n / RATE + 8000.0, n / RATE) for n in range(100, 104)]
+    assert ordered(order, [*packets[:100], *wild, *packets[100:]]) == list(range(480))
+    assert (order.wild, order.missed, order.restarts) == (4, 0, 0)
+
+
+def lasting_jump() -> None:
+    order = FrameOrder()
+    packets = [*regular(range(100)), *regular(range(100, 105), jump=960_000)]
+    assert ordered(order, packets) == [packet[0] for packet in packets]
+    assert (order.wild, order.missed, order.restarts) == (0, 0, 1), "as many could not have been sent"
+    order = FrameOrder()
+    assert ordered(order, [*regular(range(100)), *regular(range(400, 405))])[-5:] == list(range(400, 405))
+    assert (order.wild, order.missed, order.restarts) == (0, 300, 0)
+
+
+def out_of_order() -> None:
+    for places in range(1, 9):
+        order = FrameOrder()
+        numbers = list(range(2400))
+        for at in (10, *range(20, 2380, 20)):  # the first by one: how late others are shows later
+            numbers.insert(at + (places if at > 10 else 1), numbers.pop(at))
+        packets = [(number, number / RATE, at / RATE) for at, number in enumerate(numbers)]
+        assert ordered(order, packets) == list(range(2400))
+        assert order.reordered == 119 and (order.missed, order.late) == (0, 0)
+
+
+def twice() -> None:
+    order = FrameOrder()
+    assert ordered(order, [packet for packet in regular(range(100)) for _ in range(2)]) == list(range(100))
+    assert (order.doubled, order.late) == (100, 0)
+
+
+def lost_end() -> None:
+    order = FrameOrder()
+    ordered(order, regular(range(460)))
+    assert order.missing_at_end(479 / RATE + 0.001) == 20
+
+
+class Source:
+    """Frames of one point far away, and one in the room."""
+
+    def __iter__(self):
+        for number in range(10):
+            yield streamed(number, number / RATE, np.nan, [[0.1, 0.2, 0.3], [900.0, -1200.0, 0.0]])
+
+    def close(self) -> None:
+        pass
+
+
+def far_points() -> None:
+    with LiveStream(SourceStream(Source(), "mine")) as stream:
+        assert [len(frame.points) for frame in stream] == [1] * 10
+        assert stream.counts["points_out_of_range"] == 10
+
+
+def not_kept_up_with() -> None:
+    with LiveStream(Slow(100)) as stream:
+        wait_for(lambda: len(stream._arrived) == 100)
+        assert next(stream).number == 99 and stream.counts["dropped_frames"] == 99
+
+
+CASES: dict[str, Callable[[Trc], None] | Callable[[], None]] = {
+    "a gap in the numbers of the frames, or in their times where numbers go on": gaps,
+    "fewer frames than the header of a .csv or .tsv states, beside such gaps": cut,
+    "fewer frames than the header of a .trc states": shortened,
+    "more frames than the header states": more_than_stated,
+    "a stated rate that is not that of the times": another_rate,
+    "no stated rate, but evenly spaced times": no_rate,
+    "a stated rate below 1 or above 5,000 Hz": wild_rate,
+    "a C3D's `POINT:RATE` that is not the header's rate": two_rates,
+    "times that go back, or that are all the same": times_back,
+    "numbers that go back, or come twice": numbers_back,
+    "numbers that go on by more frames than the times": numbers_ahead,
+    "more than ten times as many missing frames as frames": far_jump,
+    "in a stream: a number or a time that jumps in fewer than five frames in a row": short_jump,
+    "in a stream: a jump that lasts for five frames in a row": lasting_jump,
+    "in a stream: frames out of order by up to eight": out_of_order,
+    "in a stream: frames that come twice": twice,
+    "in a stream: no frame before its end": lost_end,
+    "in a stream: points 1,000 m or more from the origin": far_points,
+    "in a stream: frames that are not kept up with": not_kept_up_with,
+}
+
+
+def test_every_row_of_the_table_has_a_case():
+    table = PAGE.read_text("utf-8").split("| what contradicts | what happens |\n|---|---|\n")[1]
+    rows = re.findall(r"^\| (.*?) \| .* \|$", table.split("\n\n")[0], re.MULTILINE)
+    assert rows == list(CASES)
+
+
+@pytest.mark.parametrize("row", CASES)
+def test_what_contradicts_happens_as_the_table_says(row, tmp_path):
+    case = CASES[row]
+    case() if row.startswith("in a stream") else case(Trc(tmp_path))
+
+
+def test_what_is_legitimate_is_read_without_a_word(tmp_path):
+    for change in (
+        {"numbers": np.arange(5017, 5017 + FRAMES), "times": 41.8 + np.arange(FRAMES) / RATE},
+        {"times": np.arange(FRAMES) / 119.88},
+        {"rate": "119.88"},
+        {"numbers": 2 * np.arange(FRAMES)},
+        {"times": np.arange(FRAMES) / RATE + np.random.default_rng(1).uniform(0.0, 0.002, FRAMES)},
+    ):
+        trc = Trc(tmp_path)
+        for name, value in change.items():
+            setattr(trc, name, value)
+        capture, told = trc.read()
+        assert capture.num_frames == FRAMES and told == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bad_network_loses_no_frame_that_arrived(seed):
+    """A fifth of the frames is lost, a tenth doubled, and each five are shuffled."""
+    rng, count = np.random.default_rng(seed), 20_000
+    sent = np.concatenate([rng.permutation(np.arange(at, at + 5)) for at in range(0, count, 5)])
+    packets = [
+        (number, number / RATE, slot / RATE)
+        for slot, number in enumerate(sent.tolist())
+        if rng.random() > 0.2
+        for _ in range(1 + (rng.random() < 0.1))
+    ]
+    order, arrived = FrameOrder(), sorted({number for number, _, _ in packets})
+    assert ordered(order, packets) == arrived
+    assert order.doubled == len(packets) - len(arrived)
+    assert order.missed == arrived[-1] - arrived[0] + 1 - len(arrived)
+    assert (order.late, order.wild, order.restarts) == (0, 0, 0)
+    assert order.passed - order.reordered > 0 < order.reordered

@@ -1,0 +1,154 @@
+"""Labels of frames that follow from each other: the hands are tracked forward and backward.
+
+A track that goes wrong at an event is wrong after it in one direction and before it in the other. Where the
+directions differ the labeler, which knows no history, is the third witness of each point's label.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+
+from track.association.initialization import MOST_POINTS
+from track.association.single_frames import FrameLabels
+from track.streams.frame_source import StreamedFrame
+from track.tracker import Tracker
+from track.user import User
+from train.labelers.protocol import Labeler
+
+_NEAR: Final = 0.03  # [m] from a hand's markers, within which a point without a label may be one
+_NOT_ASKED: Final = -2  # label of a point that the labeler was not shown
+_MAJORITY: Final = 2.0 / 3.0  # of the confidence in a label that one of three witnesses denies
+
+
+class _Tracked(NamedTuple):
+    """What the tracker made of a frame in one direction."""
+
+    labels: Int[np.ndarray, "N"]
+    """Marker of each point, counted through the hands in their order; -1 for none."""
+    confidence: Float[np.ndarray, "N"]
+    """Confidence in each label, 0 to 1."""
+    markers: Float[np.ndarray, "H M 3"]
+    """Every hand's markers [m]; NaN where it is lost."""
+
+
+def label_both_ways(
+    frames: Sequence[StreamedFrame],
+    user: User,
+    labeler: Labeler,
+    told: Callable[[int], None] = lambda count: None,
+) -> list[FrameLabels]:
+    """Label frames that follow from each other.
+
+    Args:
+        frames: The frames in the order of their times.
+        user: The hands.
+        labeler: Labeler of their glove.
+        told: Called with the number of frames that are done; a frame is done in both directions.
+    """
+    forward = _track(frames, user, labeler, lambda count: told(count // 2))
+    end = frames[-1].time
+    reverse = [dataclasses.replace(frame, time=end - frame.time) for frame in reversed(frames)]
+    backward = _track(reverse, user, labeler, lambda count: told((len(frames) + count) // 2))[::-1]
+    found = [FrameLabels(one.labels, one.confidence) for one in forward]
+    different = [
+        number
+        for number, (one, other) in enumerate(zip(forward, backward, strict=True))
+        if (one.labels != other.labels).any()
+    ]
+    points = [frames[number].points for number in different]
+    directions = [(forward[number], backward[number]) for number in different]
+    third = _ask(points, directions, user, labeler)
+    for number, (one, other), witness in zip(different, directions, third, strict=True):
+        found[number] = _decide(one, other, witness)
+    return found
+
+
+def _track(
+    frames: Sequence[StreamedFrame], user: User, labeler: Labeler, told: Callable[[int], None]
+) -> list[_Tracked]:
+    """The hands tracked through frames in their order."""
+    tracker, tracked = Tracker(user, labeler), []
+    for frame in frames:
+        one = tracker.step(frame.points, frame.ids, frame.time)
+        tracked.append(_Tracked(one.labels, one.confidence, np.stack([hand.markers for hand in one.hands])))
+        told(len(tracked))
+    return tracked
+
+
+def _ask(
+    frames: Sequence[Float[np.ndarray, "N 3"]],
+    directions: Sequence[tuple[_Tracked, _Tracked]],
+    user: User,
+    labeler: Labeler,
+) -> list[NDArray[np.int64]]:
+    """The labeler's labels of the points of frames, hand by hand; `_NOT_ASKED` of what it was not shown."""
+    clouds = [
+        (number, hand, cloud)
+        for number, (points, pair) in enumerate(zip(frames, directions, strict=True))
+        for hand in range(len(user))
+        if 0 < len(cloud := _cloud(points, pair, hand)) <= MOST_POINTS
+    ]
+    labelings = labeler.label_frames([frames[number][cloud] for number, _, cloud in clouds])
+    labels = [np.full(len(points), _NOT_ASKED) for points in frames]
+    confidence = [np.zeros(len(points)) for points in frames]
+    for (number, hand, cloud), one in zip(clouds, labelings, strict=True):
+        named, before = one.labels >= 0, labels[number][cloud]
+        better = named & (one.confidence > confidence[number][cloud])
+        own = np.where(better, hand * user.layout.num_markers + one.labels, before)
+        labels[number][cloud] = np.where(~named & (before == _NOT_ASKED), -1, own)
+        confidence[number][cloud[better]] = one.confidence[better]
+    return labels
+
+
+def _cloud(
+    points: Float[np.ndarray, "N 3"], pair: tuple[_Tracked, _Tracked], hand: int
+) -> Int[np.ndarray, "C"]:
+    """Points that may be a hand's: labeled so, or near its markers, but not another's in both directions."""
+    own, others = np.zeros(len(points), dtype=bool), np.ones(len(points), dtype=bool)
+    for tracked in pair:
+        owner = np.where(tracked.labels >= 0, tracked.labels // tracked.markers.shape[1], -1)
+        own |= owner == hand
+        others &= (owner >= 0) & (owner != hand)
+        if np.isfinite(tracked.markers[hand]).all():
+            distances = np.linalg.norm(points[:, None] - tracked.markers[hand], axis=-1)
+            own |= distances.min(axis=1) < _NEAR
+    return np.flatnonzero(own & ~others)
+
+
+def _decide(one: _Tracked, other: _Tracked, witness: Int[np.ndarray, "N"]) -> FrameLabels:
+    """The label that two of three witnesses give each point, else that of the more confident direction.
+
+    A direction without a label has no confidence, so that a label that nobody denies stays; and one that has
+    lost a hand denies none of its labels.
+    """
+    sure, other_sure = (np.where(way.labels >= 0, way.confidence, 0.0) for way in (one, other))
+    same = one.labels == other.labels
+    first_stays = _is_lost(other, one.labels) & (other.labels < 0)
+    second_stays = _is_lost(one, other.labels) & (one.labels < 0)
+    second = (witness == other.labels) | ((witness != one.labels) & (other_sure > sure))
+    second = (second & ~first_stays) | second_stays
+    labels = np.where(second, other.labels, one.labels)
+    confidence = np.where(same, one.confidence, _MAJORITY * np.where(second, other_sure, sure))
+    return FrameLabels(_without_doubles(labels, confidence), confidence)
+
+
+def _is_lost(tracked: _Tracked, labels: Int[np.ndarray, "N"]) -> Bool[np.ndarray, "N"]:
+    """Which points have the label of a hand that is lost."""
+    lost = np.isnan(tracked.markers).all(axis=(1, 2))
+    of_lost: Bool[np.ndarray, "N"] = lost[np.maximum(labels, 0) // tracked.markers.shape[1]]
+    return of_lost & (labels >= 0)
+
+
+def _without_doubles(labels: Int[np.ndarray, "N"], confidence: Float[np.ndarray, "N"]) -> NDArray[np.int64]:
+    """Labels in which every marker is at its most confident point alone."""
+    order = np.argsort(-confidence, kind="stable")
+    kept = order[np.unique(labels[order], return_index=True)[1]]
+    single = np.full(len(labels), -1)
+    single[kept] = labels[kept]
+    return single
