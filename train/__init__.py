@@ -65,6 +65,6 @@ __all__ = [
     "train_labeler",
 ]
 
-# Threads of torch that wait for one another sleep: spinning takes nearly half of the cores' time from training
-# and from others. It holds for a torch that is loaded from here on.
+# Threads of torch that wait for one another sleep: spinning takes nearly half of the cores' time from
+# training and from others. It holds for a torch that is loaded from here on.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
