@@ -1,14 +1,16 @@
 """Writes docs/results.md from the figures in benchmarks/figures: `python -m benchmarks.results`.
 
-The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json.
+The page's text is results_template.md; `{table5.right_size[1]:.2f}` in it is a number of table5.json, and
+`{speed_times}` and `{speed_rates}` are tables of all of speed.json.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Final
 
-from benchmarks.record import load_figures
+from benchmarks.record import FOLDER, load_figures
 
 PAGE: Final = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 TEMPLATE: Final = Path(__file__).with_name("results_template.md")
@@ -16,7 +18,7 @@ README: Final = (
     "{label_clean.row[0]:.2f} {label_both.row[0]:.2f}",
     "{real_motion.mean[1]:.2f} {real_motion.worst[1]:.2f}",
     "{table5.right_size[1]:.2f} {table5_seed1.right_size[1]:.2f}",
-    "{table5.time_size[0]:.2f} {table5.time_size[1]:.2f}",
+    "{speed.hand_hand_true[0]:.2f} {speed.hand_hand_true[1]:.2f}",
     "{calibration.after[0][0]:.2f} {calibration.after[0][1]:.2f}",
     "{calibration.people_after[0]:.2f} {calibration.people_after[1]:.2f}",
     "{judge.clean[0]:.1f} {judge.mixed[0]:.1f}",
@@ -32,7 +34,29 @@ def filled(text: str) -> str:
         KeyError: A field names a file that is not there.
         AttributeError: A field names a figure that its file lacks.
     """
-    return text.format(**load_figures())
+    times, rates = speed_tables()
+    return text.format(**load_figures(), speed_times=times, speed_rates=rates)
+
+
+def speed_tables(folder: Path = FOLDER) -> tuple[str, str]:
+    """The rows of speed.json as `benchmarks.speed` keeps them: times, and how many in a second."""
+    figures = json.loads((folder / "speed.json").read_text("utf-8"))["figures"]
+    times = [
+        "| what | median [ms] | 99th percentile [ms] | longest [ms] | median in units |",
+        "|---|---|---|---|---|",
+    ]
+    rates = ["| what | in a second | in a unit |", "|---|---|---|"]
+    for key, figure in figures.items():
+        if key == "unit":
+            continue
+        row = f"| {' | '.join([figure['what'].rsplit(': ', 1)[0], *map(_shown, figure['value'])])} |"
+        (times if len(figure["value"]) == 4 else rates).append(row)
+    return "\n".join(times), "\n".join(rates)
+
+
+def _shown(value: float) -> str:
+    """A number to three digits."""
+    return f"{float(f'{value:.3g}'):,g}"
 
 
 if __name__ == "__main__":
