@@ -96,6 +96,7 @@ def make_capture(plan: Plan, out: Path, number: int) -> int:
     joints, angles = poses_of(hands, take.qpos)
     rounded = _round(joints, _POINT_DECIMALS), _round(angles, _ANGLE_DECIMALS)
     write_capture(out / capture_path(planned.name), capture)
+    _as_published(out / capture_path(planned.name))
     notes = "The true hands and gloves of this capture, as a perfect calibration finds them."
     User(hands, notes).save(out / user_path(planned.name))
     save_answers(out / truth_path(planned.name), Answers(labels, *rounded))  # last: it is finished now
@@ -192,3 +193,9 @@ def _table_of_captures(plan: Plan, out: Path) -> str:
 def _write(path: Path, text: str) -> None:
     with atomic_write(path) as temporary:
         temporary.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+
+
+def _as_published(path: Path) -> None:
+    """Write a .trc as this version of the benchmark has it: without a tab at the end of its lines."""
+    lines = path.read_text("utf-8").split("\n")
+    path.write_text("\n".join([*lines[:3], *(line.removesuffix("\t") for line in lines[3:])]), "utf-8")
