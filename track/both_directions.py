@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from track.association.initialization import MOST_POINTS
+from track.association.point_groups import distances_to_nearest
 from track.association.single_frames import FrameLabels
 from track.streams.frame_source import StreamedFrame
 from track.tracker import Tracker
@@ -116,8 +117,7 @@ def _cloud(
         own |= owner == hand
         others &= (owner >= 0) & (owner != hand)
         if np.isfinite(tracked.markers[hand]).all():
-            distances = np.linalg.norm(points[:, None] - tracked.markers[hand], axis=-1)
-            own |= distances.min(axis=1) < _NEAR
+            own |= distances_to_nearest(points, tracked.markers[hand]) < _NEAR
     return np.flatnonzero(own & ~others)
 
 

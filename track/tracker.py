@@ -237,8 +237,10 @@ class Tracker:
         lost = tuple(
             hand for hand, one in enumerate(outcomes) if one.status in (Status.LOST, Status.COASTING)
         )
+        if not lost:
+            return frame, outcomes
         free = frame.free_for(lost)
-        if not lost or not self._is_attempt_due(frame.time, len(free)):
+        if not self._is_attempt_due(frame.time, len(free)):
             return frame, outcomes
         initialized = self._initializer.initialize(frame.points[free], lost)
         for found in initialized:

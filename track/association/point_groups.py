@@ -21,6 +21,14 @@ def linked_groups(points: Float[np.ndarray, "N 3"], distance: float) -> list[NDA
     return sorted(groups, key=len, reverse=True)
 
 
+def distances_to_nearest(
+    points: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "K 3"]
+) -> Float[np.ndarray, "N"]:
+    """Distance of each point from the nearest of some others [m], of which there is one at least."""
+    distances: NDArray[np.float64] = np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)
+    return distances
+
+
 @kernel
 def _single_linkage(points: Float[np.ndarray, "N 3"], distance: float) -> Int[np.ndarray, "N"]:
     """Number of the group of each point."""

@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from track.association.hand_state import HandState
@@ -21,6 +20,7 @@ from track.association.initialization import (
     HandInitializer,
     InitializedHand,
 )
+from track.association.point_groups import distances_to_nearest
 from train.labelers.protocol import MAX_POINTS, Labeler
 
 _NEAR: Final = 0.06  # [m] from a hand's points, within which other points may be its markers
@@ -85,14 +85,8 @@ def _clouds(
             clouds.append((number, hands[0].index if hands else int(usual), np.arange(len(points))))  # type: ignore[arg-type]
             continue
         for hand in hands:
-            near = _distances(points, points[hand.labels >= 0]) < _NEAR
+            near = distances_to_nearest(points, points[hand.labels >= 0]) < _NEAR
             for other in hands:
                 near &= (other.labels < 0) | (other is hand)
             clouds.append((number, hand.index, np.flatnonzero(near)[:MAX_POINTS]))
     return clouds
-
-
-def _distances(points: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "K 3"]) -> NDArray[np.float64]:
-    """Distance of each point from the nearest of some others [m]."""
-    distances: NDArray[np.float64] = np.linalg.norm(points[:, None] - others, axis=-1).min(axis=1)
-    return distances
