@@ -18,13 +18,13 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gloves.takes.columns import Column
+from handsim._closing import Closing
 from handsim.errors import CaptureError
 from handsim.files.arrays import check_npy_header
 from handsim.files.atomic import atomic_write, make_folder_of
@@ -59,7 +59,7 @@ def check_free(path: Path) -> None:
         )
 
 
-class GrowingArchive:
+class GrowingArchive(Closing):
     """Writes an archive while it grows; the end of a `with` block or `close` writes what still waits.
 
     Args:
@@ -147,14 +147,6 @@ class GrowingArchive:
             self.flush()
         finally:
             self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _write(self, content: bytes) -> None:
         rest = memoryview(content)

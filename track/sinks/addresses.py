@@ -8,11 +8,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from gloves.fit import GloveFit
 from handsim._checks import check_type
+from handsim._closing import Closing
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError, HandSimWarning
 from track.bodies.rigid_body import RigidTemplate
@@ -38,7 +38,7 @@ GROUP: Final = "handsim.sinks"
 _DOCUMENTS: Final = {"format": FORMATS, "points": ("no", "yes")}
 
 
-class SinkGroup:
+class SinkGroup(Closing):
     """Sends frames to sinks; the end of a `with` block closes them.
 
     Args:
@@ -87,14 +87,6 @@ class SinkGroup:
         sinks, self._sinks = self._sinks, {}
         for address, sink in sinks.items():
             self._close(address, sink)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _leave_out(self, address: str, error: Exception) -> None:
         warnings.warn(

@@ -13,11 +13,11 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
-from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol
 
 import numpy as np
 
+from handsim._closing import Closing
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
 from track.intake import FARTHEST, LATEST_TIME
 from track.streams.frame_order import FrameOrder
@@ -61,7 +61,7 @@ class ArrivingFrames(Protocol):
         ...
 
 
-class LiveStream(Iterator[StreamedFrame]):
+class LiveStream(Closing, Iterator[StreamedFrame]):
     """Frames of a live stream as a tracker takes them; the end of a `with` block or `close` ends it.
 
     They are in order (`track.streams.frame_order`), and their time never goes back: when the stream's time
@@ -177,14 +177,6 @@ class LiveStream(Iterator[StreamedFrame]):
             self._changed.notify_all()
         self._thread.join(_LEAVE)  # a source that does not listen ends with the process
         self._frames.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _read(self) -> None:
         """Take every frame as it arrives, in a thread of its own."""

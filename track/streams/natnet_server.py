@@ -7,8 +7,7 @@ import socket
 import threading
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Final, Protocol, Self
+from typing import Final, Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,6 +15,7 @@ from jaxtyping import Float, Int
 from gloves.captures.capture import Capture
 from gloves.optics.identities import number_runs
 from handsim._checks import check_type
+from handsim._closing import Closing
 from handsim.errors import CaptureError, choices
 from track.given import read_points
 from track.streams import natnet
@@ -49,7 +49,7 @@ class PointFrames(Protocol):
         ...
 
 
-class ReplayServer:
+class ReplayServer(Closing):
     """Streams frames at their rate over NatNet, while there is a client.
 
     Without a client it waits. The end of a `with` block or `close` ends it.
@@ -133,14 +133,6 @@ class ReplayServer:
         self._ended.set()
         self._thread.join()
         self._socket.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _serve(self) -> None:
         start = 0.0

@@ -10,10 +10,10 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 from urllib.parse import urlsplit
 
+from handsim._closing import Closing
 from handsim.errors import CaptureError
 from track.streams import natnet
 from track.streams.frame_source import StreamedFrame
@@ -57,7 +57,7 @@ def open_stream(
     return PointStream(sockets, address, info)
 
 
-class PointStream(Iterator[StreamedFrame]):
+class PointStream(Closing, Iterator[StreamedFrame]):
     """Iterator of the frames of a stream as they arrive, in any order; a `LiveStream` puts them in order.
 
     Packets are taken from the server's address, and its ports for commands and for data, only.
@@ -109,14 +109,6 @@ class PointStream(Iterator[StreamedFrame]):
         for one in self._sockets:
             one.close()
         self._sockets = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _keep_alive(self) -> float:
         """Send a keep-alive packet when it is due; returns how long to wait for a packet [s]."""
