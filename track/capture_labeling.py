@@ -26,6 +26,7 @@ from track.both_directions import label_both_ways
 from track.calibration.hand_size import sample_frames
 from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.hand_check import check_hands
 from track.setup import USUAL_SIZE, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.user import nominal_user
@@ -68,9 +69,9 @@ def label_capture(
     source = capture_of(capture)
     frames = checked_frames(source)
     sides = [side for side in BOTH if side in layout.sides]
-    user = found_user(sample_frames(frames), layout, sides, network)
-    if user is None:
-        user = nominal_user(layout, USUAL_SIZE, sides)
+    sample = sample_frames(frames)
+    user = found_user(sample, layout, sides, network) or nominal_user(layout, USUAL_SIZE, sides)
+    check_hands(sample, user, network)
     told = (lambda count: None) if progress is None else (lambda count: progress(count, len(frames)))
     if _is_continuous(frames):
         found = label_both_ways(frames, user, network, told)
