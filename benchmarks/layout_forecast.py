@@ -22,7 +22,7 @@ from scipy.stats import spearmanr
 
 from benchmarks.any_layout import random_layout
 from benchmarks.record import describe
-from gloves.layout import MarkerLayout, list_layouts, load_layout, save_layout
+from gloves.layout import MarkerLayout, list_layouts, load_layout
 from handsim.cli.main import main as handsim
 from handsim.space.cameras import load_rig
 from track.glove_advice.joint_spread import NOISE
@@ -102,7 +102,7 @@ def forecast(layout: MarkerLayout) -> Figures:
 def measure(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> Figures:
     """What a labeler that was trained on the layout does, and errors of solved joints."""
     glove, data, run = folder / "glove.toml", folder / "data", folder / "run"
-    save_layout(glove, layout)
+    layout.save(glove)
     if not data.exists():
         command = ["generate", "--glove", str(glove), "--num-frames", str(frames), "--seed", "5"]
         assert handsim([*command, "--out", str(data)]) == 0
