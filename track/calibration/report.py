@@ -24,6 +24,8 @@ ENOUGH_RANGE: Final = 0.3
 """Share of a joint's range that the user has to cover."""
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
+_USUAL_SLIP, _USUAL_LIFT = 0.003, 0.0005  # [m] of a glove's markers from where they were designed
+_USUAL_WORTH: Final = 4.0  # coordinates that this counts as
 _INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
@@ -67,6 +69,40 @@ def effective_noise(noise: float, repeated: float, num_frames: int) -> float:
     """
     flesh = repeated * noise**2
     return float(np.sqrt(noise**2 + flesh * max(num_frames / _INDEPENDENT_POSES - 1.0, 0.0)))
+
+
+def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
+    """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992).
+
+    Each marker counts as far as the data determine its place, beside a few of the usual spread.
+    """
+    reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
+    covariance = np.linalg.inv(reduced[:, :-1])
+    own = [slice(first, first + 3) for first in range(NUM_PARAMETERS, len(covariance), 3)]
+    blocks, normals = np.array([covariance[one, one] for one in own]), fit.normals
+    across = np.einsum("mi,mij,mj->m", normals, blocks, normals)
+    along = np.trace(blocks, axis1=1, axis2=2) - across
+    off = fit.design_residuals
+    slips = (off**2).sum(axis=1) - (off * normals).sum(axis=1) ** 2
+    lifts = (estimate.coordinates.heights - problem.heights) ** 2
+    problem.position_spread = _learned(slips, along, 2, problem.position_spread, _USUAL_SLIP)
+    problem.height_spread = _learned(lifts, across, 1, problem.height_spread, _USUAL_LIFT)
+
+
+def _learned(
+    squares: NDArray[np.float64], variances: NDArray[np.float64], axes: int, spread: float, usual: float
+) -> float:
+    """A spread [m] of offsets from zero.
+
+    Args:
+        squares: Estimated offsets, squared, summed over the axes (M,) [m^2].
+        variances: Their posterior variances, summed over the axes (M,) [m^2].
+        axes: Number of axes.
+        spread: The spread before [m].
+        usual: Of gloves [m].
+    """
+    determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
+    return float(np.sqrt((squares.sum() + _USUAL_WORTH * usual**2) / (determined + _USUAL_WORTH)))
 
 
 def standard_errors(

@@ -15,7 +15,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -31,17 +31,17 @@ from track.calibration.frames import (
     CalibrationError,
     PoseTrack,
     check_markers,
-    check_motion,
     complete_digits,
     informative_frames,
     initial_poses,
     solve_frames,
     usable_frames,
 )
-from track.calibration.hand_parameters import NUM_PARAMETERS, shape_at
+from track.calibration.hand_parameters import BREADTH, LENGTH, NUM_PARAMETERS, shape_at
 from track.calibration.report import (
     contact_gaps,
     effective_noise,
+    learn_spreads,
     marker_noise,
     repeated_share,
     standard_errors,
@@ -52,10 +52,13 @@ from track.calibration.solver import Progress, levenberg_marquardt, user_hand
 
 __all__ = ["Calibration", "CalibrationError", "Touch", "calibrate_hand", "calibrate_hands"]
 
+Extent = Literal["size", "size and markers", "everything"]
+"""What a calibration solves, the simplest first."""
 _WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # steps, as in the paper
 MOST_STEPS: Final = 30
 """Steps in all, at most."""
+_SPREAD_ROUNDS: Final = 4  # in which the spreads of marker places are learned
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
 _SIGNIFICANT: Final = 0.25  # weight above which a touch is significant
@@ -150,6 +153,7 @@ def calibrate_hand(
     start: GloveFit,
     rate: float,
     *,
+    extent: Extent = "everything",
     progress: Progress | None = None,
 ) -> Calibration:
     """Fit a hand and its glove to one user's labeled markers.
@@ -159,6 +163,7 @@ def calibrate_hand(
             which every joint moves and the thumb touches each fingertip and holds still for a moment.
         start: Where to begin: `nominal_fit` of the nearest size, or an earlier calibration.
         rate: Frames per second [Hz].
+        extent: What is solved; the rest stays as in `start`.
         progress: Called after each step.
 
     Returns:
@@ -173,14 +178,13 @@ def calibrate_hand(
     usable = usable_frames(markers, start)
     complete = complete_digits(markers, right.attachment)
     track = initial_poses(markers, right, usable)
-    check_motion(track, complete, start)
-    problem, estimate = _initial_problem(markers, right, track)
+    problem, estimate = _initial_problem(markers, right, track, extent)
     estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
     rough = user_hand(right, problem, estimate)
     rough_track = solve_frames(markers, rough, usable)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
-    estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, MOST_STEPS, progress)
+    estimate, fit = _solve_with_spreads(problem, estimate, steps, progress)
     done = user_hand(right, problem, estimate)
     before = _gaps_before(right, markers, touches, usable)
     final = solve_frames(markers, done, usable, rough_track.qpos)
@@ -236,7 +240,7 @@ def calibrate_hands(
 
 
 def _initial_problem(
-    markers: NDArray[np.float64], right: GloveFit, track: PoseTrack
+    markers: NDArray[np.float64], right: GloveFit, track: PoseTrack, extent: Extent
 ) -> tuple[Problem, Estimate]:
     """The problem without contacts, and the estimate that the first poses give."""
     chosen = informative_frames(track, markers)
@@ -249,8 +253,17 @@ def _initial_problem(
         markers[track.frames[chosen]],
         noise=_FIRST_NOISE,
         robust_scale=_FIRST_SCALE,
+        free=_solved(extent, len(coordinates.heights)),
     )
     return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, track.qpos[chosen])
+
+
+def _solved(extent: Extent, count: int) -> NDArray[np.bool_]:
+    """Which of the shared unknowns, 53 parameters and three per marker, are solved."""
+    free = np.full(NUM_PARAMETERS + 3 * count, extent == "everything")
+    free[[LENGTH, BREADTH]] = True
+    free[NUM_PARAMETERS:] |= extent == "size and markers"
+    return free
 
 
 def _solve_without_touches(
@@ -260,6 +273,16 @@ def _solve_without_touches(
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
     return levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
+
+
+def _solve_with_spreads(
+    problem: Problem, estimate: Estimate, steps: int, progress: Progress | None
+) -> tuple[Estimate, Fit]:
+    """The last steps; how far the glove's markers are from their design is learned meanwhile."""
+    for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
+        learn_spreads(problem, estimate, problem.fit(estimate))
+        estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
+    return estimate, fit
 
 
 def _with_touches(
@@ -285,6 +308,7 @@ def _with_touches(
         markers[track.frames[frames]],
         noise=effective_noise(noise, repeated_share(track.qpos, track.residuals), len(frames)),
         robust_scale=_SCALE_IN_NOISES * noise,
+        free=problem.free,
     )
     estimate = dataclasses.replace(estimate, qpos=track.qpos[frames])
     if not touches:
