@@ -54,10 +54,10 @@ from track.calibration.skin_coordinates import (
 
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
-POSITION_SPREAD: Final = 0.006
-"""Standard deviation of a marker's slip along the skin [m] that a solution begins with; (noise / spread)^2 is the
-paper's lambda_1."""
-HEIGHT_SPREAD: Final = 0.002
+POSITION_SPREAD: Final = 0.002
+"""Standard deviation of a marker's slip along the skin [m], to begin with; (noise / spread)^2 is the paper's
+lambda_1."""
+HEIGHT_SPREAD: Final = 0.0005
 """The same of a marker center's height around that of the design [m]."""
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
@@ -111,7 +111,7 @@ class NormalEquations(NamedTuple):
 
 
 class Problem:
-    """The data of a calibration; `robust_scale` and the two spreads of markers change, once a hand nearly fits.
+    """The data of a calibration; once a hand nearly fits, `robust_scale` and the markers' spreads change.
 
     Args:
         shape: Right hand that the parameters start from.
@@ -121,8 +121,6 @@ class Problem:
         noise: Standard deviation of a marker's coordinates [m].
         robust_scale: Distance [m] at which a residual has half the cost of a quadratic one
             (Geman and McClure 1987).
-        free: Which shared unknowns are solved, the parameters, then three per marker; the others stay as they
-            are. All when not given.
     """
 
     def __init__(
@@ -134,10 +132,8 @@ class Problem:
         *,
         noise: float,
         robust_scale: float,
-        free: Bool[np.ndarray, "S"] | None = None,
     ) -> None:
         self.shape, self.design, self.heights = shape, design, heights
-        self.free = np.ones(NUM_PARAMETERS + 3 * len(heights), dtype=bool) if free is None else free
         self.present: Bool[np.ndarray, "F M"] = np.isfinite(targets).all(axis=2)
         """Markers that are not missing."""
         self.targets = np.where(self.present[..., None], targets, 0.0)

@@ -109,14 +109,13 @@ def _step(
     problem: Problem, estimate: Estimate, fit: Fit, damping: float
 ) -> tuple[Estimate, Fit, float, bool]:
     """One step: the new estimate, its fit, the next damping, and whether the energy fell."""
-    equations, free = problem.normal_equations(estimate, fit), problem.free
+    equations = problem.normal_equations(estimate, fit)
     for _ in range(_MOST_TRIALS):
         reduced, solved = eliminate_poses(equations, damping)
         system, gradient = reduced[:, :-1].copy(), reduced[:, -1]
         diagonal = np.arange(len(system))
         system[diagonal, diagonal] += damping * equations.shared[diagonal, diagonal]
-        shared = np.zeros(len(system))
-        shared[free] = -np.linalg.solve(system[np.ix_(free, free)], gradient[free])
+        shared = -np.linalg.solve(system, gradient)
         poses = -solved[..., -1] - solved[..., :-1] @ shared
         trial = problem.apply_step(estimate, poses, shared)
         trial_fit = problem.fit(trial)
