@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.record import describe
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout, save_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of
 from handsim.space.cameras import load_rig
@@ -129,7 +129,7 @@ def forecast(layout: MarkerLayout) -> Figures:
 def measure(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> Figures:
     """What a labeler that was trained on the layout does, and errors of solved joints."""
     glove, data, run = folder / "glove.toml", folder / "data", folder / "run"
-    save_layout(glove, layout)
+    layout.save(glove)
     if not data.exists():
         command = ["generate", "--glove", str(glove), "--num-frames", str(frames), "--seed", "5"]
         assert handsim([*command, "--out", str(data)]) == 0

@@ -13,8 +13,6 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures.capture import Capture
-from gloves.captures.markers import labeled_capture
 from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
@@ -88,24 +86,6 @@ def label_capture(
         user.hands, no_poses, source.positions, ids, labels, rate=source.rate, settings=settings
     )
     return dataclasses.replace(take, confidence=confidence)
-
-
-def labeled_points(take: Take, *, sides: bool = True) -> Capture:
-    """The labeled points of a take as a capture: one column per marker, then columns for the other points.
-
-    Args:
-        take: The take.
-        sides: Whether hands have columns of their own, `right:ThumbTip`; without them there are those of one
-            hand, `ThumbTip`, and no frame may hold two.
-    """
-    names, labels = take.label_names, take.labels.astype(np.int64)
-    if not sides:
-        names = take.hands[0].layout.names
-        labels = np.where(labels >= 0, labels % len(names), -1)
-    there = np.isfinite(take.points[..., 0])
-    frames = [points[seen] for points, seen in zip(take.points, there, strict=True)]
-    rows = [row[seen] for row, seen in zip(labels, there, strict=True)]
-    return labeled_capture(frames, rows, names, take.rate)
 
 
 def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:

@@ -19,7 +19,6 @@ from gloves.layout import (
     MarkerPlace,
     list_layouts,
     load_layout,
-    save_layout,
     shipped_layout,
     starter_layout,
 )
@@ -302,7 +301,7 @@ def improve_glove(
         step("dropping one marker at a time, to compare")
         fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
     found = search.layout
-    save_layout(out, found)
+    found.save(out)
     print_line(f"before: {layout.num_markers} markers, {_worth_line(before)}")
     print_line(f"after:  {count} markers, {_worth_line(search.worth)}")
     for fewer_count, worth in fewer:
