@@ -77,7 +77,6 @@ def track(
     from gloves.captures.formats import write_capture
     from gloves.takes.take import load_take
     from handsim.cli.options import chosen_hands
-    from track.capture_labeling import labeled_points
     from track.live import track_live
     from track.setup import TrackerSetup, warm_up
     from track.sinks.addresses import open_sinks
@@ -102,7 +101,7 @@ def track(
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
     if labeled is not None:
-        write_capture(labeled, labeled_points(tracked.take if tracked.is_whole else load_take(out)))
+        write_capture(labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture())
     if shape is not None and glove is None:
         print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
     _tell(out, tracked, float(np.median(times)))
