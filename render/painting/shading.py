@@ -74,14 +74,13 @@ def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float32], u: float,
     for i in range(2):
         for j in range(2):
             share = (below if i else 1.0 - below) * (right if j else 1.0 - right)
-            texel = texels[row + i, column + j]
-            red += share * table[texel[0]]
-            green += share * table[texel[1]]
-            blue += share * table[texel[2]]
-            rough += share * texel[3]
-            x += share * texel[4]
-            y += share * texel[5]
-            z += share * texel[6]
+            red += share * table[texels[row + i, column + j, 0]]
+            green += share * table[texels[row + i, column + j, 1]]
+            blue += share * table[texels[row + i, column + j, 2]]
+            rough += share * texels[row + i, column + j, 3]
+            x += share * texels[row + i, column + j, 4]
+            y += share * texels[row + i, column + j, 5]
+            z += share * texels[row + i, column + j, 6]
     return red, green, blue, rough / 255.0, x / 127.5 - 1.0, y / 127.5 - 1.0, z / 127.5 - 1.0
 
 
