@@ -91,8 +91,17 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
             TO_DISPLAY,
             sums,
         )
-    painted: NDArray[np.uint8] = np.rint(63.75 * sums).astype(np.uint8)
+    painted = np.zeros((height, width, 4), dtype=np.uint8)
+    _as_bytes(sums.reshape(-1, 4), covered, painted.reshape(-1, 4))
     return painted
+
+
+@kernel
+def _as_bytes(sums: NDArray[np.float32], covered: NDArray[np.int32], painted: NDArray[np.uint8]) -> None:
+    """Write the bytes of covered pixels (P, 4), of sums over four samples (P, 4)."""
+    for pixel in covered:
+        for channel in range(4):
+            painted[pixel, channel] = int(np.rint(np.float32(63.75) * sums[pixel, channel]))
 
 
 def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
@@ -170,12 +179,7 @@ def _spots(
         to_linear: `shading.TO_LINEAR` (256,).
     """
     width = first.shape[1] // 2
-    end, most = begin + len(faces), 0
-    for pixel in covered:
-        row, column = pixel // width, pixel % width
-        for i in range(2):
-            for j in range(2):
-                most += begin <= first[2 * row + i, 2 * column + j] < end
+    end, most = begin + len(faces), 4 * len(covered)  # what is not used of these arrays takes no memory
     spots = np.empty((most, SPOT), np.float32)
     pixels, shares = np.empty(most, np.int64), np.empty(most, np.float32)
     spot = 0

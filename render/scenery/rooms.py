@@ -1,7 +1,4 @@
-"""Ray-cast pictures of random rooms: walls, floor and ceiling with patterns, and boxes for furniture.
-
-Half of the picture's resolution is enough: a background is out of focus.
-"""
+"""Ray-cast pictures of random rooms: walls, floor and ceiling with patterns, and boxes for furniture."""
 
 from __future__ import annotations
 
@@ -16,7 +13,6 @@ from numpy.typing import NDArray
 from handsim.kernels.kernel import kernel
 from render.sensors.random_images import normal_numbers
 
-_REDUCED: Final = 2
 _FURNITURE: Final = (4, 14)
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls
 _WALLS: Final = (0.12, 0.08, 0.12, 0.68)  # how often a wall has each of these
@@ -73,15 +69,14 @@ def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
         size: Width and height [pixels].
         seed: Seed of the random choices.
     """
-    width, height = (max(1, length // _REDUCED) for length in size)
+    width, height = size
     scene = _scene(seed)
     rays = _rays(width, height, *scene.lens)
     light = _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
-    small = light.reshape(height, width, 3)
+    picture = light.reshape(height, width, 3)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
-    small *= np.float32(1.0) + np.float32(0.05) * grain
-    small = cv2.GaussianBlur(small, (0, 0), 0.9)  # or edges would show the coarse pixels
-    drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
+    picture *= np.float32(1.0) + np.float32(0.05) * grain
+    drawn: NDArray[np.float32] = cv2.GaussianBlur(picture, (0, 0), 0.9)  # rays have no width, pixels have
     return drawn
 
 
