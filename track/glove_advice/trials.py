@@ -88,6 +88,7 @@ def try_layout(
     *,
     work: Sequence[str] = tuple(WORK),
     count: int = CAPTURES,
+    first: int = 0,
     frames: int = FRAMES,
     told: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Trial]:
@@ -99,6 +100,7 @@ def try_layout(
         labeler: A labeler of the glove.
         work: Kinds of work, of `WORK`.
         count: Captures of each kind, each of another person.
+        first: Number of the first capture.
         frames: Of each capture.
         told: Called before each capture with what it is.
     """
@@ -113,7 +115,9 @@ def try_layout(
         for number in range(1, count + 1):
             told(f"{name}, capture {number} of {count}")
             kind = WORK[name].kind
-            take = simulate_take(kind, glove=layout, num_frames=frames, rig=rig, seed=number, hands=sides)
+            take = simulate_take(
+                kind, glove=layout, num_frames=frames, rig=rig, seed=first + number, hands=sides
+            )
             tried.append(try_take(take, labeler))
         found[name] = _mean(tried)
     return found
