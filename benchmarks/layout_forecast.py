@@ -2,8 +2,8 @@
 
 Twelve layouts of 6 to 30 markers: symmetric, sparse, on the palm's side, without thumb, in clusters, and
 shipped ones. Forecast and outcome have other people and motions. With --labelers each layout also gets a
-training set and a labeler of its own, and its joints are solved. Layouts that are finished stay in the folder;
-run again to continue.
+training set and a labeler of its own, and its joints are solved. Layouts that are finished stay in the
+folder; run again to continue.
 
 python -m benchmarks.layout_forecast FOLDER [--labelers] [--frames 60000] [--samples 300000]
 """

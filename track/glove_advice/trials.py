@@ -118,14 +118,20 @@ def try_layout(
             take = simulate_take(
                 kind, glove=layout, num_frames=frames, rig=rig, seed=first + number, hands=sides
             )
-            tried.append(try_take(take, labeler))
+            tried.append(try_take(take, layout, labeler))
         found[name] = _mean(tried)
     return found
 
 
-def try_take(truth: Take, labeler: Labeler) -> Trial:
-    """Label and track the points of a simulated capture whose hands are not known."""
-    layout, capture = truth.hands[0].layout, truth.capture()
+def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
+    """Label and track the points of a simulated capture whose hands are not known.
+
+    Args:
+        truth: The capture, whose gloves have slipped a little.
+        layout: The glove as designed.
+        labeler: A labeler of it.
+    """
+    capture = truth.capture()
     sides = [side for side in BOTH if side in layout.sides]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)
