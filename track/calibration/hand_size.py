@@ -53,6 +53,7 @@ _WINDOWS: Final = 8  # parts of a capture that are looked at
 _WINDOW: Final = 30  # frames of each
 _FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
 _UNSURE: Final = 0.003  # [m] standard deviation of the length from which on it is told
+_SLIP_SPREAD, _LIFT_SPREAD = 0.006, 0.002  # [m] of markers around their places, so that tracking finds them
 _REPEATED: Final = 4.0  # a glove that slipped is the same in all frames: they tell the length as one does
 _LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers, before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
@@ -304,6 +305,7 @@ def _fit_proportions(
     problem = Problem(
         shape, coordinates, worn.layout.heights, seen, noise=_FIT_NOISE, robust_scale=_ROBUST_SCALE
     )
+    problem.position_spread, problem.height_spread = _SLIP_SPREAD, _LIFT_SPREAD
     poses = PoseSolver(start).solve(seen).qpos
     estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
     estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None)

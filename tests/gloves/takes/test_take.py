@@ -178,7 +178,7 @@ def test_labeled_points_become_columns_and_lose_none(take):
 
 
 def test_paths_are_paths(take):
-    with pytest.raises(ArgumentError, match="path is 3, expected the path of a .npz file"):
+    with pytest.raises(ArgumentError, match=r"path is 3, expected the path of a \.npz file"):
         take.save(3)
     with pytest.raises(ArgumentError, match="path is 3"):
         take.export(3)
