@@ -59,8 +59,13 @@ def test_no_marker_is_asked_for_where_every_bone_has_one(good):
     (sentence,) = advice(dataclasses.replace(good, joints=joints))
     assert sentence.startswith("Add a marker on middle_middle")  # the tip has one
     bones = [bone for bone in BONE_NAMES if bone.startswith("middle")]
-    more = [MarkerPlace(bone, bone, 0.5, 0.0) for bone in bones[:2]]
-    layout = dataclasses.replace(good.layout, markers=(*good.layout.markers, *more))
+    first, *_, second = good.layout.markers[:4]  # of other digits
+    moved = {
+        one.name: MarkerPlace(one.name, bone, 0.5, 0.0)
+        for one, bone in zip((first, second), bones, strict=False)
+    }
+    markers = tuple(moved.get(one.name, one) for one in good.layout.markers)
+    layout = dataclasses.replace(good.layout, markers=markers)
     assert advice(dataclasses.replace(good, joints=joints, layout=layout)) == []
 
 
