@@ -88,9 +88,7 @@ def open_content(
     return content
 
 
-def _open(
-    name: str, out: Path | None, size: str, rig: CameraRig | str | None, time: float | None
-) -> Content:
+def _open(name: str, out: Path | None, size: str, rig: CameraRig | str | None, time: float | None) -> Content:
     path = Path(name)
     if not path.exists() and name in list_layouts():
         return _layout(name, None, out, size)
