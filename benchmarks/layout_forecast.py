@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.any_layout import random_layout
 from benchmarks.record import describe
-from gloves.layout import MarkerLayout, list_layouts, load_layout, save_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
+from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of
 from handsim.space.cameras import load_rig
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout
@@ -69,17 +69,44 @@ def main() -> None:
 
 
 def chosen_layouts() -> list[MarkerLayout]:
-    """Eight shipped layouts, three random ones and one whose fingers look alike."""
-    layouts = [load_layout(name) for name in list_layouts()]
-    rng = np.random.default_rng(11)
-    layouts += [random_layout(number, rng) for number in range(3)]
-    rows = load_layout("dense19")
-    fingers = [marker for marker in rows.markers if marker.bone.split("_")[0] not in ("thumb", "palm")]
-    alike = tuple(
-        dataclasses.replace(marker, along=0.5, around=0.0)
-        for marker in {marker.bone: marker for marker in fingers}.values()
-    )
-    return [*layouts, dataclasses.replace(rows, name="alike", markers=alike)]
+    """Twelve layouts of 6 to 30 markers: five shipped ones, and seven with what makes layouts hard."""
+    shipped = [load_layout(name) for name in ("starter6", "tips8", "starter10", "sparse13", "starter30")]
+    tips = [_on(digit, 3, 0.7) for digit in DIGITS]
+    fingers = DIGITS[1:]
+    knuckles, middles = ([_on(digit, bone, 0.55) for digit in fingers] for bone in (1, 2))
+    palm = [*tips, *middles, *_back((0.3, 0.2), (0.4, -0.25), (0.75, 0.1))]
+    pairs = [_on(digit, 3, *place) for digit in DIGITS for place in ((0.45, -0.4), (0.75, 0.4))]
+    sides = [*(_on(digit, 3, 0.6, 0.5) for digit in DIGITS), _on("thumb", 2, 0.5, 0.3),
+             _on("middle", 2, 0.5, -0.5), _on("little", 2, 0.5, -1.0)]  # fmt: skip
+    some = [_on("index", 2, 0.5), _on("ring", 2, 0.5)]
+    made = {
+        "symmetric8": [*tips[1:], *_back((0.3, 0.2), (0.3, -0.2), (0.7, 0.2), (0.7, -0.2))],
+        "mixed10": [*tips, *some, *_back((0.3, 0.25), (0.5, -0.2), (0.7, 0.0))],
+        "near13": [
+            *tips, *middles, _on("index", 3, 0.15), *_back((0.3, 0.2), (0.35, -0.25), (0.7, 0.05)),
+        ],
+        "bones16": [*tips, *middles, _on("thumb", 2, 0.5), *knuckles, *_back((0.3, 0.2), (0.4, -0.2))],
+        "palmar12": [dataclasses.replace(one, around=np.pi) for one in palm],
+        "clusters18": [
+            *pairs, *knuckles, *_back((0.3, 0.12), (0.42, 0.12), (0.36, -0.05), (0.6, -0.25)),
+        ],
+        "sides11": [*sides, *_back((0.25, 0.0), (0.5, 0.3), (0.6, -0.3))],
+    }  # fmt: skip
+    return [*shipped, *(MarkerLayout(name, tuple(places), 0.0032) for name, places in made.items())]
+
+
+def _on(digit: str, number: int, along: float, around: float = 0.0) -> MarkerPlace:
+    """A marker on a digit's bone, the first, second or third from the knuckle."""
+    bone = BONE_NAMES[bones_of(digit)[number - 1]]
+    return MarkerPlace(f"{bone}_{along:g}_{around:g}", bone, along, around)
+
+
+def _back(*places: tuple[float, float]) -> list[MarkerPlace]:
+    """Markers on the back of the hand: along and across."""
+    return [
+        MarkerPlace(f"Back{number}", "palm", along, 0.0, across)
+        for number, (along, across) in enumerate(places, 1)
+    ]
 
 
 def stored(path: Path, make: Callable[[], Figures]) -> Figures:
@@ -102,7 +129,7 @@ def forecast(layout: MarkerLayout) -> Figures:
 def measure(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> Figures:
     """What a labeler that was trained on the layout does, and errors of solved joints."""
     glove, data, run = folder / "glove.toml", folder / "data", folder / "run"
-    save_layout(glove, layout)
+    layout.save(glove)
     if not data.exists():
         command = ["generate", "--glove", str(glove), "--num-frames", str(frames), "--seed", "5"]
         assert handsim([*command, "--out", str(data)]) == 0

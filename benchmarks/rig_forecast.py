@@ -21,7 +21,7 @@ from benchmarks.record import describe
 from gloves.captures.gaps import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
-from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig, save_rig
+from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig
 from train.rig_advice.forecast import ROOM, forecast, light
 from train.rig_advice.plan import plan
 from train.rig_advice.work import sample_work
@@ -69,7 +69,7 @@ def compare(folder: Path, frames: int) -> None:
     table = []
     for rig in rigs():
         path = folder / f"{rig.name}.toml"
-        save_rig(path, rig)
+        rig.save(path)
         told = forecast(light(scenes, rig, rng=np.random.default_rng(0)), rig)
         expected = (100 * told.missing, told.gaps, 120 * told.gap_median)
         kept = captured(path, frames, WELL_KEPT)

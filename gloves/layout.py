@@ -187,6 +187,18 @@ class MarkerLayout:
         """Number of markers, M."""
         return len(self.markers)
 
+    def save(self, path: str | Path) -> None:
+        """Write the layout as TOML, numbers to nine decimals; `load_layout` gives the same layout again.
+
+        Raises:
+            LayoutError: The file cannot be written.
+        """
+        try:
+            with atomic_write(path) as temporary:
+                temporary.write_text("\n".join(layout_lines(self)) + "\n", "utf-8")
+        except OSError as error:
+            raise LayoutError(f"{path}: cannot be written: {error.strerror or error}") from error
+
 
 @dataclass(frozen=True, slots=True)
 class ShippedLayout:
@@ -248,19 +260,6 @@ def shipped_layout(name: str) -> ShippedLayout:
     return ShippedLayout(
         parse_layout(table), text_of(table, "description", default=""), text_of(table, "source", default="")
     )
-
-
-def save_layout(path: str | Path, layout: MarkerLayout) -> None:
-    """Write a layout as TOML, numbers to nine decimals; `load_layout` gives the same layout again.
-
-    Raises:
-        LayoutError: The file cannot be written.
-    """
-    try:
-        with atomic_write(path) as temporary:
-            temporary.write_text("\n".join(layout_lines(layout)) + "\n", "utf-8")
-    except OSError as error:
-        raise LayoutError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:

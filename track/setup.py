@@ -11,7 +11,7 @@ from typing import Any, Final, Self, get_args
 
 import numpy as np
 
-from gloves.fit import GloveFit
+from gloves.fit import GloveFit, attach
 from gloves.layout import MarkerLayout, load_layout
 from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimWarning, choices
@@ -150,6 +150,11 @@ def found_user(
     """The user whose hands are in some frames, measured; None if no hand is found."""
     size = fit_size(frames, layout, sides, labeler)
     return None if size is None else User(size.hands(sides), f"auto, {size}")
+
+
+def as_designed(user: User) -> tuple[GloveFit, ...]:
+    """The hands of a user in the glove as it was designed."""
+    return tuple(attach(hand.layout, hand.model) for hand in user)
 
 
 def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:

@@ -40,7 +40,7 @@ def label(
     from handsim.app.messages import print_line
     from handsim.app.progress import progress_bar
     from handsim.files.outputs import check_outputs
-    from track.capture_labeling import label_capture, labeled_points
+    from track.capture_labeling import label_capture
     from track.take_summary import no_points
     from train.threads import label_on
 
@@ -55,7 +55,7 @@ def label(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     right, left = _hands_there(take)
-    write_capture(out, labeled_points(take, sides=bool((right & left).any())))
+    write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
     labeled, points = take.labels >= 0, np.isfinite(take.points[..., 0])
     sure = f", median confidence {np.median(take.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(

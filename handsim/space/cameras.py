@@ -107,6 +107,15 @@ class CameraRig:
         """The rig as a JSON record, which `as_rig` reads."""
         return {"name": self.name, "cameras": [one.record() for one in self.cameras]}
 
+    def save(self, path: str | Path) -> None:
+        """Write the rig's `.toml` file; `load_rig` gives an equal rig again.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        with atomic_write(path) as temporary:
+            temporary.write_text("\n".join(rig_lines(self.name, self.cameras)) + "\n", encoding="utf-8")
+
     def digest(self) -> str:
         """Beginning of the SHA-256 of its record to nine decimals: whether a name still means this rig."""
         rounded = json.loads(json.dumps(self.record()), parse_float=lambda text: round(float(text), 9) + 0.0)
@@ -186,16 +195,6 @@ def rig_setting(rig: CameraRig | str | Path | Mapping[str, Any]) -> str | dict[s
     """
     found = as_rig(rig)
     return found.name if found.name in list_rigs() and found == named_rig(found.name) else found.record()
-
-
-def save_rig(path: Path, rig: CameraRig) -> None:
-    """Write a rig's `.toml` file; `load_rig` gives an equal rig again.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    with atomic_write(path) as temporary:
-        temporary.write_text("\n".join(rig_lines(rig.name, rig.cameras)) + "\n", encoding="utf-8")
 
 
 def _shipped(name: str) -> Path:

@@ -36,6 +36,7 @@ from render.painting.shadows import shadow_map
 from render.scenery.lights import Lighting
 
 _SMOOTH: Final = 0.006  # a pixel whose depths differ by less than this share shows one surface
+_SHADED_AROUND: Final = 0.1  # of the picture around it, where a surface may have vertices of one in it
 _ROUGHEST: Final = 0.04  # that a mirror can be
 _BLOCK: Final = 2048  # surface points shaded at a time, so that they stay in the processor's cache
 
@@ -69,7 +70,11 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     lamps, around = _lamp_table(lighting), np.zeros((9, 3))
     around[: max(1, len(lighting.surroundings))] = lighting.surroundings or lighting.ambient
     casting = np.concatenate([one.casting + first for one, first in zip(drawn, counts, strict=False)])
-    shadows = shadow_map(np.concatenate([mesh.rows[:, :3] for mesh in meshes]), casting, lamps[0, :3])
+    sides = 2.0 * np.array([width, height])
+    with np.errstate(invalid="ignore"):  # NaN behind the camera
+        inside = np.abs(corners[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
+    points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
+    shadows = shadow_map(points, casting, lamps[0, :3], inside.all(axis=1))
     sums = np.zeros((height, width, 4), dtype=np.float32)
     for mesh in meshes:
         spots, pixels, shares = _spots(nearness, first, *mesh, TO_LINEAR)

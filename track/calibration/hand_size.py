@@ -24,6 +24,7 @@ from track.calibration.energy import Estimate, Problem
 from track.calibration.hand_parameters import NUM_PARAMETERS
 from track.calibration.skin_coordinates import nearest_coordinates
 from track.calibration.solver import levenberg_marquardt, user_hand
+from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
@@ -43,6 +44,7 @@ _INDEPENDENT: Final = 4.0  # frames' worth of evidence: what glue and flesh do r
 _PROBE: Final = 0.006  # [m] of length to either side, where the cost tells how sure the length is
 _FRAMES: Final = 8  # of each hand with which length and breadth are searched
 _PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted to
+_MOST_FRAMES: Final = 0.5  # share of the frames in which measured hands must be found
 _FEWEST: Final = 3  # frames with which a size is trusted
 _MISSING: Final = 0.2  # share of the markers at most in such a frame
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
@@ -51,6 +53,9 @@ _WINDOWS: Final = 8  # parts of a capture that are looked at
 _WINDOW: Final = 30  # frames of each
 _FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
 _UNSURE: Final = 0.003  # [m] standard deviation of the length from which on it is told
+_SLIP_SPREAD, _LIFT_SPREAD = 0.006, 0.002  # [m] of markers around their places, so that tracking finds them
+_REPEATED: Final = 4.0  # a glove that slipped is the same in all frames: they tell the length as one does
+_LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers, before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
 
@@ -108,16 +113,43 @@ def fit_size(
     Returns:
         The hands, both of one shape; None if no hand is found that shows most of its markers.
     """
-    for length in _LENGTHS:
-        found = _measure_from(length, frames, layout, sides, labeler)
-        if (
-            found is not None and abs(found.measures[0] - length) > _FAR
-        ):  # the labels are better with its own size
-            found = _measure_from(found.measures[0], frames, layout, sides, labeler) or found
-        if found is not None:
-            hand, rms = _fit_proportions(found.markers, _hand(*found.measures, layout, "right"))
-            return SizeFit(hand, rms, found.spread)
+    usual = TrackerConfig()
+    for config in (usual, _LENIENT):
+        for length in _LENGTHS:
+            fit = _fit_from(length, frames, layout, sides, labeler, config)
+            if fit is not None and (config is usual or _is_found(fit, frames, sides, labeler)):
+                return fit
     return None
+
+
+def _fit_from(
+    length: float,
+    frames: Sequence[StreamedFrame],
+    layout: MarkerLayout,
+    sides: Sequence[Side],
+    labeler: Labeler,
+    config: TrackerConfig,
+) -> SizeFit | None:
+    """The hands that are found as hands of a length [m]."""
+    found = _measure_from(length, frames, layout, sides, labeler, config)
+    if found is not None and abs(found.measures[0] - length) > _FAR:  # its own size labels better
+        found = _measure_from(found.measures[0], frames, layout, sides, labeler, config) or found
+    if found is None:
+        return None
+    hand, rms = _fit_proportions(found.markers, _hand(*found.measures, layout, "right"))
+    return SizeFit(hand, rms, found.spread)
+
+
+def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
+    """Whether hands that were measured by weak evidence are found by the usual one in most frames."""
+    tracker = Tracker(fit.hands(sides), labeler)
+    least = (1.0 - _MISSING) * fit.hand.layout.num_markers
+    tracked = [
+        any(hand.has_pose for hand in tracker.step(frame.points, frame.ids, frame.time).hands)
+        for frame in frames
+        if len(frame.points) >= least
+    ]
+    return bool(np.mean(tracked) >= _MOST_FRAMES) if tracked else False
 
 
 def _measure_from(
@@ -126,10 +158,11 @@ def _measure_from(
     layout: MarkerLayout,
     sides: Sequence[Side],
     labeler: Labeler,
+    config: TrackerConfig,
 ) -> _Measured | None:
     """What is measured on hands that are labeled as hands of a length [m]."""
     users = [_hand(length, usual_breadth(length), layout, side) for side in sides]
-    markers = {side: some for side, some in _label(frames, users, labeler) if len(some) >= _FEWEST}
+    markers = {side: some for side, some in _label(frames, users, labeler, config) if len(some) >= _FEWEST}
     return _Measured(markers, *_search(markers, users)) if markers else None
 
 
@@ -146,10 +179,11 @@ def _hand(length: float, breadth: float, layout: MarkerLayout, side: Side) -> Gl
 
 
 def _label(
-    frames: Sequence[StreamedFrame], users: Sequence[GloveFit], labeler: Labeler
+    frames: Sequence[StreamedFrame], users: Sequence[GloveFit], labeler: Labeler, config: TrackerConfig
 ) -> Iterator[tuple[Side, Float[np.ndarray, "F M 3"]]]:
     """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them."""
-    tracker, count = Tracker(users, labeler), users[0].layout.num_markers
+    tracker = Tracker(users, labeler, config=config)
+    count = users[0].layout.num_markers
     found: list[list[NDArray[np.float64]]] = [[] for _ in users]
     in_vain = 0
     for frame in frames:
@@ -204,8 +238,9 @@ def _search(
     breadth = _least(lambda tried: cost(length, tried), _BREADTHS[0] * usual, _BREADTHS[1] * usual)
     length = _least(lambda tried: cost(tried, breadth), 0.95 * length, 1.05 * length)
     around = [cost(length + step, breadth) for step in (-_PROBE, 0.0, _PROBE)]
+    prior = _LENGTH_SPREAD**-2
     curvature = (around[0] - 2.0 * around[1] + around[2]) / _PROBE**2
-    return (length, breadth), max(curvature, _LENGTH_SPREAD**-2) ** -0.5
+    return (length, breadth), (max(curvature - prior, 0.0) / _REPEATED + prior) ** -0.5
 
 
 def _least(function: Callable[[float], float], low: float, high: float) -> float:
@@ -270,6 +305,7 @@ def _fit_proportions(
     problem = Problem(
         shape, coordinates, worn.layout.heights, seen, noise=_FIT_NOISE, robust_scale=_ROBUST_SCALE
     )
+    problem.position_spread, problem.height_spread = _SLIP_SPREAD, _LIFT_SPREAD
     poses = PoseSolver(start).solve(seen).qpos
     estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
     estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None)

@@ -52,9 +52,10 @@ _MEANINGS: Final = {
     "point_scores": "Log-probability for each point of each marker, in the order of handsim.marker_names; "
     "the last column is a ghost.",
     "label_scores": "Log-probability for each marker of each point; the last column is that it is not seen.",
-    "pairs": "Probability for each point of each marker, no two points of one marker; the last column is a ghost.",
-    "costs": "What each marker costs each point, then each point as a ghost, in its own column: labels are the "
-    "assignment of least cost, verified by a prior of hands (docs/how_to/onnx.md).",
+    "pairs": "Probability for each point of each marker, no two points of one marker; the last column is a "
+    "ghost.",
+    "costs": "What each marker costs each point, then each point as a ghost, in its own column: labels are "
+    "the assignment of least cost, verified by a prior of hands (docs/how_to/onnx.md).",
     "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where "
     "there is none.",
     "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "

@@ -82,8 +82,9 @@ class SetLabeler(nn.Module):
 class PairedScores(nn.Module):
     """A network with two more outputs, for exported files: what its labels are assigned by.
 
-    They are as `train.matching.assignment` makes them of the scores: the probabilities of pairs of a point and a
-    label, ghosts last (B, N, M+1); and what each label costs each point, and each point as a ghost (B, N, M+N).
+    They are as `train.matching.assignment` makes them of the scores: the probabilities of pairs of a point
+    and a label, ghosts last (B, N, M+1); and what each label costs each point, and each point as a ghost
+    (B, N, M+N).
 
     Args:
         network: The network.

@@ -33,6 +33,7 @@ from train.simulation.room_settings import (
     OpticsOptions,
     RoomConfig,
     SimulatedKind,
+    usual_room,
 )
 
 WRIST_VOLUME: Final = 0.5
@@ -40,7 +41,6 @@ WRIST_VOLUME: Final = 0.5
 BOTH: Final[tuple[Side, Side]] = ("right", "left")
 APART: Final = ("single-hand", "calibration", "free")
 """Kinds of capture in which a hand may be alone."""
-_ALIKE: Final = {"real-like": "hand-hand", "free": "single-hand"}  # kinds whose rooms are alike
 _MAX_PEOPLE: Final = 10
 _SLIP_ALONG, _SLIP_AROUND = 0.05, np.deg2rad(5.0)
 
@@ -94,10 +94,8 @@ class TakeConfig:
 
     @property
     def room(self) -> RoomConfig:
-        """The room of the paper's capture, or of the one most like this kind."""
-        if self.kind == "calibration":
-            return RoomConfig()
-        return TWINS[_ALIKE.get(self.kind, self.kind)].room
+        """The room of this kind."""
+        return usual_room(self.kind)
 
 
 def simulate_take(

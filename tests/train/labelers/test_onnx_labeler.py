@@ -181,7 +181,14 @@ def test_the_file_tells_what_goes_in_and_out(exported):
     model = onnx.load(str(exported))
     told = {entry.key: entry.value for entry in model.metadata_props}
     ends = [*model.graph.input, *model.graph.output]
-    assert [end.name for end in ends] == ["points", "present", "point_scores", "label_scores"]
+    assert [end.name for end in ends] == [
+        "points",
+        "present",
+        "point_scores",
+        "label_scores",
+        "pairs",
+        "costs",
+    ]
     for end in ends:
         assert told[f"handsim.{end.name}"] == end.doc_string != ""
     assert "meters" in told["handsim.points"]
