@@ -203,6 +203,7 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
     start, memory, first = time.perf_counter(), [], 0
     there = np.zeros(frames, dtype=bool)
     packets = open_stream(server.url)
+    packets.is_live = False  # this server waits for its reader
     with LiveStream(packets, ended=server.ended.is_set) as stream:
         with Recorder(out, tracker) as recorder:
             for frame in stream:

@@ -70,10 +70,11 @@ class PointStream(Closing):
     the socket from running over.
     """
 
-    is_live: Final = True
-    error: Final = None
-
     def __init__(self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo) -> None:
+        self.is_live = True
+        """Whether frames come at their own pace."""
+        self.error: Exception | None = None
+        """Nothing makes it fail: a server that is gone may come again."""
         self.server = server
         """The server's description of itself."""
         self.packets = 0
