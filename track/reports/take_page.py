@@ -202,7 +202,7 @@ def _doubts_section(take: Take, doubts: Sequence[Doubt], source: str) -> Section
         frames = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first} to {doubt.last}"
         start, end, worst = (f"{take.times[one]:.3f}" for one in (doubt.first, doubt.last, doubt.worst))
         look = f"frame {doubt.worst}, {worst} s"
-        table.append([frames, start, end, doubt.of, doubt.why, look, command])
+        table.append([frames, start, end, doubt.of, doubt.why, look, f"{command} --time {worst}"])
     text = (
         "Frames in which a hand is lost or coasts, the longest first, then labels of little confidence, "
         f"which is given. <code>{escape(command)}</code> lists the worst of them too; a click leads there, "
