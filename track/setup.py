@@ -23,7 +23,7 @@ from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
-from track.user import User, checked_sides, load_user, nominal_user
+from track.user import MEASURED, User, checked_sides, load_user, nominal_user
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
@@ -141,7 +141,7 @@ def measured_user(
         stacklevel=3,
     )
     usual = nominal_user(layout, USUAL_SIZE, sides)
-    return User(usual.hands, f"auto, {USUAL_SIZE}")
+    return User(usual.hands, f"{MEASURED}{USUAL_SIZE}")
 
 
 def found_user(
@@ -149,7 +149,7 @@ def found_user(
 ) -> User | None:
     """The user whose hands are in some frames, measured; None if no hand is found."""
     size = fit_size(frames, layout, sides, labeler)
-    return None if size is None else User(size.hands(sides), f"auto, {size}")
+    return None if size is None else User(size.hands(sides), f"{MEASURED}{size}")
 
 
 def warm_up(hands: Sequence[GloveFit], labeler: Labeler) -> None:

@@ -57,6 +57,7 @@ def resting_covariance() -> Float[np.ndarray, "20 20"]:
     return covariance
 
 
+@cache
 def resting_prior() -> JointPrior:
     """Prior of a hand without any history."""
     covariance = resting_covariance()
@@ -75,9 +76,10 @@ def predict_joints(
         covariance: Covariance of the estimate [rad^2].
         span: Time since the estimate [s].
     """
-    prior = JointPrior(angles, np.empty_like(covariance), np.empty_like(covariance))
-    kept = np.exp(-2.0 * max(span, 0.0) / _JOINT_MEMORY)
-    _predict_covariance(covariance, resting_covariance(), kept, prior)
+    kept = np.exp(-max(span, 0.0) / _JOINT_MEMORY)
+    mean = resting_angles() + kept * (angles - resting_angles())
+    prior = JointPrior(mean, np.empty_like(covariance), np.empty_like(covariance))
+    _predict_covariance(covariance, resting_covariance(), kept**2, prior)
     return prior
 
 
