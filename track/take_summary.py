@@ -66,11 +66,16 @@ def summarize(take: Take) -> list[str]:
     return [*lines, line]
 
 
+def no_points(take: Take) -> str:
+    """What is told of a take without a point."""
+    return f"no point is in any of the {take.num_frames} frames; does the camera system see markers?"
+
+
 def suspicions(take: Take) -> list[str]:
     """What is probably not as the user meant it, as one sentence each with its remedy."""
     there = np.isfinite(take.points[..., 0])
     if not there.any():
-        return [f"no point is in any of the {take.num_frames} frames; does the camera system see markers?"]
+        return [no_points(take)]
     clouds = [points[seen] for points, seen in zip(take.points, there, strict=True)]
     if all_at_origin(clouds):
         return [AT_ORIGIN]
