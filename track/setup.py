@@ -23,7 +23,7 @@ from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
-from track.user import User, checked_sides, load_user, nominal_user
+from track.user import User, as_user, checked_sides, nominal_user
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
@@ -199,17 +199,14 @@ def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[Us
     check_type("hands", hands, (Sequence, Path), _HANDS)
     if isinstance(hands, str) and hands in SIDES:
         hands = (hands,)
-    if isinstance(hands, str | Path):
-        known = dataclasses.replace(load_user(hands), notes=Path(hands).name)
-        return _in_glove(known, glove, size), False
-    if isinstance(hands, User):
-        return _in_glove(hands, glove, size), False
+    if isinstance(hands, str | Path | User):
+        return _in_glove(as_user(hands), glove, size), False
     for hand in hands:
         check_type("one of hands", hand, (GloveFit, str), _HANDS)
     sides = [hand for hand in hands if not isinstance(hand, GloveFit)]
     if not sides and hands:
-        fits = tuple(hand for hand in hands if isinstance(hand, GloveFit))
-        return _in_glove(User(fits), glove, size), False
+        fits = [hand for hand in hands if isinstance(hand, GloveFit)]
+        return _in_glove(as_user(fits), glove, size), False
     layout = load_layout(USUAL_GLOVE if glove is None else glove)
     return nominal_user(layout, USUAL_SIZE if size == "auto" else size, sides), size == "auto"
 
