@@ -6,6 +6,7 @@ Simulated captures with their truth, the output of a tracker, and poses of a use
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from gloves.attachment import Attachment
 from gloves.captures.capture import Capture
+from gloves.captures.markers import labeled_columns
 from gloves.fit import GlovedHand, GloveFit
 from gloves.layout import stored_layout
 from gloves.takes.archives import SCHEMA, names_of, read_archive, settings_of, write_archive
@@ -134,6 +136,14 @@ class Take:
     """Standard deviation of each joint angle [rad]; NaN where a hand has no pose, None if it is not known."""
     keypoint_spread: Float[np.ndarray, "T H 21"] | None = None
     """Standard deviation of each keypoint in each direction [m]; NaN and None as of the angles."""
+
+    def __repr__(self) -> str:
+        """What the take holds, without its arrays."""
+        bodies = "".join(f", {body.name}" for body in self.bodies)
+        return (
+            f"Take({self.num_frames} frames at {self.rate:g} Hz of {', '.join(self.sides)}{bodies}; "
+            f"{self.points.shape[1]} columns of points)"
+        )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hands", tuple(self.hands))
@@ -450,6 +460,25 @@ class Take:
         names = tuple(f"*{column}" for column in range(self.points.shape[1]))
         return Capture(names, self.points, self.rate)
 
+    def labeled_capture(self, *, sides: bool = True) -> Capture:
+        """The points with labels, for `write_capture`: one column per marker, then those of the other points.
+
+        Args:
+            sides: Whether columns have names with their hand, `right:ThumbTip`; without it they are those of
+                one hand, `ThumbTip`, and no frame may hold two.
+
+        Raises:
+            CaptureError: There are no points.
+        """
+        names, labels = self.label_names, self.labels.astype(np.int64)
+        if not sides:
+            names = self.hands[0].layout.names
+            labels = np.where(labels >= 0, labels % len(names), -1)
+        there = np.isfinite(self.points[..., 0])
+        frames = [points[seen] for points, seen in zip(self.points, there, strict=True)]
+        rows = [row[seen] for row, seen in zip(labels, there, strict=True)]
+        return labeled_columns(frames, rows, names, self.rate)
+
     def without_body(self) -> Take:
         """The take without its bodies and their points, which many optical systems track themselves."""
         gone = self.labels >= self.hand_labels[-1].stop
@@ -490,6 +519,7 @@ class Take:
             HandSimError: A package that the format needs is not installed.
             OSError: The file cannot be written.
         """
+        check_type("path", path, (str, os.PathLike), "the path of a file")
         path = Path(path)
         form = motion_format(path)
         motion = self.poses_alone(rate)
@@ -505,6 +535,7 @@ class Take:
         Raises:
             OSError: The file cannot be written.
         """
+        check_type("path", path, (str, os.PathLike), "the path of a .npz file")
         arrays = {column.name: getattr(self, column.name) for column in (*FRAMES, *self._known())}
         arrays |= {KEYPOINTS.name: self.keypoints(), **worn_arrays(self.hands, self.bodies)}
         header = take_header(self.hands, self.bodies, self.rate, self.settings)

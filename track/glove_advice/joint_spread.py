@@ -6,14 +6,18 @@ anything may be anywhere in its range. What hands usually do narrows that furthe
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import dataclasses
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
-from handsim.hand.topology import JOINTS, NUM_JOINTS
+from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
+from handsim.hand.model import HandModel
+from handsim.hand.topology import BONE_NAMES, JOINTS, NUM_JOINTS, PALM
 from track.glove_advice.observed_hands import ObservedHand
 from track.kinematics.marker_kinematics import hand_arrays
 from track.kinematics.pose_spread import known_hand, tip_lengths
@@ -22,6 +26,9 @@ from track.kinematics.pose_spread import pose_spreads as spreads_of_poses
 NOISE: Final = 0.0015
 """Standard deviation of a marker around a calibrated hand's [m]: optics, and the skin that moves."""
 _FEWEST: Final = 4  # markers of a pose
+_FEWEST_OF_BODY: Final = 3  # of a rigid body
+_IN_LINE: Final = 1e-8  # [m^2]
+_RADIUS: Final = 0.003  # [m]
 
 
 def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) -> Float[np.ndarray, "20"]:
@@ -52,6 +59,28 @@ def pose_spreads(
         count += len(good)
     spreads: Float[np.ndarray, "20"] = np.sqrt(squares / max(1, count))
     return spreads
+
+
+def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
+    """Standard deviation of the palm's rotation about its least certain axis, by its own markers [rad].
+
+    Args:
+        places: Markers of a layout.
+        model: A hand.
+
+    Returns:
+        Infinite with fewer than three markers on the palm, or three in a line.
+    """
+    palm = [place for place in places if place.bone == BONE_NAMES[PALM]]
+    if len(palm) < _FEWEST_OF_BODY:
+        return float("inf")
+    copies = (*palm, *[palm[0]] * (FEWEST_MARKERS - len(palm)))  # the fewest that a glove has
+    named = tuple(dataclasses.replace(place, name=str(number)) for number, place in enumerate(copies))
+    points = attach_markers(MarkerLayout("palm", named, _RADIUS), model).points[: len(palm)]
+    arms = points - points.mean(axis=0)
+    information = (arms**2).sum() * np.eye(3) - arms.T @ arms
+    least = float(np.linalg.eigvalsh(information)[0])
+    return float(NOISE / np.sqrt(least)) if least > _IN_LINE else float("inf")
 
 
 def untold_spreads() -> Float[np.ndarray, "20"]:

@@ -114,8 +114,11 @@ def _calibration_section(take: Take) -> Section:
             f"The hands are not calibrated: they are the mean hands of size {notes}, in a glove as designed. "
         )
         text += _UNCALIBRATED + _CALIBRATE
+    elif notes:
+        text = f"The hands are a user's ({escape(notes)}), as calibrated or given."
     else:
-        text = f"The hands are a user's{f' ({escape(notes)})' if notes else ''}, as calibrated or given."
+        text = "The hands were given, and the take does not say whether they are calibrated. "
+        text += "If they are not: " + _UNCALIBRATED[0].lower() + _UNCALIBRATED[1:]
     return Section("Calibration", text)
 
 
@@ -205,7 +208,7 @@ def _doubts_section(take: Take, doubts: Sequence[Doubt], source: str) -> Section
         frames = f"{doubt.first}" if doubt.first == doubt.last else f"{doubt.first} to {doubt.last}"
         start, end, worst = (f"{take.times[one]:.3f}" for one in (doubt.first, doubt.last, doubt.worst))
         look = f"frame {doubt.worst}, {worst} s"
-        table.append([frames, start, end, doubt.of, doubt.why, look, command])
+        table.append([frames, start, end, doubt.of, doubt.why, look, f"{command} --time {worst}"])
     text = (
         "Frames in which a hand is lost or coasts, the longest first, then labels of little confidence, "
         f"which is given. <code>{escape(command)}</code> lists the worst of them too; a click leads there, "
