@@ -53,7 +53,7 @@ class _Fit(NamedTuple):
     """Mean over the frames of that of hands, less what speaks against them."""
     found: dict[Side, int] = {}  # noqa: RUF012
     """Number of frames in which each hand is found."""
-    count: int = 0
+    shown: int = 0
     """Number of frames in which any is."""
     is_good: bool = False
     """Whether nothing tells of a mistake."""
@@ -96,18 +96,18 @@ def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labe
     glove = designed_glove(hands[0].layout)
     best = max(_others(some, glove, labeler), key=lambda other: other.fit.log_odds)
     fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
-    if fit.count < _LEAST_FOUND * len(some) or fit.log_odds <= factor * asked.log_odds:
+    if fit.shown < _LEAST_FOUND * len(some) or fit.log_odds <= factor * asked.log_odds:
         return
     if best.scale != 1.0:
         raise ArgumentError(_of_scale(1.0 / best.scale))
-    there = [side for side, count in fit.found.items() if count >= _LEAST_FOUND * fit.count]
+    there = [side for side, count in fit.found.items() if count >= _LEAST_FOUND * fit.shown]
     remedy = [] if set(there) <= {hand.side for hand in hands} else [f"--hands {' '.join(there)}"]
     named = "two hands" if len(there) == 2 else f"a {there[0]} hand"
     if best.layout != glove:
         named += f" in glove '{best.layout.name}'"
         remedy.append(f"--glove {best.layout.name}")
     if remedy:
-        shares = f"{fit.count} of {len(some)} frames, what is asked for {asked.count}"
+        shares = f"{fit.shown} of {len(some)} frames, what is asked for {asked.shown}"
         warnings.warn(
             f"the points fit {named} better ({shares}); name it ({' '.join(remedy)})",
             HandSimWarning,
@@ -125,7 +125,7 @@ def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Label
             others.append(_Other(layout, 1.0, _measured_fit(frames, layout, labeler_at_once(layout))))
         if others[-1].fit.is_good:
             return others
-    if max(other.fit.count for other in others) < _LEAST_FOUND * len(frames):
+    if max(other.fit.shown for other in others) < _LEAST_FOUND * len(frames):
         for scale in _scales():
             scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in frames]
             others.append(_Other(glove, scale, _measured_fit(scaled, glove, labeler)))

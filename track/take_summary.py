@@ -17,6 +17,7 @@ _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose i
 _MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
 _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
 _MOST_UNLABELED: Final = 0.25  # share of the points at the hands
+_MANY_FAR: Final = 0.05  # share of the points that are elsewhere, from which on it is told
 _AT_HAND: Final = 0.04  # [m] from the markers of a hand
 _CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
@@ -58,11 +59,11 @@ def summarize(take: Take) -> list[str]:
         never = [] if (status != LOST).any() else ["it was never found: are these its markers?"]
         lines.append("; ".join([f"{body.name}: {_status_shares(status)}", *_median_rms(rms), *never]))
     there, foreign = np.isfinite(take.points[..., 0]), _unlabeled(take)
+    line = f"{int(foreign.sum())} of {int(there.sum())} points are not markers"
     near = int(_at_hands(take, foreign).sum())
-    return [
-        *lines,
-        f"{int(foreign.sum())} of {int(there.sum())} points are not markers, {near} of them at the hands",
-    ]
+    if foreign.sum() - near > _MANY_FAR * there.sum():
+        line += f", {near} of them at the hands"
+    return [*lines, line]
 
 
 def no_points(take: Take) -> str:

@@ -7,6 +7,7 @@ import warnings
 
 import pytest
 
+from gloves.layout import load_layout
 from handsim.errors import ArgumentError, HandSimWarning
 from track.capture_labeling import label_capture
 from track.capture_tracking import track_capture
@@ -41,12 +42,9 @@ def test_the_glove_that_is_worn_is_named(capture):
 
 
 def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypatch):
-    from gloves.layout import load_layout, save_layout
-
-    own = dataclasses.replace(
-        load_layout("dense19"), name="mine", markers=load_layout("dense19").markers[:-3]
-    )
-    save_layout(tmp_path / "mine.toml", own)
+    dense = load_layout("dense19")
+    own = dataclasses.replace(dense, name="mine", markers=dense.markers[4:])
+    own.save(tmp_path / "mine.toml")
     monkeypatch.chdir(tmp_path)
     worn = simulate_take("free", glove=own, num_frames=FRAMES, hands="left", seed=4).capture()
     with pytest.warns(HandSimWarning, match="a left hand in glove 'mine' better"):

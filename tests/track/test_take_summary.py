@@ -49,7 +49,7 @@ def test_a_hand_that_is_not_there(tracked):
 
 def test_points_of_others_are_counted_apart(tracked):
     count = tracked.points.shape[1]
-    far = np.full((FRAMES, count, 3), 3.0) + np.arange(count)[:, None]
+    far = np.full((FRAMES, count, 3), 3.0) + 0.1 * np.arange(count)[:, None]
     blank = np.full((FRAMES, count), -1)
     take = dataclasses.replace(
         tracked,

@@ -85,7 +85,8 @@ def _arm(
     frame = np.stack([-along, across, np.cross(along, across)], axis=2)
     elbow, *between = _ALONG_FOREARM[1], _ALONG_FOREARM[0], _ALONG_FOREARM[2]
     places = np.array([*_WRIST, elbow, *between])
-    return wrist[:, None] + np.einsum("tij,kj->tki", frame, places)
+    markers: Float[np.ndarray, "T 5 3"] = wrist[:, None] + np.einsum("tij,kj->tki", frame, places)
+    return markers
 
 
 def _path(
