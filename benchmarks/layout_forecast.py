@@ -1,10 +1,11 @@
-"""What `handsim glove score` says of layouts, beside labelers that are trained on them and solved poses.
+"""What `handsim glove score` says of layouts, beside captures that are labeled and tracked afterwards.
 
-Twelve layouts of 6 to 30 markers: the shipped ones, even and crowded random ones, and one without thumb and
-palm, whose fingers look alike. Each gets a training set and a labeler of its own; forecast and measurement
-use other people, poses and losses. Layouts that are finished stay in the folder; run again to continue.
+Twelve layouts of 6 to 30 markers: symmetric, sparse, on the palm's side, without thumb, in clusters, and
+shipped ones. Forecast and outcome have other people and motions. With --labelers each layout also gets a
+training set and a labeler of its own, and its joints are solved. Layouts that are finished stay in the
+folder; run again to continue.
 
-python -m benchmarks.layout_forecast FOLDER [--frames 60000] [--samples 300000]
+python -m benchmarks.layout_forecast FOLDER [--labelers] [--frames 60000] [--samples 300000]
 """
 
 from __future__ import annotations
@@ -20,17 +21,20 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.any_layout import random_layout
 from benchmarks.record import describe
-from gloves.layout import MarkerLayout, list_layouts, load_layout, save_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
+from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of
 from handsim.space.cameras import load_rig
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
+from track.glove_advice.trials import FRAMES, METHODS, WORK, try_layout
 from track.kinematics.pose_solver import PoseSolver
 from train.any_layout.fine_tuning import fine_tuned_labeler
+from train.any_layout.learned_gloves import learned_labeler
 from train.glove_labeler import load_labeler
+from train.labelers.protocol import Labeler
 
 SCORED_FRAMES = 1500  # as `handsim glove score`
 MEASURED_FRAMES = 3000
@@ -41,18 +45,69 @@ Figures = dict[str, Any]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="training sets, runs and results")
+    parser.add_argument("--labelers", action="store_true", help="train a labeler of each layout, too")
     parser.add_argument("--frames", type=int, default=60_000, help="of each training set")
     parser.add_argument("--samples", type=int, default=300_000, help="of each training: minutes on one core")
     options = parser.parse_args()
     print(describe("torch", "numpy"))
+    compare_captures(options.folder)
+    if options.labelers:
+        compare_labelers(options.folder, options.frames, options.samples)
+
+
+def compare_captures(folder: Path) -> None:
+    """Print what the score says of captures and what becomes of others, and how alike their ranks are."""
+    told, found, listed = [], [], 0
+    for layout in chosen_layouts():
+        path = folder / layout.name
+        path.mkdir(parents=True, exist_ok=True)
+        labeler = learned_labeler(layout)
+        told.append(stored(path / "told.json", lambda: trial_figures(layout, labeler, 0, FRAMES)))  # noqa: B023
+        found.append(stored(path / "found.json", lambda: trial_figures(layout, labeler, 50, 600)))  # noqa: B023
+        for work, shares in told[-1].items():
+            pairs = ", ".join(
+                f"{method} {100 * share:.2f} / {100 * found[-1][work]['share'][method]:.2f}"
+                for method, share in shares["share"].items()
+            )
+            joints = f"{shares['joints']:.1f} / {found[-1][work]['joints']:.1f} deg"
+            print(
+                f"{layout.name}, {work}: forecast / outcome {pairs}; joints {joints}, size off "
+                f"{found[-1][work]['size']:.1f} mm",
+                flush=True,
+            )
+        worst = int(np.argmin(told[-1]["two touching"]["right"]))
+        listed += worst in np.argsort(found[-1]["two touching"]["right"])[:3]
+    for work in WORK:
+        for method in METHODS:
+            pairs = [[one[work]["share"][method] for one in rows] for rows in (told, found)]
+            print(f"{work}, {method}: rank correlation {spearmanr(*pairs).statistic:.3f}")
+    print(f"worst marker of touching hands among the worst three: {listed} of {len(told)}")
+
+
+def trial_figures(layout: MarkerLayout, labeler: Labeler, first: int, frames: int) -> Figures:
+    """What became of captures of a layout, by kind of work."""
+    trials = try_layout(layout, "figure5", labeler, first=first, frames=frames)
+    return {
+        work: {
+            "share": {method: one.share(method) for method in METHODS},
+            "right": one.right.tolist(),
+            "joints": float(np.rad2deg(np.sqrt(np.mean(one.joints**2)))),
+            "size": 1e3 * one.size_error,
+        }
+        for work, one in trials.items()
+    }
+
+
+def compare_labelers(parent: Path, frames: int, samples: int) -> None:
+    """Print what the score says of single frames and what a labeler of the layout does."""
     found = []
     for layout in chosen_layouts():
-        folder = options.folder / layout.name
+        folder = parent / layout.name
         folder.mkdir(parents=True, exist_ok=True)
         told = stored(folder / "forecast.json", lambda layout=layout: forecast(layout))
         measured = stored(
             folder / "measured.json",
-            lambda layout=layout, folder=folder: measure(layout, folder, options.frames, options.samples),
+            lambda layout=layout, folder=folder: measure(layout, folder, frames, samples),
         )
         found.append((told, measured))
         print_layout(layout, told, measured)
@@ -69,17 +124,44 @@ def main() -> None:
 
 
 def chosen_layouts() -> list[MarkerLayout]:
-    """Eight shipped layouts, three random ones and one whose fingers look alike."""
-    layouts = [load_layout(name) for name in list_layouts()]
-    rng = np.random.default_rng(11)
-    layouts += [random_layout(number, rng) for number in range(3)]
-    rows = load_layout("dense19")
-    fingers = [marker for marker in rows.markers if marker.bone.split("_")[0] not in ("thumb", "palm")]
-    alike = tuple(
-        dataclasses.replace(marker, along=0.5, around=0.0)
-        for marker in {marker.bone: marker for marker in fingers}.values()
-    )
-    return [*layouts, dataclasses.replace(rows, name="alike", markers=alike)]
+    """Twelve layouts of 6 to 30 markers: five shipped ones, and seven with what makes layouts hard."""
+    shipped = [load_layout(name) for name in ("starter6", "tips8", "starter10", "sparse13", "starter30")]
+    tips = [_on(digit, 3, 0.7) for digit in DIGITS]
+    fingers = DIGITS[1:]
+    knuckles, middles = ([_on(digit, bone, 0.55) for digit in fingers] for bone in (1, 2))
+    palm = [*tips, *middles, *_back((0.3, 0.2), (0.4, -0.25), (0.75, 0.1))]
+    pairs = [_on(digit, 3, *place) for digit in DIGITS for place in ((0.45, -0.4), (0.75, 0.4))]
+    sides = [*(_on(digit, 3, 0.6, 0.5) for digit in DIGITS), _on("thumb", 2, 0.5, 0.3),
+             _on("middle", 2, 0.5, -0.5), _on("little", 2, 0.5, -1.0)]  # fmt: skip
+    some = [_on("index", 2, 0.5), _on("ring", 2, 0.5)]
+    made = {
+        "symmetric8": [*tips[1:], *_back((0.3, 0.2), (0.3, -0.2), (0.7, 0.2), (0.7, -0.2))],
+        "mixed10": [*tips, *some, *_back((0.3, 0.25), (0.5, -0.2), (0.7, 0.0))],
+        "near13": [
+            *tips, *middles, _on("index", 3, 0.15), *_back((0.3, 0.2), (0.35, -0.25), (0.7, 0.05)),
+        ],
+        "bones16": [*tips, *middles, _on("thumb", 2, 0.5), *knuckles, *_back((0.3, 0.2), (0.4, -0.2))],
+        "palmar12": [dataclasses.replace(one, around=np.pi) for one in palm],
+        "clusters18": [
+            *pairs, *knuckles, *_back((0.3, 0.12), (0.42, 0.12), (0.36, -0.05), (0.6, -0.25)),
+        ],
+        "sides11": [*sides, *_back((0.25, 0.0), (0.5, 0.3), (0.6, -0.3))],
+    }  # fmt: skip
+    return [*shipped, *(MarkerLayout(name, tuple(places), 0.0032) for name, places in made.items())]
+
+
+def _on(digit: str, number: int, along: float, around: float = 0.0) -> MarkerPlace:
+    """A marker on a digit's bone, the first, second or third from the knuckle."""
+    bone = BONE_NAMES[bones_of(digit)[number - 1]]
+    return MarkerPlace(f"{bone}_{along:g}_{around:g}", bone, along, around)
+
+
+def _back(*places: tuple[float, float]) -> list[MarkerPlace]:
+    """Markers on the back of the hand: along and across."""
+    return [
+        MarkerPlace(f"Back{number}", "palm", along, 0.0, across)
+        for number, (along, across) in enumerate(places, 1)
+    ]
 
 
 def stored(path: Path, make: Callable[[], Figures]) -> Figures:
@@ -102,7 +184,7 @@ def forecast(layout: MarkerLayout) -> Figures:
 def measure(layout: MarkerLayout, folder: Path, frames: int, samples: int) -> Figures:
     """What a labeler that was trained on the layout does, and errors of solved joints."""
     glove, data, run = folder / "glove.toml", folder / "data", folder / "run"
-    save_layout(glove, layout)
+    layout.save(glove)
     if not data.exists():
         command = ["generate", "--glove", str(glove), "--num-frames", str(frames), "--seed", "5"]
         assert handsim([*command, "--out", str(data)]) == 0

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.layout_forecast import measure, stored
 from benchmarks.record import describe
-from gloves.layout import MarkerLayout, MarkerPlace, load_layout, save_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.cli.main import main as handsim
 from handsim.hand.topology import BONE_NAMES, DIGITS, bones_of
 
@@ -34,7 +34,7 @@ def main() -> None:
         folder = options.folder / layout.name
         folder.mkdir(parents=True, exist_ok=True)
         before, after = folder / "before.toml", folder / "after.toml"
-        save_layout(before, layout)
+        layout.save(before)
         if not after.exists():
             command = ["glove", "improve", str(before), "--minutes", str(options.minutes)]
             assert handsim([*command, "--out", str(after)]) == 0

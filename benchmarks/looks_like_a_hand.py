@@ -175,6 +175,8 @@ def photograph(
     people = sample_people(1, False, tones=TONES[case.tone], rng=rng)
     studio = Studio([hand], people, passes=("rgb", "ids", "depth"))
     moment = Moment(Take.of_poses([hand], qpos[:, None], rate=60.0), 0)
+    if shown:
+        moment = studio.reaching(moment, [case.camera])
     exposure = sample_exposure(ExposureConfig(), rng=rng)
     lighting = expose_for(lighting, people[0].skin)
     choices = FrameChoices(lighting, background, exposure, None, None, int(rng.integers(2**31)))

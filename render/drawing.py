@@ -181,8 +181,9 @@ class Drawing:
                 if person not in kept:
                     kept[person] = sample_choices(config, studio.skin, rng, size, around)
                 chosen = kept[person]
-            moment = Moment(self.take, frame, None if cast is None else cast.person)
             cameras = self.viewpoints.cameras(frame)
+            moment = Moment(self.take, frame, None if cast is None else cast.person)
+            moment = studio.reaching(moment, cameras)
             if leave_out is not None and not studio.is_clear(moment, cameras):
                 leave_out(frame)
                 continue

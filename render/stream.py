@@ -257,7 +257,7 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         poses = {n: moment.hand(n) for n in range(len(take.hands))}
         there = {n: pose for n, pose in poses.items() if pose is not None}
         keypoints = [hand_keypoints(take.hands[n].model, pose[None])[0] for n, pose in there.items()]
-        camera = self._placed(sitting.studio, moment, keypoints, list(there.values()), rng)
+        moment, camera = self._placed(sitting.studio, moment, keypoints, list(there.values()), rng)
         skin = sitting.studio.skin
         chosen = sample_choices(self.config, skin, rng, camera.size)
         fresh = dataclasses.replace(chosen, seed=int(rng.integers(2**31)))
@@ -288,8 +288,8 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
         keypoints: Sequence[NDArray[np.float64]],
         qpos: Sequence[NDArray[np.float64]],
         rng: np.random.Generator,
-    ) -> Camera:
-        """The camera somewhere around the hands, outside of all surfaces."""
+    ) -> tuple[Moment, Camera]:
+        """The camera somewhere around the hands, outside of all surfaces, and arms that leave its picture."""
         points, wrists = np.concatenate(keypoints), np.stack(qpos)
         for _ in range(_TRIES):
             share = float(rng.uniform(*self._fill))
@@ -298,9 +298,10 @@ class PictureStream(IterableDataset[dict[str, torch.Tensor]]):
             else:
                 wide = around_hands(self._camera, points, wrists, share * _CROPPED, rng=rng)
                 camera = crop_around(wide, points, share, self._crop, rng=rng)
-            if studio.is_clear(moment, [camera]):
+            reaching = studio.reaching(moment, [camera])
+            if studio.is_clear(reaching, [camera]):
                 break
-        return camera
+        return reaching, camera
 
 
 def _as_photographs(picture: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

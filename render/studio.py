@@ -33,6 +33,7 @@ from render.scenery.lights import Lighting
 from render.sensors.depth_noise import DepthNoise, apply_depth_noise, reflectance_of
 from render.sensors.exposure import Exposure, expose, linear_of
 from render.sensors.shutter import Shutter, combine, shutter_times
+from render.skin.forearm import upper_arms
 from render.skin.look import SkinLook
 
 _AROUND: Final = 8
@@ -65,6 +66,8 @@ class Moment:
     frame: int
     person: Int[np.ndarray, "T"] | None = None
     """Who is in each frame, where that changes: the time around a frame ends where another person comes."""
+    upper_arms: Float[np.ndarray, "H 3"] | None = None
+    """Unit direction of each hand's upper arm; see `Studio.reaching`."""
 
     def hand(self, number: int, shift: float = 0.0) -> Float[np.ndarray, "27"] | None:
         """Pose of a hand `shift` seconds after the frame; None where the frame has none."""
@@ -197,6 +200,18 @@ class Studio:
             choices=self._record(choices) if recorded else {},
         )
 
+    def reaching(self, moment: Moment, cameras: Sequence[Camera]) -> Moment:
+        """The moment with arms that leave the pictures of these cameras."""
+        there = {
+            number: pose for number in range(len(self._hands)) if (pose := moment.hand(number)) is not None
+        }
+        if not there:
+            return moment
+        lines = [self._hands[number].forearm_line(pose) for number, pose in there.items()]
+        found = np.full((len(self._hands), 3), np.nan)
+        found[list(there)] = upper_arms(*map(np.array, zip(*lines, strict=True)), cameras)
+        return dataclasses.replace(moment, upper_arms=found)
+
     def is_clear(self, moment: Moment, cameras: Sequence[Camera]) -> bool:
         """Whether all cameras are outside of hands and objects, so that the moment can be drawn."""
         drawn = self._still(moment)
@@ -215,7 +230,8 @@ class Studio:
         for index, hand in enumerate(self._hands):
             pose = moment.hand(index, shift)
             if pose is not None:
-                drawn += hand.drawn(pose, number)
+                upper_arm = None if moment.upper_arms is None else moment.upper_arms[index]
+                drawn += hand.drawn(pose, number, upper_arm)
                 number += 1
         for index, body in enumerate(self._bodies):
             T_world_body = moment.body(index, shift)

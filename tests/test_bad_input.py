@@ -15,7 +15,7 @@ import pytest
 
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
-from gloves.layout import load_layout, save_layout
+from gloves.layout import load_layout
 from gloves.takes.archives import write_archive
 from handsim.cli.main import main
 from train.simulation.takes import simulate_take
@@ -85,7 +85,7 @@ def folder(tmp_path, monkeypatch):
     dataclasses.replace(take, settings={"tracker": {}}).save(tmp_path / "tracked.npz")
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "broken.jpg").write_text("no picture")
-    save_layout(tmp_path / "copy.toml", load_layout("dense19"))
+    load_layout("dense19").save(tmp_path / "copy.toml")
     return tmp_path
 
 
@@ -130,6 +130,14 @@ CASES = {
     "nothing to track": ["track", "--out", "out.npz"],
     "a capture and a stream": ["track", "good.trc", "--live", "natnet://localhost", "--out", "out.npz"],
     "a time for a capture": ["track", "good.trc", "--seconds", "3", "--out", "out.npz"],
+    "a stream that is tracked twice": [
+        "track",
+        "--live",
+        "natnet://localhost",
+        "--calibrate",
+        "--out",
+        "out.npz",
+    ],
     "no time for a stream": ["track", "--live", "natnet://localhost", "--seconds", "0", "--out", "out.npz"],
     "an address that is none": ["track", "--live", "localhost:1510", "--out", "out.npz"],
     "a tracked take in another kind of file": ["track", "good.trc", "--out", "out.c3d"],

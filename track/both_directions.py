@@ -7,7 +7,7 @@ directions differ the labeler, which knows no history, is the third witness of e
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,12 +18,16 @@ from track.association.initialization import MOST_POINTS
 from track.association.point_groups import distances_to_nearest
 from track.association.single_frames import FrameLabels
 from track.streams.frame_source import StreamedFrame
+from track.tracked_frame import TrackedHand
 from track.tracker import Tracker
 from track.user import User
 from train.labelers.protocol import Labeler
 
 _NEAR: Final = 0.03  # [m] from a hand's markers, within which a point without a label may be one
 _NOT_ASKED: Final = -2  # label of a point that the labeler was not shown
+_WORTH: Final = 6.0  # log-odds of a point that lies exactly where its marker is, against a stray
+_SPREAD: Final = 0.003  # [m] of the RMS distance of labeled markers from a pose
+_MOST: Final = 0.5  # share of the points with two labels, whose hands are different
 _MAJORITY: Final = 2.0 / 3.0  # of the confidence in a label that one of three witnesses denies
 
 
@@ -36,6 +40,8 @@ class _Tracked(NamedTuple):
     """Confidence in each label, 0 to 1."""
     markers: Float[np.ndarray, "H M 3"]
     """Every hand's markers [m]; NaN where it is lost."""
+    evidence: float
+    """Of all hands together: log-odds of their labeled points, by their distances from the poses."""
 
 
 def label_both_ways(
@@ -56,6 +62,12 @@ def label_both_ways(
     end = frames[-1].time
     reverse = [dataclasses.replace(frame, time=end - frame.time) for frame in reversed(frames)]
     backward = _track(reverse, user, labeler, lambda count: told((len(frames) + count) // 2))[::-1]
+    for run in _exchanges(forward, backward, user.layout.num_markers):  # right and left: the poses tell
+        sums = [sum(one.evidence for one in way[run]) for way in (forward, backward)]
+        if sums[0] >= sums[1]:
+            backward[run] = forward[run]
+        else:
+            forward[run] = backward[run]
     found = [FrameLabels(one.labels, one.confidence) for one in forward]
     different = [
         number
@@ -77,9 +89,30 @@ def _track(
     tracker, tracked = Tracker(user, labeler), []
     for frame in frames:
         one = tracker.step(frame.points, frame.ids, frame.time)
-        tracked.append(_Tracked(one.labels, one.confidence, np.stack([hand.markers for hand in one.hands])))
+        markers = np.stack([hand.markers for hand in one.hands])
+        tracked.append(_Tracked(one.labels, one.confidence, markers, sum(map(_evidence, one.hands))))
         told(len(tracked))
     return tracked
+
+
+def _evidence(hand: TrackedHand) -> float:
+    """What speaks for a hand's labels: many points near the pose's markers, where they are designed."""
+    if not np.isfinite(hand.rms):
+        return 0.0
+    return (len(hand.markers) - len(hand.filled)) * (_WORTH - 0.5 * (hand.rms / _SPREAD) ** 2)
+
+
+def _exchanges(
+    forward: Sequence[_Tracked], backward: Sequence[_Tracked], num_markers: int
+) -> Iterator[slice]:
+    """Runs of frames in which the directions give most points of a hand to different hands."""
+    wrong = []
+    for one, other in zip(forward, backward, strict=True):
+        both = (one.labels >= 0) & (other.labels >= 0)
+        wrong.append((one.labels[both] // num_markers != other.labels[both] // num_markers).mean() > _MOST
+                     if both.any() else False)  # fmt: skip
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], np.array(wrong, dtype=np.int8), [0]])))
+    yield from (slice(int(begin), int(end)) for begin, end in steps.reshape(-1, 2))
 
 
 def _ask(

@@ -13,8 +13,6 @@ from typing import Final
 
 import numpy as np
 
-from gloves.captures.capture import Capture
-from gloves.captures.markers import labeled_capture
 from gloves.layout import load_layout
 from gloves.optics.identities import number_runs
 from gloves.takes.take import Take
@@ -26,9 +24,9 @@ from track.both_directions import label_both_ways
 from track.calibration.hand_size import sample_frames
 from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
-from track.setup import USUAL_SIZE, found_user
+from track.hand_check import check_hands
+from track.setup import AnyHands, choose_user, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
-from track.user import nominal_user
 from train.glove_labeler import load_labeler
 
 _COMPARED: Final = 200  # pairs of frames that tell whether a capture's frames follow from each other
@@ -40,16 +38,20 @@ def label_capture(
     capture: AnyCapture,
     glove: AnyGlove = "dense19",
     *,
+    hands: AnyHands | None = None,
     labeler: AnyLabeler = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Take:
     """Label the hands in every frame of a capture: none, one or two, as `handsim label` does.
 
-    Their size is measured in the capture. The take holds labels alone; `track_capture` gives poses.
+    Their size is measured in the capture unless they are given. The take holds labels alone; `track_capture`
+    gives poses.
 
     Args:
         capture: Points [m], or the path of a marker file or a take; names of markers are not used.
         glove: Marker layout, or its shipped name or the path of its .toml file.
+        hands: A user, hands in their gloves or the path of a user's file; or sides, those of the glove when
+            not given.
         labeler: A labeler, or what `load_labeler` reads; that of the glove when not given.
         progress: Called with the number of frames that are done, and of all frames.
 
@@ -67,10 +69,12 @@ def label_capture(
     network = load_labeler(layout, labeler)
     source = capture_of(capture)
     frames = checked_frames(source)
-    sides = [side for side in BOTH if side in layout.sides]
-    user = found_user(sample_frames(frames), layout, sides, network)
-    if user is None:
-        user = nominal_user(layout, USUAL_SIZE, sides)
+    worn = [side for side in BOTH if side in layout.sides]
+    user, is_measured = choose_user(layout, worn if hands is None else hands, "auto")
+    sample = sample_frames(frames)
+    if is_measured:
+        user = found_user(sample, layout, user.sides, network) or user
+    check_hands(sample, user, network)
     told = (lambda count: None) if progress is None else (lambda count: progress(count, len(frames)))
     if _is_continuous(frames):
         found = label_both_ways(frames, user, network, told)
@@ -88,24 +92,6 @@ def label_capture(
         user.hands, no_poses, source.positions, ids, labels, rate=source.rate, settings=settings
     )
     return dataclasses.replace(take, confidence=confidence)
-
-
-def labeled_points(take: Take, *, sides: bool = True) -> Capture:
-    """The labeled points of a take as a capture: one column per marker, then columns for the other points.
-
-    Args:
-        take: The take.
-        sides: Whether hands have columns of their own, `right:ThumbTip`; without them there are those of one
-            hand, `ThumbTip`, and no frame may hold two.
-    """
-    names, labels = take.label_names, take.labels.astype(np.int64)
-    if not sides:
-        names = take.hands[0].layout.names
-        labels = np.where(labels >= 0, labels % len(names), -1)
-    there = np.isfinite(take.points[..., 0])
-    frames = [points[seen] for points, seen in zip(take.points, there, strict=True)]
-    rows = [row[seen] for row, seen in zip(labels, there, strict=True)]
-    return labeled_capture(frames, rows, names, take.rate)
 
 
 def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:

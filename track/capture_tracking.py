@@ -16,15 +16,18 @@ from gloves.takes.corrections import Correction, find_pins, load_corrections, to
 from gloves.takes.take import Take, label_names
 from handsim.errors import CaptureError, HandSimWarning
 from track.bodies.body_file import AnyBody
+from track.calibration.frames import CalibrationError
 from track.calibration.hand_size import sample_frames
 from track.config import BOTH, Size, TrackerConfig
 from track.corrected_take import correct_take
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
 from track.recorder import TakeRecorder
-from track.setup import AnyHands, TrackerSetup
+from track.setup import AnyHands, TrackerSetup, as_designed
 from track.sinks.addresses import SinkGroup
 from track.streams.frame_source import StreamedFrame, checked_frames
+from track.take_calibration import calibrate_take, kept_user
 from track.tracked_frame import TrackedFrame
+from track.tracker import Tracker
 
 Progress = Callable[[int, int], None]
 OnFrame = Callable[[StreamedFrame, TrackedFrame], None]
@@ -40,6 +43,7 @@ def track_capture(
     bodies: Sequence[AnyBody] = (),
     config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     corrections: str | Path | None = None,
+    calibrate: bool = False,
     sinks: SinkGroup | None = None,
     progress: Progress | None = None,
     on_frame: OnFrame | None = None,
@@ -57,6 +61,8 @@ def track_capture(
         bodies: Rigid bodies beside the hands: templates, names of handsim's objects, or .toml files.
         config: All settings of the tracker.
         corrections: A file of labels that a person corrected, as `handsim view` saves it beside a take.
+        calibrate: Track twice: hands are calibrated on the first take, as `track.calibrate` does it, and the
+            second is made with those that fit better so.
         sinks: Take every frame as it is tracked, from `open_sinks`; the capture is then played at its own
             rate.
         progress: Called after each frame with the number of tracked frames and of all frames.
@@ -77,8 +83,26 @@ def track_capture(
     source = capture_of(capture)
     pins = () if corrections is None else _checked_corrections(Path(corrections), source, setup)
     frames = checked_frames(source)
+    is_measured = setup.is_measured
     setup = setup.measured(sample_frames(frames))
-    tracker = setup.tracker()
+    if calibrate:
+        recorder = _record(frames, setup.tracker(), None, None, progress)
+        setup = _calibrated(recorder.take(source), setup, progress, is_measured=is_measured)
+    recorder = _record(frames, setup.tracker(), sinks, on_frame, progress)
+    take = recorder.take(source)
+    settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
+    take = dataclasses.replace(take, settings={**take.settings, **settings, **setup.settings})
+    return take if corrections is None else _corrected(take, Path(corrections), pins)
+
+
+def _record(
+    frames: Sequence[StreamedFrame],
+    tracker: Tracker,
+    sinks: SinkGroup | None,
+    on_frame: OnFrame | None,
+    progress: Progress | None,
+) -> TakeRecorder:
+    """Track all frames; sinks take them at the capture's own rate."""
     recorder = TakeRecorder(tracker)
     if sinks:
         sinks.start(tracker.hands, tracker.bodies)
@@ -93,10 +117,32 @@ def track_capture(
         recorder.add(frame, tracked)
         if progress is not None:
             progress(recorder.num_frames, len(frames))
-    take = recorder.take(source)
-    settings = {"capture": Path(capture).name} if isinstance(capture, str | Path) else {}
-    take = dataclasses.replace(take, settings={**take.settings, **settings, **setup.settings})
-    return take if corrections is None else _corrected(take, Path(corrections), pins)
+    return recorder
+
+
+def _calibrated(
+    take: Take, setup: TrackerSetup, progress: Progress | None, *, is_measured: bool
+) -> TrackerSetup:
+    """The setup with its hands calibrated on a take, as far as they fit held-out frames better.
+
+    Args:
+        take: A take that was made with the setup.
+        setup: The setup.
+        progress: Called with the number of steps, and of all steps.
+        is_measured: Whether its hands were measured, so that where their markers are is a guess.
+    """
+    user, told = setup.user, None if progress is None else lambda _, *steps: progress(*steps)
+    try:
+        done = calibrate_take(take, as_designed(user) if is_measured else user.hands, user, told)
+    except CalibrationError as error:
+        warnings.warn(f"not calibrated: {error}", HandSimWarning, stacklevel=3)
+        return setup
+    notes = f"calibrated on the take itself, {user.notes.removeprefix('auto, ') or user} to begin with"
+    found = kept_user(take, done, user, notes, told)
+    better = {hand.side: hand for hand in found}
+    hands = tuple(better.get(hand.side, hand) for hand in user)
+    settings = {**setup.settings, "user": found.notes}
+    return dataclasses.replace(setup, user=dataclasses.replace(found, hands=hands), settings=settings)
 
 
 def _checked_corrections(path: Path, source: Capture, setup: TrackerSetup) -> tuple[Correction, ...]:

@@ -33,6 +33,8 @@ class TrackerConfig:
     """Strays near a hand that could be taken for a marker [1/m^3]: one in a cube of 8 cm."""
     most_rms: float = 0.008
     """RMS distance beyond which a pose is rejected [m]; Han et al. 2018, section 4.4."""
+    least_evidence: float = 5.0
+    """Log-odds of a hand for each of its markers (at most those of ten), from which on it is initialized."""
     fewest_labels: int = 5
     """Labeled points from which on a pose is reliable."""
     longest_coast: float = 0.1

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gloves.captures.capture import Capture
-from gloves.takes.columns import FRAMES, KEYPOINTS, NUMBERS
+from gloves.takes.columns import FRAMES, KEYPOINTS, OPTIONAL
 from gloves.takes.growing import GrowingArchive, GrownArchive, finish_archive, growing_path
 from gloves.takes.take import (
     RATED_FRAMES,
@@ -48,7 +48,7 @@ class TakeRecorder:
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
-        self._config = tracker.config
+        self._settings = settings_of(tracker)
         self._bodies = tracker.bodies
         self._rows: list[dict[str, NDArray[Any]]] = []
 
@@ -80,8 +80,13 @@ class TakeRecorder:
         rows = self._rows
         if not rows or (capture is None and len(rows) < 2):
             raise CaptureError(f"{len(rows)} frames came, expected two or more")
-        settings = {"tracker": dataclasses.asdict(self._config)}
-        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=settings)
+        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=self._settings)
+
+
+def settings_of(tracker: Tracker) -> dict[str, Any]:
+    """What a take's settings say of the tracker that made it, as JSON."""
+    known = {"user": tracker.user.notes} if tracker.user.notes else {}
+    return {"glove": tracker.user.layout.name, **known, "tracker": dataclasses.asdict(tracker.config)}
 
 
 def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
@@ -94,6 +99,8 @@ def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArr
         "qpos": np.array([hand.qpos for hand in hands]),
         "status": np.array([_NUMBERS[hand.status] for hand in hands], dtype=np.int8),
         "rms": np.array([hand.rms for hand in hands]),
+        "angle_spread": np.array([hand.angle_spread for hand in hands], dtype=np.float32),
+        "keypoint_spread": np.array([hand.keypoint_spread for hand in hands], dtype=np.float32),
         "body_poses": np.array(poses).reshape(len(bodies), 7),
         "body_status": np.array([_NUMBERS[body.status] for body in bodies], dtype=np.int8),
         "body_rms": np.array([body.rms for body in bodies], dtype=np.float64),
@@ -133,13 +140,13 @@ class Recorder:
         self.part = growing_path(out)
         """The file of the recording."""
         self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
-        self._settings = {"tracker": dataclasses.asdict(tracker.config), **settings}
+        self._settings = {**settings_of(tracker), **settings}
         sizes = {"H": len(self._hands), "B": len(self._bodies)}
         self._archive = GrowingArchive(
             self.part,
             self._header(None),
             worn_arrays(self._hands, self._bodies),
-            [column.sized(sizes) for column in (*FRAMES, NUMBERS, KEYPOINTS)],
+            [column.sized(sizes) for column in (*FRAMES, *OPTIONAL, KEYPOINTS)],
         )
         self._times: tuple[float, float] | None = None
         self._closed = False

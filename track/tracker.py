@@ -8,6 +8,7 @@ the labeler. A frame goes one way, as a `FrameState` that every step replaces by
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from time import perf_counter
 from typing import Final, NamedTuple
 
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim._checks import check_type
-from handsim.errors import ArgumentError
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 from track.association.candidates import SETTLED_EVIDENCE
@@ -33,6 +33,7 @@ from track.config import TrackerConfig
 from track.given import AnyLabeler, designed_glove
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+from track.user import User, as_user
 from train.glove_labeler import load_labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
@@ -59,7 +60,8 @@ class Tracker:
     """Tracks the user's hands, and bodies with markers of their own, from frame to frame.
 
     Args:
-        hands: The user's hands, each side at most once, or a `User`.
+        hands: The user's hands, each side at most once; a `User`, which knows whether they are calibrated (of
+            others that is assumed), or the path of a user's file.
         labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`. That of
             the glove when not given.
         bodies: Rigid bodies beside the hands.
@@ -67,24 +69,26 @@ class Tracker:
 
     Raises:
         ArgumentError: An argument is of another type, or two hands are of one side.
+        UserError: The user's file cannot be read.
         WeightsError: There is no labeler of that name, or it knows other markers.
     """
 
     def __init__(
         self,
-        hands: Sequence[GloveFit],
+        hands: User | Sequence[GloveFit] | str | Path,
         labeler: AnyLabeler = None,
         bodies: Sequence[RigidTemplate] = (),
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     ) -> None:
         check_type("config", config, TrackerConfig, "a TrackerConfig")
-        self.hands = _checked_hands(hands)
+        self.user = as_user(hands)
+        self.hands = self.user.hands
         self.bodies = tuple(bodies)
         self.config = config
         asked = load_labeler(designed_glove(self.hands[0].layout), labeler)
         self._intake = Intake(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
-        self._states = [HandState(hand, config) for hand in self.hands]
+        self._states = [HandState(hand, config, is_calibrated=self.user.is_calibrated) for hand in self.hands]
         counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)
@@ -133,7 +137,7 @@ class Tracker:
         final, outcomes = self._replace_doubted(started, outcomes)
         self._history.keep(final)
         hands = tuple(
-            _tracked_hand(state, outcome, final.points, final.markers(hand))
+            _tracked_hand(state, outcome, final, final.markers(hand))
             for hand, (state, outcome) in enumerate(zip(self._states, outcomes, strict=True))
         )
         all_labels, all_confidence = np.full(incoming.num_points, -1), np.ones(incoming.num_points)
@@ -305,32 +309,18 @@ class Tracker:
         return frame.with_markers(found.index, markers), (*others[0], started, *others[1])
 
 
-def _checked_hands(hands: Sequence[GloveFit]) -> tuple[GloveFit, ...]:
-    """The hands of a sequence or a user.
-
-    Raises:
-        ArgumentError: It is something else or empty, or two are of one side.
-    """
-    check_type("hands", hands, Sequence, "a User, or hands in their gloves (GloveFit)")
-    for hand in hands:
-        check_type("a hand", hand, GloveFit, "one in its glove (GloveFit)")
-    sides = [hand.side for hand in hands]
-    if not sides or len(set(sides)) < len(sides):
-        raise ArgumentError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
-    return tuple(hands)
-
-
 def _tracked_hand(
-    state: HandState, outcome: _Outcome, points: NDArray[np.float64], own: NDArray[np.int64]
+    state: HandState, outcome: _Outcome, frame: FrameState, own: NDArray[np.int64]
 ) -> TrackedHand:
-    """The output for a hand: labeled points (N, 3) [m] where there are some, the pose's markers elsewhere."""
+    """The output for a hand: its labeled points where there are some, the pose's markers elsewhere."""
     count, side = state.num_markers, state.hand.side
     if state.qpos is None:
         no_markers = np.full((count, 3), np.nan)
         return TrackedHand(side, outcome.status, np.full(NUM_QPOS, np.nan), np.nan, no_markers, np.arange(0))
     markers, labeled = state.positions.copy(), own >= 0
-    markers[own[labeled]] = points[labeled]
+    markers[own[labeled]] = frame.points[labeled]
     present = np.zeros(count, dtype=bool)
     present[own[labeled]] = True
     filled = np.flatnonzero(~present)
-    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled)
+    spreads = state.pose_spread(frame.time)
+    return TrackedHand(side, outcome.status, state.qpos.copy(), outcome.rms, markers, filled, *spreads)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, cast, overload
+from typing import Any, Final, cast, get_args, overload
 
 import numpy as np
 
@@ -23,8 +23,11 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import SIDES, Side
 from track.calibration.user_calibration import Calibration
+from track.config import Size
 
 SCHEMA: Final = 1
+MEASURED: Final = "auto, "
+"""How the notes on hands begin whose size was measured; the size follows."""
 _MOST: Final = 1 << 24  # bytes; a user of two hands has 40,000
 _ARRAYS: Final = {"points": "f8", "normals": "f8", "bone_indices": None, "bone_weights": "f8"}
 """The stored arrays of an attachment and their types; indices keep theirs, so that fractions are refused."""
@@ -78,6 +81,11 @@ class User(Sequence[GloveFit]):
     def sides(self) -> tuple[Side, ...]:
         """Sides of the hands, in their order."""
         return tuple(hand.side for hand in self.hands)
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the hands are the person's, not hands of the same size."""
+        return are_calibrated(self.notes)
 
     def __str__(self) -> str:
         """Length and breadth of the hands [mm], one pair where both are alike."""
@@ -157,6 +165,11 @@ class User(Sequence[GloveFit]):
             raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+def are_calibrated(notes: str) -> bool:
+    """Whether hands with these notes are a person's; those of a size, named or measured (auto), are not."""
+    return not notes.startswith(MEASURED) and notes not in get_args(Size)
+
+
 def nominal_user(layout: MarkerLayout, size: str, sides: Sequence[Side]) -> User:
     """Hands of one of the five sizes in gloves as designed.
 
@@ -179,6 +192,19 @@ def checked_sides(sides: str | Sequence[str]) -> tuple[Side, ...]:
     if not sides or len(set(sides)) < len(sides) or not set(sides) <= set(SIDES):
         raise ArgumentError(f"hands are '{' '.join(sides)}', expected right, left, or one of each")
     return cast("tuple[Side, ...]", sides)
+
+
+def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
+    """The user of hands, of a user's file, or one that is given.
+
+    Raises:
+        ArgumentError: It is of another type, or the hands are no user's.
+        UserError: The file cannot be read.
+    """
+    if isinstance(hands, str | Path):
+        return dataclasses.replace(load_user(hands), notes=Path(hands).name)
+    check_type("hands", hands, Sequence, "a User, hands in their gloves (GloveFit), or a user's file")
+    return hands if isinstance(hands, User) else User(tuple(hands))
 
 
 def load_user(path: str | Path) -> User:

@@ -32,13 +32,13 @@ from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.captures.markers import UNLABELED
 from gloves.fit import GloveFit
-from gloves.layout import load_layout, save_layout
+from gloves.layout import load_layout
 from gloves.takes.take import Take
 from handsim.files.atomic import atomic_write, remove_leftovers
 from handsim.files.capacity import check_free
 from handsim.files.json_files import claim
 from handsim.hand.model import HandModel
-from handsim.space.cameras import load_rig, save_rig
+from handsim.space.cameras import load_rig
 from track.user import User, load_user
 from train.simulation.real_like import sample_real_like_scene
 from train.simulation.room import record_take
@@ -165,11 +165,11 @@ def _settings(plan: Plan) -> dict[str, Any]:
 
 def _complete(plan: Plan, out: Path) -> Benchmark:
     """Write what captures share, the data card and the manifest."""
-    save_layout(out / _GLOVE_FILE, load_layout(GLOVE))
+    load_layout(GLOVE).save(out / _GLOVE_FILE)
     files = [PLAN, _GLOVE_FILE, CAPTURES, _LICENSE_FILE, "README.md"]
     for name in sorted({DIFFICULTIES[name].rig for name in plan.difficulties}):
         files.append(f"captures/rig-{name}.toml")
-        save_rig(out / files[-1], load_rig(name))
+        load_rig(name).save(out / files[-1])
     _write(out / CAPTURES, _table_of_captures(plan, out))
     with atomic_write(out / _LICENSE_FILE) as temporary:
         shutil.copyfile(Path(__file__).with_name(f"{LICENSE}.txt"), temporary)

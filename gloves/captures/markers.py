@@ -71,7 +71,7 @@ def unlabeled_frames(capture: Capture) -> list[Float[np.ndarray, "N 3"]]:
     return [points[seen] for points, seen in zip(capture.positions, there, strict=True)]
 
 
-def labeled_capture(
+def labeled_columns(
     frames: Sequence[Float[np.ndarray, "N 3"]],
     labels: Sequence[Int[np.ndarray, "N"]],
     names: Sequence[str],

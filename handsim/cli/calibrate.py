@@ -28,14 +28,13 @@ def calibrate(
     hands: tuple[Side, ...] = BOTH,
     labeler: str | None = None,
 ) -> None:
-    """Fit hands and gloves to a user, from a capture in which every joint moves and fingertips touch.
+    """Fit hands and gloves to a user, from any capture; a minute in which all joints move tells most.
 
-    The capture is labeled by the tracker. If some markers stay unlabeled, it is labeled once more with the
-    calibrated hands. Each hand is checked on frames that were held out.
+    The capture is labeled by the tracker. Each hand is solved on two thirds of the time and tried on the
+    rest; a hand that is no better there stays as it was.
 
     Args:
-        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file of half a minute or more; its
-            names are not used.
+        capture: A .trc, .c3d, .csv (Motive, Vicon) or .tsv (Qualisys) file; its names are not used.
         out: The user's file, .json, for handsim track --shape.
         glove: Marker layout: a shipped name or the path of a .toml file.
         size: The size nearest to the hands; auto measures it in the capture.
@@ -68,18 +67,11 @@ def calibrate(
 
 
 def _report(done: Calibration) -> list[str]:
-    """Residuals before and after, and suggestions for a better capture, as lines."""
-    line = f"markers {1e3 * done.rms_before:.2f} mm off before, {1e3 * done.rms_after:.2f} mm after"
+    """Held-out frames before and after, and suggestions for a better capture, as lines."""
+    line = str(done)
     before, after = 1e3 * done.gaps()
-    if np.isfinite(before):
+    if done.is_better and np.isfinite(before):
         line += f"; thumb and fingers {before:.1f} mm from touching before, {after:.1f} mm after"
-    line += f"; hand length {1e3 * done.hand.model.shape.length:.0f} mm"
-    lines = [line]
-    if done.held_out is not None:
-        before, after, frames = done.held_out
-        word = "better" if done.held_out.is_better else "no better"
-        lines.append(
-            f"{word} on {frames} held-out frames: markers {1e3 * before:.2f} mm off as measured, "
-            f"{1e3 * after:.2f} mm calibrated"
-        )
-    return [*lines, *done.suggestions()]
+    if done.is_better:
+        line += f"; hand length {1e3 * done.hand.model.shape.length:.0f} mm"
+    return [line, *done.suggestions()]

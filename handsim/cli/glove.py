@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -19,7 +20,6 @@ from gloves.layout import (
     MarkerPlace,
     list_layouts,
     load_layout,
-    save_layout,
     shipped_layout,
     starter_layout,
 )
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from track.glove_advice.layout_score import LayoutScore
     from track.glove_advice.layout_worth import Worth
     from track.glove_advice.observed_hands import ObservedHand
+    from track.glove_advice.trials import Trial
 
 
 def list_gloves(out: Path | None = None) -> None:
@@ -175,9 +176,13 @@ def score_glove(
     out: Path | None = None,
     frames: int = 1500,
     labeler: str | None = None,
+    captures: int = 3,
     seed: int = 0,
 ) -> None:
     """Say how well a layout can be labeled and what it tells of each joint; nothing is trained.
+
+    Short captures of one hand, two apart and two that touch are simulated, and labeled and tracked as
+    `handsim label` and `handsim track` do with nothing calibrated: they are what to expect.
 
     Args:
         glove: A .toml file or a shipped name.
@@ -188,7 +193,8 @@ def score_glove(
         frames: Frames of hands, of a take those of each hand.
         labeler: Folder of a labeler trained on the layout, or an exported .onnx file; the network for any
             layout when not given.
-        seed: Seed of people, poses and cameras' losses.
+        captures: Captures of each kind of work that are tried, of different people; 0 for none.
+        seed: Seed of people, poses and cameras' losses; captures have their own.
     """
     from handsim.space.cameras import load_rig
 
@@ -198,10 +204,12 @@ def score_glove(
         raise ArgumentError(f"--out is {page}, expected a file name that ends in .html")
     if frames < _FEWEST_FRAMES:
         raise ArgumentError(f"--frames is {frames}, expected at least {_FEWEST_FRAMES}")
+    _check_captures(captures)
     check_outputs([glove, rig, motion], [page])
     from track.glove_advice.advice import advice
     from track.glove_advice.layout_score import score_layout
     from track.glove_advice.score_page import write_score_page
+    from track.glove_advice.trials import try_layout
     from train.any_layout.learned_gloves import learned_labeler
     from train.glove_labeler import load_labeler
 
@@ -212,11 +220,20 @@ def score_glove(
         known = learned_labeler(layout, cameras) if labeler is None else load_labeler(glove, labeler)
         step("labeling")
         score = score_layout(layout, hands, known, rng=rng)
+        trials = try_layout(
+            layout, cameras, known, count=captures, told=lambda words: step(f"trying captures: {words}")
+        )
+        score = dataclasses.replace(score, trials=trials)
     _tell(score)
     for number, sentence in enumerate(advice(score), 1):
         print_line(f"{number}. {sentence}")
     write_score_page(page, score, seen_by=f"{seen}, seen by rig {cameras.name}", trained=labeler is not None)
     print_line(f"{page}: the hand with its confusions, markers and joints")
+
+
+def _check_captures(captures: int) -> None:
+    if captures < 0:
+        raise ArgumentError(f"--captures is {captures}, expected 0 or more")
 
 
 def _hands(
@@ -256,9 +273,24 @@ def _tell(score: LayoutScore) -> None:
     print_line(f"{percent(score.seen.mean())} % of the markers seen; {percent(score.sides_right)} % of the "
                "hands told left from right")  # fmt: skip
     print_line(
-        f"joints, frame by frame: standard deviation {np.sqrt((joints**2).mean()):.1f} deg, the worst "
-        f"{joints.max():.1f} deg"
+        "joints of calibrated hands, frame by frame: standard deviation "
+        f"{np.sqrt((joints**2).mean()):.1f} deg, the worst {joints.max():.1f} deg; {_palm_line(score.layout)}"
     )
+    _tell_trials(score.trials, score.layout)
+
+
+def _tell_trials(trials: Mapping[str, Trial], layout: MarkerLayout) -> None:
+    """Print what became of simulated captures, nothing calibrated."""
+    from track.glove_advice.score_page import trial_rows
+
+    if not trials:
+        return
+    print_line("captures, hands not calibrated; slots and whole frames that are right:")
+    header, *rows = trial_rows(trials, layout)
+    table = Table(*header, box=None, pad_edge=False)
+    for row in rows:
+        table.add_row(*map(Text, row))
+    Console().print(table)
 
 
 def improve_glove(
@@ -268,9 +300,12 @@ def improve_glove(
     keep: tuple[str, ...] = (),
     rig: str = "figure5",
     minutes: float = 3.0,
+    captures: int = 3,
     seed: int = 0,
 ) -> None:
     """Look for a better layout near a given one: move, add or drop markers.
+
+    At the end both are tried as `handsim glove score` tries one.
 
     Args:
         glove: A .toml file or a shipped name to begin with.
@@ -279,6 +314,7 @@ def improve_glove(
         keep: Names of markers that stay where they are.
         rig: Camera rig: a shipped name or the path of a .toml file.
         minutes: How long to move markers.
+        captures: Captures of each kind of work on which both layouts are tried at the end; 0 for none.
         seed: Seed of people, poses and tries.
     """
     from handsim.space.cameras import load_rig
@@ -287,12 +323,15 @@ def improve_glove(
     count = layout.num_markers if markers is None else markers
     if not FEWEST_MARKERS <= count <= MOST_MARKERS:
         raise ArgumentError(f"--markers is {count}, expected {FEWEST_MARKERS} to {MOST_MARKERS}")
+    _check_captures(captures)
     if not 0.0 <= minutes < np.inf:
         raise ArgumentError(f"--minutes is {minutes:g}, expected 0 or more")
     if out.suffix.lower() != ".toml":
         raise ArgumentError(f"--out is {out}, expected a file name that ends in .toml")
     check_outputs([glove, rig], [out])
     from track.glove_advice.improvement import Improvement
+    from track.glove_advice.trials import try_layout, verdict
+    from train.any_layout.learned_gloves import learned_labeler
 
     with named_steps("putting the glove on") as step:
         search = Improvement(layout, cameras, keep, rng=np.random.default_rng(seed))
@@ -301,10 +340,22 @@ def improve_glove(
         search.search(60.0 * minutes, lambda worth: step(_worth_line(worth)))
         step("dropping one marker at a time, to compare")
         fewer = search.smaller(max(FEWEST_MARKERS, len(keep), count - _FEWER))
-    found = search.layout
-    save_layout(out, found)
-    print_line(f"before: {layout.num_markers} markers, {_worth_line(before)}")
-    print_line(f"after:  {count} markers, {_worth_line(search.worth)}")
+        found, trials = search.layout, {}
+        for name, tried in (("before", layout), ("after", found)) if captures else ():
+            step(f"learning the layout {name}, about a minute")
+            known = learned_labeler(tried, cameras)
+            told = f"trying captures {name}"
+            trials[name] = try_layout(
+                tried, cameras, known, count=captures, told=lambda words, told=told: step(f"{told}: {words}")
+            )
+    found.save(out)
+    print_line(f"before: {layout.num_markers} markers, {_worth_line(before)}, {_palm_line(layout)}")
+    print_line(f"after:  {count} markers, {_worth_line(search.worth)}, {_palm_line(found)}")
+    for name, tried in (("before", layout), ("after", found)) if captures else ():
+        print_line(f"{name}, on people that the search did not see:")
+        _tell_trials(trials[name], tried)
+    if captures:
+        print_line(verdict(trials["before"], trials["after"]))
     for fewer_count, worth in fewer:
         print_line(f"        {fewer_count} markers, {_worth_line(worth)}")
     old = {marker.name: marker for marker in layout.markers}
@@ -322,6 +373,16 @@ def _worth_line(worth: Worth) -> str:
         f"{100.0 * worth.slots:.1f} % of the slots right with losses and ghosts, joints to "
         f"{np.rad2deg(worth.joints):.1f} deg"
     )
+
+
+def _palm_line(layout: MarkerLayout) -> str:
+    from handsim.hand.model import HandModel
+    from track.glove_advice.joint_spread import palm_spread
+
+    spread = np.rad2deg(palm_spread(layout.markers, HandModel.named("M")))
+    if not np.isfinite(spread):
+        return "the palm has not three markers in a triangle, so that they alone do not tell its rotation"
+    return f"the palm's own markers tell its rotation to {spread:.1f} deg"
 
 
 def _place_line(marker: MarkerPlace) -> str:

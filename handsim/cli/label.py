@@ -40,7 +40,8 @@ def label(
     from handsim.app.messages import print_line
     from handsim.app.progress import progress_bar
     from handsim.files.outputs import check_outputs
-    from track.capture_labeling import label_capture, labeled_points
+    from track.capture_labeling import label_capture
+    from track.take_summary import no_points
     from train.threads import label_on
 
     label_on(threads)
@@ -54,7 +55,7 @@ def label(
             progress=lambda done, total: bar.update(task, completed=done, total=total),
         )
     right, left = _hands_there(take)
-    write_capture(out, labeled_points(take, sides=bool((right & left).any())))
+    write_capture(out, take.labeled_capture(sides=bool((right & left).any())))
     labeled, points = take.labels >= 0, np.isfinite(take.points[..., 0])
     sure = f", median confidence {np.median(take.confidence[labeled]):.3f}" if labeled.any() else ""
     print_line(
@@ -63,7 +64,7 @@ def label(
     )
     if not labeled.any():
         told = f"no hand in {capture}, expected hands in glove '{glove}' (--glove names another)"
-        warnings.warn(told, HandSimWarning, stacklevel=2)
+        warnings.warn(told if points.any() else no_points(take), HandSimWarning, stacklevel=2)
 
 
 def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:

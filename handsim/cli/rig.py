@@ -30,7 +30,6 @@ from handsim.space.cameras import (
     load_rig,
     named_rig,
     rig_description,
-    save_rig,
 )
 from handsim.space.rig_formats.any_file import import_cameras
 from train.rig_advice.mounts import MOUNTS, Mount
@@ -154,7 +153,7 @@ def import_rig(
         rig = CameraRig(name, import_cameras(file, up))
     except RigError as error:
         raise RigError(str(error) if str(file) in str(error) else f"{file}: {error}") from error
-    save_rig(out, rig)
+    rig.save(out)
     table = Table("camera", "name", box=None, pad_edge=False)
     for column in ("position [m]", "picture [px]", "focal length [px]", "lens"):
         table.add_column(Text(column), justify="right", min_width=7)
@@ -292,7 +291,7 @@ def plan_rig(
     if planned.before is not None:
         print_line(f"before: {_forecast_line(planned.before)}")
     print_line(f"after:  {_forecast_line(planned.after)}")
-    save_rig(out, planned.rig)
+    planned.rig.save(out)
     print_line(f"{out}: run `handsim rig score {out}`")
 
 

@@ -41,6 +41,7 @@ def track(
     hands: tuple[Side, ...] | None = None,
     body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     labeler: str | None = None,
+    calibrate: bool = False,
     labeled: Annotated[Path | None, tyro.conf.arg(aliases=["--labelled"])] = None,
 ) -> None:
     """Track hands in a marker capture or a live stream; writes motion, labels and status.
@@ -68,19 +69,20 @@ def track(
             handsim's own objects.
         labeler: Folder of a trained labeler, an exported .onnx file, or module:name; the shipped one when
             not given.
+        calibrate: Track a capture twice: first to calibrate its hands, then with those that fit frames better
+            which they were not calibrated on. For those who did not capture a minute for handsim calibrate.
         labeled: File for the labeled points, .trc, .c3d or Motive .csv; markers are called right:ThumbTip and
             so on, other points Unlabeled1, Unlabeled2, ...
     """
     from gloves.captures.formats import write_capture
     from gloves.takes.take import load_take
     from handsim.cli.options import chosen_hands
-    from track.capture_labeling import labeled_points
     from track.live import track_live
     from track.setup import TrackerSetup, warm_up
     from track.sinks.addresses import open_sinks
     from track.streams.frame_source import StreamedFrame
 
-    _check_options(capture, live, seconds, out, labeled)
+    _check_options(capture, live, seconds, out, labeled, calibrate=calibrate)
     check_outputs((capture, shape, glove, labeler, *body), (out, labeled))
     chosen, chosen_size = chosen_hands(shape, hands, size)
     times: deque[float] = deque(maxlen=_TIMED)  # [s]
@@ -90,14 +92,16 @@ def track(
 
     with open_sinks(send) as sinks:
         if capture is not None:
-            tracked = _track_file(capture, out, glove, chosen, chosen_size, labeler, body, sinks, on_frame)
+            tracked = _track_file(
+                capture, out, glove, chosen, chosen_size, labeler, body, sinks, on_frame, calibrate=calibrate
+            )
         else:
             setup = TrackerSetup.of(glove, chosen, chosen_size, labeler, body, TrackerConfig())
             with Console(stderr=True).status("getting ready"):
                 warm_up(setup.user, setup.labeler)
             tracked = track_live(str(live), out, setup, seconds=seconds, sinks=sinks, on_frame=on_frame)
     if labeled is not None:
-        write_capture(labeled, labeled_points(tracked.take if tracked.is_whole else load_take(out)))
+        write_capture(labeled, (tracked.take if tracked.is_whole else load_take(out)).labeled_capture())
     if shape is not None and glove is None:
         print_line(f"{shape}: hands in the glove '{tracked.take.settings['glove']}'")
     _tell(out, tracked, float(np.median(times)))
@@ -113,6 +117,8 @@ def _track_file(
     bodies: tuple[str, ...],
     sinks: SinkGroup,
     on_frame: OnFrame,
+    *,
+    calibrate: bool,
 ) -> LiveTake:
     """Track a capture, with the corrections beside OUT, and write the take."""
     from gloves.takes.corrections import corrections_path
@@ -129,6 +135,7 @@ def _track_file(
             labeler=labeler,
             bodies=bodies,
             corrections=corrections if corrections.exists() else None,
+            calibrate=calibrate,
             sinks=sinks,
             progress=lambda done, total: bar.update(task, completed=done, total=total),
             on_frame=on_frame,
@@ -146,6 +153,8 @@ def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
     take, frames = tracked.take, tracked.num_frames
     _, measured, size = take.settings["user"].partition("auto, ")
     lines = [f"size of the hands: {size}"] if measured else []
+    if take.settings["user"].startswith("calibrated on"):
+        lines = take.settings["user"].split("; ")
     lines.append(f"{out}: {frames} frames, {frames / take.rate:.1f} s at {take.rate:.4g} Hz")
     for line in (*lines, *tracked.notes, *summarize(take), f"{1e3 * seconds:.2f} ms per frame"):
         print_line(line)
@@ -154,7 +163,13 @@ def _tell(out: Path, tracked: LiveTake, seconds: float) -> None:
 
 
 def _check_options(
-    capture: Path | None, live: str | None, seconds: float | None, out: Path, labeled: Path | None
+    capture: Path | None,
+    live: str | None,
+    seconds: float | None,
+    out: Path,
+    labeled: Path | None,
+    *,
+    calibrate: bool,
 ) -> None:
     from gloves.captures.formats import WRITABLE, check_suffix
     from handsim.cli.options import check_take_file
@@ -166,6 +181,10 @@ def _check_options(
         raise ArgumentError(f"given {given}, expected a capture or --live natnet://host")
     if seconds is not None and live is None:
         raise ArgumentError(f"--seconds is {seconds:g} without --live, expected both or neither")
+    if calibrate and live is not None:
+        raise ArgumentError(
+            f"given --calibrate and --live {live}, expected a capture, which is tracked twice"
+        )
     if seconds is not None and not 0.0 < seconds < np.inf:
         raise ArgumentError(f"--seconds is {seconds:g}, expected a positive number")
     check_take_file(out, live=live is not None)

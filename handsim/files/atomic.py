@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from handsim._checks import check_type
 from handsim.errors import HandSimError, shortened
 from handsim.files.inputs import read_bytes
 
@@ -41,6 +42,7 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         The path to write to.
 
     Raises:
+        ArgumentError: `path` is no path.
         OSError: The folder cannot be made, `path` is a folder or a device, the disk is full, or the block
             wrote nothing.
     """
@@ -59,8 +61,11 @@ def atomic_writes(*paths: str | Path) -> Iterator[tuple[Path, ...]]:
         The paths to write to, in the same order.
 
     Raises:
+        ArgumentError: One is no path.
         OSError: As `atomic_write`.
     """
+    for path in paths:
+        check_type("path", path, (str, os.PathLike), "a path")
     finals = [Path(os.path.realpath(path)) if os.path.islink(path) else Path(path) for path in paths]
     for final in finals:
         # Renaming onto a device (/dev/null) would replace it; a folder would be noticed only after the work.

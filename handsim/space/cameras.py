@@ -18,7 +18,7 @@ from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, RigError, choices
 from handsim.files.atomic import atomic_write
 from handsim.space.camera import Camera, CameraArrays, camera_arrays, camera_from_record, points_in_view
-from handsim.space.rig_file import check_near, read_rig_file, rig_lines
+from handsim.space.rig_file import check_names, check_near, read_rig_file, rig_lines
 
 FEWEST_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32
@@ -39,7 +39,7 @@ class CameraRig:
 
     Raises:
         ArgumentError: What is given are no cameras.
-        RigError: Too few or too many cameras, two at one position, or one beyond 50 m.
+        RigError: Too few or too many cameras, two of one name or at one position, or one beyond 50 m.
     """
 
     name: str
@@ -58,6 +58,7 @@ class CameraRig:
                 f"rig '{self.name}' has {len(self.cameras)} cameras, "
                 f"expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
             )
+        check_names(f"rig '{self.name}'", self.cameras)
         for number, camera in enumerate(self.cameras, 1):
             check_near(f"camera {number} of rig '{self.name}'", camera)
         _check_apart(self.name, self.positions)
@@ -106,6 +107,15 @@ class CameraRig:
     def record(self) -> dict[str, Any]:
         """The rig as a JSON record, which `as_rig` reads."""
         return {"name": self.name, "cameras": [one.record() for one in self.cameras]}
+
+    def save(self, path: str | Path) -> None:
+        """Write the rig's `.toml` file; `load_rig` gives an equal rig again.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        with atomic_write(path) as temporary:
+            temporary.write_text("\n".join(rig_lines(self.name, self.cameras)) + "\n", encoding="utf-8")
 
     def digest(self) -> str:
         """Beginning of the SHA-256 of its record to nine decimals: whether a name still means this rig."""
@@ -186,16 +196,6 @@ def rig_setting(rig: CameraRig | str | Path | Mapping[str, Any]) -> str | dict[s
     """
     found = as_rig(rig)
     return found.name if found.name in list_rigs() and found == named_rig(found.name) else found.record()
-
-
-def save_rig(path: Path, rig: CameraRig) -> None:
-    """Write a rig's `.toml` file; `load_rig` gives an equal rig again.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    with atomic_write(path) as temporary:
-        temporary.write_text("\n".join(rig_lines(rig.name, rig.cameras)) + "\n", encoding="utf-8")
 
 
 def _shipped(name: str) -> Path:

@@ -40,7 +40,7 @@ class Framing:
         self._there = np.isfinite(self.points[..., 0, 0])
         self.centers: Float[np.ndarray, "T 3"] = self._centers()
         """Middle of the box around all hands of each frame [m]; interpolated over frames without hands."""
-        self._window = max(1, round(take.rate))
+        self._window = max(1, round(0.5 * take.rate))
 
     def _centers(self) -> NDArray[np.float64]:
         known = np.flatnonzero(self._there.any(axis=1))
@@ -81,6 +81,36 @@ class Framing:
         total = np.where(there, longer, 0.0).sum(axis=1)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
+    def shares(
+        self,
+        camera: Camera,
+        poses: Float[np.ndarray, "F 4 4"],
+        most: float,
+        frames: Int[np.ndarray, "F"] | None = None,
+    ) -> Float[np.ndarray, "F"]:
+        """Share of the picture's height that a hand's longer side has, the mean of a frame's hands.
+
+        Two hands before one another count for less, by how much of the smaller one's box the other covers.
+
+        Args:
+            camera: Its matrix and size count.
+            poses: Of the camera.
+            most: What a share counts as at most, so that one near hand does not make up for a far one.
+            frames: Which frames; all when not given.
+        """
+        points, there = self._rows(frames)
+        rotations, positions = poses[:, :3, :3], poses[:, None, None, :3, 3]
+        local = self._turned(points - positions.astype(np.float32), rotations)
+        pixels = local[..., :2] / np.maximum(local[..., 2:], 1e-3) * camera.K[1, 1] / camera.size[1]
+        low, high = pixels.min(axis=2), pixels.max(axis=2)
+        longer = np.where(there, np.minimum((high - low).max(axis=-1), most), 0.0)
+        total: NDArray[np.float64] = longer.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        if points.shape[1] == 2:
+            common = np.clip(high.min(axis=1) - low.max(axis=1), 0.0, None).prod(axis=-1)
+            covered = common / np.maximum((high - low).prod(axis=-1).min(axis=1), 1e-9)
+            total = total * (1.0 - np.nan_to_num(covered))
+        return np.where(there.any(axis=1), total, np.nan)
+
     def shortest(
         self,
         camera: Camera,
@@ -102,6 +132,29 @@ class Framing:
         needed = ((np.abs(local[..., :2]) + _SKIN) / half_view(camera)).max(axis=-1)
         distances = np.maximum(needed, _NEAREST) - local[..., 2]
         return np.where(there.any(axis=1), np.nan_to_num(distances, nan=-np.inf).max(axis=1), 0.0)
+
+    def centered(
+        self,
+        centers: Float[np.ndarray, "T 3"],
+        rotations: Float[np.ndarray, "T 3 3"],
+        distances: Float[np.ndarray, "T"],
+    ) -> Float[np.ndarray, "T 3"]:
+        """Places to look at [m] with all hands in the middle of the picture, as near these as may be.
+
+        Args:
+            centers: Where a camera looks [m].
+            rotations: Its axes in the world, as columns.
+            distances: From what it looks at [m].
+        """
+        around = self.points - centers[:, None, None].astype(np.float32)
+        local = self._turned(around, rotations).reshape(len(centers), -1, 3)
+        there = self._there.any(axis=1)
+        rays = local[there, :, :2] / np.maximum(local[there, :, 2:] + distances[there, None, None], _NEAREST)
+        shifts = np.zeros((len(centers), 2))
+        shifts[there] = 0.5 * distances[there, None] * (np.nanmin(rays, axis=1) + np.nanmax(rays, axis=1))
+        shifts = uniform_filter1d(shifts, self._window, axis=0, mode="nearest")
+        moved: NDArray[np.float64] = centers + np.einsum("tij,tj->ti", rotations[..., :2], shifts)
+        return moved
 
     def _rows(self, frames: NDArray[np.int64] | None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         if frames is None:

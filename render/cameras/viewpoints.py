@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -34,13 +34,18 @@ _ORBIT_PERIOD: Final = 12.0  # [s] of one revolution of a camera in orbit
 _LOWEST, _HIGHEST = np.deg2rad(-20.0), np.deg2rad(75.0)  # elevation of cameras that stand anywhere
 _TRIES: Final = 60
 _CLOSER: Final = 1.35  # largest share of a hand over `ViewConfig.share`
-_STILL_ENOUGH: Final = 1.05  # distance over that of the share up to which a camera stays where it is
+_ENOUGH: Final = 1.05  # by how much smaller than the share hands may be before other places are tried
 _SKIN_CLEARANCE: Final = 0.08  # [m] between a camera around hands and the nearest keypoint, at least
 _FREE: Final = 0.8  # of the room around hands in a picture, which they are shifted within
 _ROUNDS: Final = 8
 _NEARLY_ALL: Final = 0.97  # of the frames: what a lens of one length shows whole
-_PLACES: Final = 8  # in front of the hands that are tried
-_ASIDE: Final = np.deg2rad(50.0)  # farther from the front, at most
+_PLACES: Final = 16  # in front of the hands, and orbits, that are tried
+_AROUND: Final = 36  # azimuths of an orbit whose views are compared,
+_SAMPLES: Final = 48  # in so many frames
+_CENTERED: Final = 2  # times that a camera is turned to the middle of what it sees
+_LINGER: Final = 20.0  # power of their share that an orbit's time where hands are small falls with
+_QUICKEST: Final = 0.02  # of the longest time, at least
+_ASIDE: Final = np.deg2rad(90.0)  # farther from the front, at most
 _HIDDEN: Final = 10.0  # what a view from behind an arm counts as, times the distance of the share
 _ARM: Final = 0.5  # [m] of a forearm that views keep clear of
 _ARM_DISTANCE: Final = 0.2  # [m] between its middle and a camera, at least
@@ -57,8 +62,9 @@ class ViewConfig:
 
     placement: Placement = "still"
     """Position of the cameras. still: in front of the hands, following them only where they leave the
-    picture. orbit: around them. head: at the user's eyes. anywhere: at another position in every frame.
-    rig: at the cameras of a rig, turned to the hands, with lenses as long as it takes."""
+    picture. orbit: around them, for less time where hands far apart are small. head: at the user's eyes.
+    anywhere: at another position in every frame. rig: at the cameras of a rig, turned to the hands, with
+    lenses as long as it takes, which zoom where hands would be small."""
     camera: str = "vga"
     """Camera: vga, vga_wide, sr300, kinect2, azure_kinect, d435, headset_fisheye."""
     views: int = 1
@@ -101,6 +107,23 @@ class ViewConfig:
         return str(self.cameras)
 
 
+class _Path(NamedTuple):
+    """A camera on its way."""
+
+    camera: Camera
+    poses: NDArray[np.float64]
+    """(T, 4, 4)."""
+    zoom: NDArray[np.float64] | None = None
+    """Factor on its focal lengths (T,); None: it keeps them."""
+
+    def at(self, frame: int) -> Camera:
+        """The camera of one frame."""
+        camera = self.camera.at(self.poses[frame])
+        if self.zoom is None:
+            return camera
+        return zoomed(camera, float(self.zoom[frame]))
+
+
 class Viewpoints:
     """Cameras of every frame.
 
@@ -113,32 +136,34 @@ class Viewpoints:
     def __init__(self, config: ViewConfig, take: Take, *, rng: np.random.Generator) -> None:
         if config.cameras is not None:
             own = config.cameras
-            self._cameras = load_cameras(own) if isinstance(own, str) else own
-            self._poses = _kept([camera.T_world_camera for camera in self._cameras], take)
+            cameras = list(load_cameras(own) if isinstance(own, str) else own)
+            stay = (take.num_frames, 4, 4)
+            self._paths = [_Path(one, np.broadcast_to(one.T_world_camera, stay)) for one in cameras]
             self._centers = hand_centers(take)
         else:
             framing = Framing(take)
-            cameras, poses = zip(*_PATHS[config.placement](config, take, framing, rng), strict=True)
-            self._cameras = tuple(dataclasses.replace(one, name=f"view{n}") for n, one in enumerate(cameras))
-            self._poses, self._centers = list(poses), framing.centers
+            paths = _PATHS[config.placement](config, take, framing, rng)
+            cameras = [dataclasses.replace(path.camera, name=f"view{n}") for n, path in enumerate(paths)]
+            self._paths = [path._replace(camera=camera) for path, camera in zip(paths, cameras, strict=True)]
+            self._centers = framing.centers
 
     @property
     def num_cameras(self) -> int:
         """Number of cameras."""
-        return len(self._poses)
+        return len(self._paths)
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the first camera's pictures [px]."""
-        return self._cameras[0].size
+        return self._paths[0].camera.size
 
     def positions(self) -> Float[np.ndarray, "P 3"]:
         """All positions of the cameras, and of the hands' centers, over the whole take [m]."""
-        return np.concatenate([self._centers, *(path[:, :3, 3] for path in self._poses)])
+        return np.concatenate([self._centers, *(path.poses[:, :3, 3] for path in self._paths)])
 
     def cameras(self, frame: int) -> list[Camera]:
         """The cameras of one frame: `view0`, `view1`, ..., or those of the file with their own names."""
-        return [camera.at(path[frame]) for camera, path in zip(self._cameras, self._poses, strict=True)]
+        return [path.at(frame) for path in self._paths]
 
 
 def hand_centers(take: Take) -> Float[np.ndarray, "T 3"]:
@@ -164,10 +189,6 @@ def _spherical(azimuth: float, elevation: float) -> NDArray[np.float64]:
     )
 
 
-_Path = tuple[Camera, NDArray[np.float64]]
-"""A camera and its poses (T, 4, 4)."""
-
-
 def _still(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
     """In front of the user; several cameras form a fan.
 
@@ -176,30 +197,82 @@ def _still(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gene
     user = _towards_user(take)
     front = np.arctan2(-user[1], -user[0])
     spread = np.deg2rad(40.0) * (np.arange(config.views) - 0.5 * (config.views - 1))
-    paths = []
-    for azimuth in spread:
-        tried = []
-        for wider in np.linspace(0.0, 1.0, 1 if config.distance else _PLACES):
+
+    def places(azimuth: float) -> Iterator[NDArray[np.float64]]:
+        for wider in np.linspace(0.0, 1.0, _PLACES):
             aside = rng.uniform(0.15 * (1.0 - wider), 0.15 + _ASIDE * wider) * rng.choice([-1.0, 1.0])
             direction = _spherical(front + azimuth + aside, rng.uniform(0.1, 0.6 + 0.4 * wider))
-            directions = np.tile(direction, (take.num_frames, 1))
-            tried.append(_followed(config, framing, directions, rng))
-            if tried[-1][0] <= _STILL_ENOUGH:
-                break
-        paths.append(min(tried, key=lambda one: one[0])[1])
-    return paths
+            yield np.tile(direction, (take.num_frames, 1))
+
+    return [_largest(config, framing, places(azimuth), rng) for azimuth in spread]
 
 
 def _orbit(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
-    paths = []
-    for number in range(config.views):
-        start = rng.uniform(-np.pi, np.pi) + 2.0 * np.pi * number / config.views
-        elevation = rng.uniform(0.0, 0.8)
-        azimuths = start + 2.0 * np.pi * (take.times - take.times[0]) / _ORBIT_PERIOD
-        level = np.cos(elevation) * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
-        directions = np.column_stack([level, np.full(len(level), np.sin(elevation))])
-        paths.append(_followed(config, framing, directions, rng)[1])
-    return paths
+    """Around the hands, and around hands that are far apart more slowly where they are large."""
+    turned = 2.0 * np.pi * (take.times - take.times[0]) / _ORBIT_PERIOD
+
+    def orbits(first: float) -> Iterator[NDArray[np.float64]]:
+        for attempt in range(_PLACES):
+            azimuths = first + rng.uniform(-np.pi, np.pi) + turned
+            elevation = rng.uniform(0.0, 0.8)
+            if attempt:
+                azimuths = _lingering(config, framing, azimuths, elevation)
+            level = np.cos(elevation) * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
+            yield np.column_stack([level, np.full(len(level), np.sin(elevation))])
+
+    first = 2.0 * np.pi * np.arange(config.views) / config.views
+    return [_largest(config, framing, orbits(one), rng) for one in first]
+
+
+def _largest(
+    config: ViewConfig,
+    framing: Framing,
+    ways: Iterator[NDArray[np.float64]],
+    rng: np.random.Generator,
+) -> _Path:
+    """The first of some cameras that shows hands as large as asked for; if none does, the best of them.
+
+    Args:
+        config: What is asked for.
+        framing: The hands.
+        ways: Directions (T, 3) of a camera from the hands; the first is taken where hands have one distance.
+        rng: Source of the distances.
+    """
+    best, chosen = np.inf, None
+    for directions in ways:
+        farther, path = _followed(config, framing, directions, rng)
+        if chosen is None and (config.distance or farther <= _ENOUGH):
+            return path
+        shares = framing.shares(path.camera, path.poses, _CLOSER * config.share)
+        smaller = config.share / max(float(np.nanmedian(shares)), 1e-6)
+        if smaller < best:
+            best, chosen = smaller, path
+        if best <= _ENOUGH:
+            break
+    assert chosen is not None
+    return chosen
+
+
+def _lingering(
+    config: ViewConfig, framing: Framing, turned: NDArray[np.float64], elevation: float
+) -> NDArray[np.float64]:
+    """Azimuths (T,) in the place of those of an even turn, that pass quickly where hands would be small."""
+    camera, azimuths = preset(config.camera), np.linspace(0.0, 2.0 * np.pi, _AROUND, endpoint=False)
+    frames = np.unique(np.linspace(0, len(turned) - 1, _SAMPLES).astype(int))
+    shares = []
+    for azimuth in azimuths:
+        directions = np.tile(_spherical(azimuth, elevation), (len(frames), 1))
+        centers, rotations = framing.centers[frames], looking(directions)
+        away = framing.shortest(camera, centers, rotations, frames)[:, None] * directions
+        poses = poses_at(centers + away, rotations)
+        shares.append(np.nanmedian(framing.shares(camera, poses, _CLOSER * config.share, frames)))
+    time = np.minimum(np.array(shares) / config.share, 1.0) ** _LINGER
+    time = np.maximum(time, _QUICKEST * time.max())
+    passed = np.concatenate([[0.0], np.cumsum(time)]) / time.sum() * 2.0 * np.pi
+    laps, rest = np.divmod(turned, 2.0 * np.pi)
+    slow: NDArray[np.float64] = 2.0 * np.pi * laps
+    slow += np.interp(rest, passed, np.append(azimuths, 2.0 * np.pi))
+    return slow
 
 
 def _followed(
@@ -218,16 +291,19 @@ def _followed(
         usual = farthest / float(rng.uniform(1.0, _CLOSER))
     else:
         farthest = usual = float(rng.uniform(*config.distance))
-    if enough <= _STILL_ENOUGH * farthest:
+    if enough <= _ENOUGH * farthest:
         centers, distances = kept, np.full(len(kept), usual if config.distance else max(usual, enough))
     else:
         centers = framing.followed()
         distances = np.full(len(centers), usual)
         if config.distance is None:
-            shortest = framing.shortest(camera, centers, rotations)
-            distances = framing.held(np.maximum(shortest, usual))
-    path = camera, poses_at(centers + distances[:, None] * directions, rotations)
-    return float(np.median(distances)) / farthest, path
+            for _ in range(_CENTERED):
+                shortest = framing.shortest(camera, centers, rotations)
+                distances = framing.held(np.maximum(shortest, usual))
+                centers = framing.centered(centers, rotations, distances)
+            distances = framing.held(np.maximum(framing.shortest(camera, centers, rotations), usual))
+    poses = poses_at(centers + distances[:, None] * directions, rotations)
+    return float(np.median(distances)) / farthest, _Path(camera, poses)
 
 
 def _distance_of(
@@ -250,7 +326,7 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
         eyes += 0.064 * (number - 0.5 * (config.views - 1)) * aside
         away = eyes - centers
         directions = away / np.linalg.norm(away, axis=1, keepdims=True)
-        paths.append((preset(config.camera), poses_at(eyes, looking(directions))))
+        paths.append(_Path(preset(config.camera), poses_at(eyes, looking(directions))))
     return paths
 
 
@@ -278,7 +354,7 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
         distances = np.ones(take.num_frames)
         closer = rng.uniform(1.0, _CLOSER, take.num_frames)
         remaining = np.arange(take.num_frames)
-        for _ in range(_TRIES):
+        for attempt in range(_TRIES):
             count, middles = len(remaining), centers[remaining]
             azimuths = rng.uniform(-np.pi, np.pi, count)
             rise = np.arcsin(rng.uniform(np.sin(_LOWEST), np.sin(_HIGHEST), count))
@@ -289,18 +365,23 @@ def _anywhere(config: ViewConfig, take: Take, framing: Framing, rng: np.random.G
                 usual = _distance_of(camera, framing.sides(rotations, remaining), config.share)
                 shortest = framing.shortest(camera, middles, rotations, remaining)
                 distance = np.maximum(usual / closer[remaining], shortest)
-                bad = np.maximum(np.nan_to_num(distance / usual, nan=1.0), _STILL_ENOUGH)
+                smaller = distance / usual
+                if attempt:
+                    poses = poses_at(middles + distance[:, None] * directions, rotations)
+                    shares = framing.shares(camera, poses, _CLOSER * config.share, remaining)
+                    smaller = config.share / np.maximum(shares, 1e-6)
+                bad = np.maximum(np.nan_to_num(smaller, nan=1.0), _ENOUGH)
             else:
                 distance, bad = rng.uniform(*config.distance, count), np.ones(count)
             bad = bad + _HIDDEN * _behind_arms(take.qpos[remaining], middles + distance[:, None] * directions)
             better = bad < best[remaining]
             rows = remaining[better]
             best[rows], chosen[rows], distances[rows] = bad[better], directions[better], distance[better]
-            remaining = remaining[best[remaining] > _STILL_ENOUGH]
+            remaining = remaining[best[remaining] > _ENOUGH]
             if not len(remaining):
                 break
         distances = np.where(np.isfinite(distances), distances, 1.0)  # of frames without hands
-        paths.append((camera, poses_at(centers + distances[:, None] * chosen, looking(chosen))))
+        paths.append(_Path(camera, poses_at(centers + distances[:, None] * chosen, looking(chosen))))
     return paths
 
 
@@ -319,37 +400,53 @@ def _behind_arms(qpos: NDArray[np.float64], positions: NDArray[np.float64]) -> N
 
 
 def _rig(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
-    """At the cameras of a rig, with the lens that the share takes, or one that shows nearly all hands."""
+    """At the cameras of a rig, with the lens that the share takes, or one that shows nearly all hands.
+
+    Where that makes them small, cameras follow the hands, and where it still does, they zoom too.
+    """
     middle, paths = framing.middle(), []
     for T_world_camera in load_rig(config.rig).T_world_camera:
-        camera, position = preset(config.camera), T_world_camera[:3, 3]
-        for centers in (np.broadcast_to(middle, framing.centers.shape), framing.followed()):
-            away = position - centers
-            distances = np.linalg.norm(away, axis=1)
-            rotations = looking(away / distances[:, None])
+        camera, position, zoom = preset(config.camera), T_world_camera[:3, 3], None
+        followed = framing.followed()
+        for _ in range(_CENTERED):
+            _, distances, rotations = _turned_to(position, followed)
+            followed = framing.centered(followed, rotations, distances)
+        for centers in (np.broadcast_to(middle, followed.shape), followed):
+            away, distances, rotations = _turned_to(position, centers)
             if camera.lens.kind != "pinhole":
                 break
             share = config.share * rng.uniform(1.0, _CLOSER)
             side = float(np.nanmedian(framing.sides(rotations) / distances))
             wanted = 1.0 / _distance_of(camera, side, share)
             longest = distances / framing.shortest(camera, centers, rotations).clip(1e-6)
-            zoom = min(wanted, float(np.quantile(longest, 1.0 - _NEARLY_ALL)))
-            if zoom >= wanted / _STILL_ENOUGH:
+            lens = min(wanted, float(np.quantile(longest, 1.0 - _NEARLY_ALL)))
+            if lens >= wanted / _ENOUGH:
                 break
+        else:
+            zoom = 1.0 / framing.held(1.0 / np.minimum(wanted, longest)) / lens
         if camera.lens.kind == "pinhole":
-            K = camera.K.copy()
-            K[[0, 1], [0, 1]] *= zoom
-            camera = dataclasses.replace(camera, K=K)
-        paths.append((camera, poses_at(np.broadcast_to(position, away.shape), rotations)))
+            camera = zoomed(camera, lens)
+        paths.append(_Path(camera, poses_at(np.broadcast_to(position, away.shape), rotations), zoom))
     return paths
 
 
-def _kept(poses: Iterable[NDArray[np.float64]], take: Take) -> list[NDArray[np.float64]]:
-    """Paths of cameras that stay at their poses (4, 4)."""
-    return [np.broadcast_to(pose, (take.num_frames, 4, 4)) for pose in poses]
-
-
 _PATHS: Final = {"still": _still, "orbit": _orbit, "head": _head, "anywhere": _anywhere, "rig": _rig}
+
+
+def _turned_to(
+    position: NDArray[np.float64], centers: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Ways (T, 3) [m] from places to a camera, their lengths (T,) [m], and its axes (T, 3, 3) then."""
+    away = position - centers
+    distances = np.linalg.norm(away, axis=1)
+    return away, distances, looking(away / distances[:, None])
+
+
+def zoomed(camera: Camera, zoom: float) -> Camera:
+    """The camera with so many times its focal lengths."""
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= zoom
+    return dataclasses.replace(camera, K=K)
 
 
 def check_hands_in_view(name: str, cameras: Sequence[Camera], take: Take) -> None:

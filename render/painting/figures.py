@@ -131,14 +131,23 @@ class HandFigure:
         if look.glove is not None:
             self.thickness = self.thickness + fit.layout.heights.max() + fit.layout.radius
 
-    def drawn(self, qpos: Float[np.ndarray, "27"], number: int) -> list[Drawn]:
+    def forearm_line(
+        self, qpos: Float[np.ndarray, "27"]
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """See `PosableSkin.forearm_line`."""
+        return self._skin.forearm_line(qpos)
+
+    def drawn(
+        self, qpos: Float[np.ndarray, "27"], number: int, upper_arm: Float[np.ndarray, "3"] | None = None
+    ) -> list[Drawn]:
         """Skin, and markers where a glove is worn.
 
         Args:
             qpos: The pose.
             number: Index of the hand among those in the picture.
+            upper_arm: Unit direction of its upper arm; see `PosableSkin.posed`.
         """
-        skin, first_part = self._skin.posed(qpos), 1 + PARTS_A_HAND * number
+        skin, first_part = self._skin.posed(qpos, upper_arm), 1 + PARTS_A_HAND * number
         count = len(skin.faces)
         triangles = Triangles(
             skin.vertices,

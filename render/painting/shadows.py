@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 from numpy.typing import NDArray
 
 from handsim.kernels.kernel import kernel
@@ -39,30 +39,35 @@ class ShadowMap(NamedTuple):
 
 
 def shadow_map(
-    points: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], towards: Float[np.ndarray, "3"]
+    points: Float32[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    towards: Float[np.ndarray, "3"],
+    seen: Bool[np.ndarray, "V"],
 ) -> ShadowMap:
-    """The shadows of a surface.
+    """The shadows on a surface.
 
     Args:
         points: Vertices [m], in any frame.
         faces: Triangles.
         towards: Unit vector to the lamp, in the same frame.
+        seen: Around which of the vertices shadows are needed; all when none is.
     """
     aside = np.cross(np.eye(3)[np.abs(towards).argmin()], towards)
     aside /= np.linalg.norm(aside)
     rotation = np.stack([aside, np.cross(aside, towards), towards])  # rows run down, as in pictures
-    corners, to_map, scale = _onto_map(points, rotation)
+    corners, to_map, scale = _onto_map(points, rotation, seen if seen.any() else ~seen)
     nearest, _ = nearest_faces(corners, faces, (_TEXELS, _TEXELS), farthest=-np.inf)
     return ShadowMap(to_map, nearest, 1.5 / scale)
 
 
 @kernel
-def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64]) -> Any:
-    """Points in a map that has room for all of them (V, 3), `ShadowMap.to_map`, and its texels a meter.
+def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64], seen: NDArray[np.bool_]) -> Any:
+    """Points in a map that has room for those seen (V, 3), `ShadowMap.to_map`, and its texels a meter.
 
     Args:
         points: Vertices (V, 3) [m].
         rotation: Rows are the map's axes: right, down, to the lamp (3, 3).
+        seen: Which the map has room for (V,).
     """
     corners = np.empty((len(points), 3))
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -71,7 +76,8 @@ def _onto_map(points: NDArray[np.float32], rotation: NDArray[np.float64]) -> Any
             value = rotation[axis, 0] * points[point, 0]
             value += rotation[axis, 1] * points[point, 1] + rotation[axis, 2] * points[point, 2]
             corners[point, axis] = value
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+            if seen[point]:
+                low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
     scale = (_TEXELS - 2.0 * _EDGE) / max(high[0] - low[0], high[1] - low[1], 1e-6)
     to_map = np.zeros((3, 4))
     to_map[:, :3] = rotation

@@ -1,4 +1,6 @@
-"""`Forearm`, the arm behind the hand, which no bone of the hand model moves.
+"""`Forearm`, the arm behind the hand, which no bone of the hand model moves, and where its upper arm goes.
+
+An upper arm leads out of the pictures: towards the body, as far as that is not into their depth.
 
 Girths are shares of the hand's breadth: ANSUR II (2012) has wrists of 176 and 154 mm and flexed forearms of
 309 and 263 mm around for hands of 88.3 and 78.2 mm (men's and women's means); a forearm at rest is about a
@@ -8,6 +10,7 @@ tenth thinner. Elbows, 1.4 hand lengths behind the wrist, are a little thinner, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,6 +22,7 @@ from scipy.interpolate import PchipInterpolator
 from handsim.errors import HandSimError
 from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_BONES
+from handsim.space.camera import Camera
 from handsim.space.transforms import MIRROR
 
 FOREARM: Final = NUM_BONES
@@ -30,6 +34,17 @@ _GIRTHS: Final = (1.92, 2.1, 2.7, 3.0, 2.85, 3.2, 3.6, 3.8)
 """Girths there [hand breadths]."""
 _BLEND: Final = 0.22  # length of the blend from the hand's section to the arm's [hand lengths]
 _BEND: Final = 0.20  # length of the bend of the wrist [hand lengths]
+ELBOW: Final = _PLACES[4]
+"""Place of the elbow behind the wrist [hand lengths]."""
+_ELBOW_BEND: Final = 0.07  # [m] on either side of the elbow that bend with it
+REACH: Final = 1.8
+"""Where arms that leave a picture end, behind the elbow [m]."""
+_TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
+_TILTS: Final = (0.0, 0.4)  # of an upper arm towards the cameras that are tried
+_DOWN: Final = np.array([0.0, 0.0, -0.5])  # of the way to a body, beside the forearms' level way
+_MOST_BENT: Final = np.cos(np.deg2rad(130.0))
+_CLEAR: Final = 0.12  # [m] between an upper arm and a camera, at least
+_MARGIN: Final = 0.1  # of a picture around it where no arm ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +78,7 @@ class Forearm:
 def sample_forearm(*, rng: np.random.Generator) -> Forearm:
     """A random forearm: wrists within half their range, a sleeve on one in three.
 
-    The arm is straight and reaches beyond the elbow, so that it extends beyond most pictures.
+    The arm reaches beyond the elbow, where `bent_rings` makes it leave the picture.
     """
     length = rng.uniform(0.62, 0.75)
     flexion, deviation = np.clip(rng.normal(0.0, np.deg2rad((12.0, 6.0))), -0.5, 0.5)
@@ -108,6 +123,101 @@ def forearm_rings(
     local = np.concatenate([((1.0 - share) * lean[None, :, None]), sections], axis=-1)
     points: NDArray[np.float64] = center + middles[:, None] + np.einsum("kij,krj->kri", axes, local)
     return points @ mirror
+
+
+def bent_rings(
+    rings: Float[np.ndarray, "K R 3"], elbow: float, towards: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "K R 3"]:
+    """Rings of an arm that bends at its elbow and ends `REACH` behind it [m].
+
+    Args:
+        rings: Of a straight arm, outwards from the hand [m].
+        elbow: Place of the elbow along it, behind the first ring [m].
+        towards: Unit direction of the upper arm.
+    """
+    middles = rings.mean(axis=1)
+    ahead = middles[-1] - middles[-2]
+    ahead /= np.linalg.norm(ahead)
+    steps = np.linalg.norm(np.diff(middles, axis=0), axis=1)
+    beyond = np.concatenate([[0.0], np.cumsum(steps)]) - elbow
+    turned = np.flatnonzero(beyond > -_ELBOW_BEND)
+    start = middles[turned[0]] - (beyond[turned[0]] + _ELBOW_BEND) * ahead
+    beyond[-1] = REACH
+    axis = np.cross(ahead, towards)
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-6 else np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+    most, aside = np.arctan2(sine, ahead @ towards), np.cross(axis, ahead)
+    fine = np.concatenate([np.linspace(-_ELBOW_BEND, _ELBOW_BEND, 33), [REACH]])
+    angles = most * _smooth((fine + _ELBOW_BEND) / (2.0 * _ELBOW_BEND))
+    ways = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
+    course = np.zeros((len(fine), 3))
+    course[1:] = np.cumsum(0.5 * (ways[1:] + ways[:-1]) * np.diff(fine)[:, None], axis=0)
+    angle = np.interp(beyond[turned], fine, angles)[:, None]
+    places = start + np.stack([np.interp(beyond[turned], fine, course[:, i]) for i in range(3)], axis=1)
+    offsets = rings[turned] - middles[turned, None]
+    across, along = (offsets @ aside)[..., None], (offsets @ ahead)[..., None]
+    offsets += across * ((np.cos(angle) - 1.0) * aside - np.sin(angle) * ahead)[:, None]
+    offsets += along * ((np.cos(angle) - 1.0) * ahead + np.sin(angle) * aside)[:, None]
+    bent = rings.copy()
+    bent[turned] = places[:, None] + offsets
+    return bent
+
+
+def upper_arms(
+    elbows: Float[np.ndarray, "H 3"], forearms: Float[np.ndarray, "H 3"], cameras: Sequence[Camera]
+) -> Float[np.ndarray, "H 3"]:
+    """Unit directions from elbows in which arms leave the pictures of all cameras, where that is possible.
+
+    Args:
+        elbows: In the world [m].
+        forearms: Unit directions of the forearms, from wrist to elbow.
+        cameras: All that see the arms.
+    """
+    axis = np.mean([camera.T_world_camera[:3, 2] for camera in cameras], axis=0)
+    if np.linalg.norm(axis) < 0.2:  # they look at the arms from all around
+        axis = cameras[0].T_world_camera[:3, 2]
+    axis = axis / np.linalg.norm(axis)
+    body = forearms.mean(axis=0) * [1.0, 1.0, 0.0] + _DOWN
+    body -= (body @ axis) * axis
+    body /= max(float(np.linalg.norm(body)), 1e-6)
+    found = []
+    for elbow, forearm in zip(elbows, forearms, strict=True):
+        flat = forearm - (forearm @ axis) * axis
+        level = float(np.linalg.norm(flat))
+        back = min(0.0, float(body @ flat)) / max(level, 1e-6) ** 2 * min(1.0, 5.0 * level)
+        way = flat + (1.0 - level) * (body - back * flat)
+        if np.linalg.norm(way) < 1e-3:
+            way = cameras[0].T_world_camera[:3, 1]
+        found.append(_out_of_pictures(elbow, forearm, way / np.linalg.norm(way), axis, cameras))
+    return np.array(found)
+
+
+def _out_of_pictures(
+    elbow: NDArray[np.float64],
+    forearm: NDArray[np.float64],
+    way: NDArray[np.float64],
+    axis: NDArray[np.float64],
+    cameras: Sequence[Camera],
+) -> NDArray[np.float64]:
+    """The direction nearest to `way`, turned about `axis`, in which an arm ends in no picture."""
+    aside = np.cross(axis, way)
+    flat = np.cos(_TURNS)[:, None] * way + np.sin(_TURNS)[:, None] * aside
+    tried = np.concatenate([flat - tilt * axis for tilt in _TILTS])
+    tried /= np.linalg.norm(tried, axis=1, keepdims=True)
+    bad = np.tile(np.abs(_TURNS), len(_TILTS)) / np.pi + np.repeat(_TILTS, len(_TURNS))
+    bad += 3.0 * (tried @ forearm < _MOST_BENT)
+    ends = elbow + REACH * tried
+    for camera in cameras:
+        size = np.array(camera.size, dtype=np.float64)
+        with np.errstate(invalid="ignore"):
+            pixels = camera.project(ends) / size
+        inside = (np.abs(pixels - 0.5) < 0.5 + _MARGIN).all(axis=1)
+        bad += 10.0 * (inside & (camera.local(ends)[:, 2] > 0.0))
+        to_camera = camera.T_world_camera[:3, 3] - elbow
+        nearest = np.clip(tried @ to_camera, 0.0, REACH)[:, None] * tried
+        bad += 5.0 * (np.linalg.norm(to_camera - nearest, axis=1) < _CLEAR)
+    best: NDArray[np.float64] = tried[int(bad.argmin())]
+    return best
 
 
 def _half_axes(

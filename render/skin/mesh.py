@@ -19,9 +19,10 @@ from handsim.hand.skin.skinning import skin_frames
 from handsim.hand.skin.surface import vertex_normals
 from handsim.hand.topology import NUM_BONES, PALM
 from handsim.kernels.kernel import kernel
+from handsim.space.transforms import quaternion_matrix
 from render.skin.atlas import RINGS, skin_atlas
 from render.skin.flexion import Flexion
-from render.skin.forearm import FOREARM, Forearm, forearm_rings
+from render.skin.forearm import ELBOW, FOREARM, Forearm, bent_rings, forearm_rings
 
 _DARKEST: Final = 0.12  # even the deepest folds receive some light
 
@@ -63,6 +64,7 @@ class PosableSkin:
         hand = surface.vertices[atlas.used]
         arm = forearm_rings(model.shape, self.forearm, hand[atlas.wrist], RINGS)
         end = arm[-1].mean(axis=0, keepdims=True)
+        self._elbow = ELBOW * model.shape.length  # behind the first ring, nearly the wrist
         self.rest: Float[np.ndarray, "U 3"] = np.concatenate([hand, arm.reshape(-1, 3), end])
         """Rest positions in the wrist's frame [m]: the hand, the forearm's rings, the middle of its end."""
         beyond = len(self.rest) - len(hand)
@@ -79,15 +81,40 @@ class PosableSkin:
         self._flexion = Flexion(model, self.rest, vertex_normals(self.rest, self.faces), bony)
         self._rest_occluded = self._rest_occlusion(model.rest_transforms[None], self.rest, self.faces)
 
-    def posed(self, qpos: Float[np.ndarray, "27"]) -> DrawnSkin:
+    def forearm_line(
+        self, qpos: Float[np.ndarray, "27"]
+    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """The elbow [m], and the unit direction to it from the wrist, in the world."""
+        middles = self._rings(self.rest).mean(axis=1)
+        ahead = middles[-1] - middles[-2]
+        ahead /= np.linalg.norm(ahead)
+        elbow = middles[-1] + (self._elbow - np.linalg.norm(np.diff(middles, axis=0), axis=1).sum()) * ahead
+        rotation = quaternion_matrix(qpos[3:7])
+        return qpos[:3] + rotation @ elbow, rotation @ ahead
+
+    def _rings(self, rest: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The arm's rings (K, R, 3)."""
+        return rest[skin_atlas().num_hand : -1].reshape(RINGS, -1, 3)
+
+    def posed(
+        self, qpos: Float[np.ndarray, "27"], upper_arm: Float[np.ndarray, "3"] | None = None
+    ) -> DrawnSkin:
         """The skin in one pose.
+
+        Args:
+            qpos: The pose.
+            upper_arm: Unit direction of the upper arm in the world; without it the arm is straight and short.
 
         Raises:
             ArgumentError: `qpos` is not (27,) or not finite.
         """
         atlas = skin_atlas()
         transforms = self.model.forward_kinematics(qpos[None])
-        points = self.merged(transforms, self._flexion.shaped(self.rest, qpos[7:]))
+        shaped = self._flexion.shaped(self.rest, qpos[7:])
+        if upper_arm is not None:
+            rings = bent_rings(self._rings(shaped), self._elbow, upper_arm @ quaternion_matrix(qpos[3:7]))
+            shaped = np.concatenate([shaped[: atlas.num_hand], rings.reshape(-1, 3), rings[-1:].mean(axis=1)])
+        points = self.merged(transforms, shaped)
         normals = vertex_normals(points, self.faces)
         occluded = self._occluded(transforms, points, normals)
         shade = np.clip(1.0 - np.maximum(occluded - self._rest_occluded, 0.0), _DARKEST, 1.0)

@@ -14,7 +14,7 @@ import trimesh
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
 from gloves.fit import GloveFit, attach
-from gloves.layout import load_layout, save_layout, starter_layout
+from gloves.layout import load_layout, starter_layout
 from gloves.takes import columns as table
 from gloves.takes.corrections import NO_MARKER, Correction, save_corrections
 from gloves.takes.growing import GrowingArchive, growing_path
@@ -102,7 +102,7 @@ def tsv(folder: Path) -> list[Path]:
 
 def layout(folder: Path) -> list[Path]:
     (folder / "starter.toml").write_text(starter_layout())
-    save_layout(folder / "dense.toml", load_layout("dense19"))
+    load_layout("dense19").save(folder / "dense.toml")
     return [folder / "starter.toml", folder / "dense.toml"]
 
 

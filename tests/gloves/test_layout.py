@@ -18,7 +18,6 @@ from gloves.layout import (
     MarkerPlace,
     list_layouts,
     load_layout,
-    save_layout,
     shipped_layout,
     starter_layout,
     stored_layout,
@@ -140,7 +139,7 @@ LAYOUTS = st.builds(
 @given(layout=LAYOUTS)
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, layout: MarkerLayout) -> None:
     path = tmp_path_factory.mktemp("layout") / "glove.toml"
-    save_layout(path, layout)
+    layout.save(path)
     again = load_layout(path)
     assert (again.name, again.names, again.sides) == (layout.name, layout.names, layout.sides)
     assert again.radius == pytest.approx(layout.radius, abs=1e-12)
@@ -234,7 +233,7 @@ def test_error_sentences(tmp_path: Path, golden: Callable[[str, dict[str, str]],
         load_layout(path)
     actual["not UTF-8"] = str(caught.value).replace(str(path), "glove.toml")
     with pytest.raises(LayoutError) as caught:
-        save_layout(tmp_path, load_layout("dense19"))
+        load_layout("dense19").save(tmp_path)
     actual["save onto a folder"] = str(caught.value).replace(str(tmp_path), "folder")
     assert not any("\n" in sentence for sentence in actual.values())
     golden("layout_errors", actual)

@@ -13,6 +13,9 @@ from handsim.hand.keypoints import hand_keypoints
 from handsim.hand.model import join_qpos
 from poses import sample_poses
 from render import RenderConfig, ViewConfig, draw
+from render.cameras.viewpoints import PLACEMENTS, Viewpoints
+from render.drawing import open_studio
+from render.studio import Moment
 from train.simulation.takes import simulate_take
 
 K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
@@ -98,3 +101,22 @@ def test_what_cannot_be_drawn_is_told(qpos, arguments, message):
 def test_a_take_has_its_own_hands():
     with pytest.raises(ArgumentError, match="model belongs to poses of your own"):
         draw(simulate_take(num_frames=2), model="M")
+
+
+@pytest.mark.parametrize("kind", ["single-hand", "hand-hand"])
+def test_no_arm_ends_in_a_picture(kind):
+    take = simulate_take(kind=kind, num_frames=120, seed=2)
+    studio = open_studio(take.hands, RenderConfig(painter="compiled"), rng=np.random.default_rng(0))
+    pictures = 0
+    for placement in PLACEMENTS:
+        viewpoints = Viewpoints(ViewConfig(placement, "vga_wide"), take, rng=np.random.default_rng(1))
+        for frame in range(0, 120, 20):
+            cameras = viewpoints.cameras(frame)
+            moment = studio.reaching(Moment(take, frame), cameras)
+            ends = np.array([one.triangles.vertices[-1] for one in studio._drawn(moment, 0.0)])
+            for camera in cameras:
+                pixels, ahead = camera.project(ends), camera.local(ends)[:, 2] > 0.0
+                inside = ((pixels >= 0.0) & (pixels <= camera.size)).all(axis=1) & ahead
+                assert not inside.any(), f"{placement}, frame {frame}, {camera.name}"
+                pictures += 1
+    assert pictures >= 60

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout, save_layout
+from gloves.layout import load_layout
 from handsim.errors import ArgumentError, HandSimWarning, LayoutError, WeightsError
 from train.any_layout.fine_tuning import fine_tuned_labeler
 from train.any_layout.layout_labeler import LayoutLabeler
@@ -35,7 +35,7 @@ class First:
 
 def test_a_layout_that_is_a_shipped_one_has_its_labeler(tmp_path):
     layout = load_layout("dense19")
-    save_layout(tmp_path / "mine.toml", layout)
+    layout.save(tmp_path / "mine.toml")
     for glove in ("dense19", layout, tmp_path / "mine.toml", str(tmp_path / "mine.toml")):
         found = load_labeler(glove)
         assert isinstance(found, TrainedSetLabeler) and found.marker_names == layout.names
@@ -44,7 +44,7 @@ def test_a_layout_that_is_a_shipped_one_has_its_labeler(tmp_path):
 @pytest.mark.parametrize("given", ["name", "object", "path"])
 def test_any_other_layout_is_learned_and_that_is_told(given, quick, tmp_path):
     layout = dataclasses.replace(load_layout("tips8"), name="mine")
-    save_layout(tmp_path / "mine.toml", layout)
+    layout.save(tmp_path / "mine.toml")
     glove = {"name": "tips8", "object": layout, "path": tmp_path / "mine.toml"}[given]
     with pytest.warns(HandSimWarning, match="no labeler was trained on glove"):
         found = load_labeler(glove)

@@ -54,8 +54,7 @@ _SEARCH_LEAST, _SEARCH_MOST = 0.003, 0.012  # [m] bounds of that spread
 _FREE_COORDINATES: Final = 20.0  # degrees of freedom that a pose takes from its points, in effect
 _USUAL_SPREAD: Final = 0.002  # [m] of markers around a fitted pose, as long as few of them tell
 _SUPPOSED: Final = 6.0  # coordinates that this spread counts for
-_LEAST_SCORE: Final = 50.0  # log-odds of a hand: about those of twelve points that are 5 mm off
-_LEAST_PER_MARKER: Final = 5.0  # log-odds of a hand with few markers, for each of them
+_MOST_MARKERS: Final = 10  # whose evidence is asked for: about that of twelve points that are 5 mm off
 _CERTAIN_SCORE: Final = 6.5  # log-odds per marker after which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # of the RMS distance of the other hand, from which on a hand is mirrored
 _HOPELESS_SHARE: Final = 0.8  # of the labels that the other hand keeps
@@ -127,10 +126,30 @@ class HandInitializer:
                 rest = rest[hand.labels[rest] < 0]
                 missing.remove(hand.index)
             self._attempts[missing] += 1
+        initialized = self._sides_checked(initialized, points)
         for hand in initialized:
             self._attempts[hand.index] = 0
         self._first_cut += self._cuts
         return initialized
+
+    def _sides_checked(
+        self, hands: list[InitializedHand], points: Float[np.ndarray, "N 3"]
+    ) -> list[InitializedHand]:
+        """Two hands as they are, or the other way round where both together fit better so.
+
+        One by one the hand that fits a cloud best may be the wrong one: markers without a thumb's, in a
+        symmetric pattern, fit both hands nearly alike.
+        """
+        if len(hands) != 2:
+            return hands
+        one, two = hands
+        exchanged = [
+            self._trim(self._first_fit(index, points, labels), points)
+            for index, labels in ((two.index, one.labels), (one.index, two.labels))
+        ]
+        found = [hand for hand in exchanged if hand is not None]
+        better = sum(hand.score for hand in found) > one.score + two.score
+        return found if len(found) == 2 and better else hands
 
     def score(self, count: int, rms: float, spread: float | None = None) -> float:
         """Log-odds of labeled points being a hand against their being strays.
@@ -243,7 +262,8 @@ class HandInitializer:
         accepted = (
             best is not None
             and best.fit.rms[0] <= self._config.most_rms
-            and best.score >= min(_LEAST_SCORE, _LEAST_PER_MARKER * self._states[best.index].num_markers)
+            and best.score
+            >= self._config.least_evidence * min(_MOST_MARKERS, self._states[best.index].num_markers)
         )
         return best if accepted else None
 

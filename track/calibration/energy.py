@@ -54,10 +54,11 @@ from track.calibration.skin_coordinates import (
 
 ALPHA_NORMAL, ALPHA_ALONG = 2.0, 1.0
 """Weights of E_prior along the normal and in the skin (Han et al. 2018, section 4.5)."""
-POSITION_SPREAD: Final = 0.006
-"""Standard deviation of a marker's slip along the skin [m]; (noise / spread)^2 is the paper's lambda_1."""
-HEIGHT_SPREAD: Final = 0.002
-"""Standard deviation of a marker center's height around that of the design [m]."""
+POSITION_SPREAD: Final = 0.002
+"""Standard deviation of a marker's slip along the skin [m], to begin with; (noise / spread)^2 is the paper's
+lambda_1."""
+HEIGHT_SPREAD: Final = 0.0005
+"""The same of a marker center's height around that of the design [m]."""
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
 _LIMIT_SPREAD: Final = np.deg2rad(2.0)  # of an angle beyond its range
@@ -111,7 +112,7 @@ class NormalEquations(NamedTuple):
 
 
 class Problem:
-    """The data of a calibration; only `robust_scale` changes, once a hand nearly fits.
+    """The data of a calibration; once a hand nearly fits, `robust_scale` and the markers' spreads change.
 
     Args:
         shape: Right hand that the parameters start from.
@@ -141,6 +142,7 @@ class Problem:
         """Markers that are not missing."""
         self.targets = np.where(self.present[..., None], targets, 0.0)
         self.noise, self.robust_scale = noise, robust_scale
+        self.position_spread, self.height_spread = POSITION_SPREAD, HEIGHT_SPREAD
         self.precision = shape_precision()
         self._ranges = HandModel(shape).skeleton.ranges
         self._surface_jacobian: NDArray[np.float64] | None = None
@@ -177,7 +179,7 @@ class Problem:
         cost = (squares / (1.0 + squares / self.robust_scale**2)).sum() / self.noise**2
         cost += estimate.parameters @ self.precision @ estimate.parameters
         cost += (fit.design_residuals * self._apply_position_precision(fit, fit.design_residuals)).sum()
-        cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / HEIGHT_SPREAD**2
+        cost += ((estimate.coordinates.heights - self.heights) ** 2).sum() / self.height_spread**2
         values, weights = self._joint_angle_residuals(estimate)
         cost += (weights * values**2).sum()
         if fit.geometry is not None and estimate.contacts is not None:
@@ -189,7 +191,7 @@ class Problem:
         """E_prior's precision matrix of each marker [1/m^2] times vectors (M, 3)."""
         along = (vectors * fit.normals).sum(axis=1, keepdims=True) * fit.normals
         product: NDArray[np.float64] = ALPHA_ALONG * vectors + (ALPHA_NORMAL - ALPHA_ALONG) * along
-        return product / POSITION_SPREAD**2
+        return product / self.position_spread**2
 
     def _joint_angle_residuals(self, estimate: Estimate) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Residuals of the joint angles (F, 40) [rad] to their limits and to rest, and their weights."""
@@ -303,9 +305,9 @@ class Problem:
         weighted = np.stack(columns, axis=-1)
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
-        result.shared[:] += heights.T @ heights / HEIGHT_SPREAD**2
+        result.shared[:] += heights.T @ heights / self.height_spread**2
         result.shared_gradient[:] += (
-            (estimate.coordinates.heights - self.heights) @ heights / HEIGHT_SPREAD**2
+            (estimate.coordinates.heights - self.heights) @ heights / self.height_spread**2
         )
         values, weights = self._joint_angle_residuals(estimate)
         angles = np.arange(6, 26)

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from gloves.attachment import Attachment
 from gloves.fit import GloveFit
 from handsim.errors import ArgumentError, HandSimError
-from handsim.hand.topology import BONES, DIGITS, NUM_JOINTS
-from track.calibration.report import ENOUGH_RANGE, still_joints
+from handsim.hand.topology import BONES, DIGITS
 from track.kinematics.pose_solver import PoseSolver
 
 NUM_FRAMES: Final = 240
@@ -97,20 +96,6 @@ def initial_poses(
 ) -> PoseTrack:
     """Poses of frames spread over the capture, on the hand that a calibration begins with."""
     return solve_frames(markers, hand, usable[:: max(1, len(usable) // _INITIAL_FRAMES)])
-
-
-def check_motion(track: PoseTrack, complete: Bool[np.ndarray, "T 5"], hand: GloveFit) -> None:
-    """Check that the hand moves.
-
-    Raises:
-        CalibrationError: More than half of its joints are still.
-    """
-    still = still_joints(track.qpos[:, 7:], complete[track.frames], hand.model)
-    if 2 * len(still) > NUM_JOINTS:
-        raise CalibrationError(
-            f"{len(still)} of the {hand.side} hand's {NUM_JOINTS} joints cover less than {ENOUGH_RANGE:.0%} "
-            "of their range while all markers of their digit are seen, expected a capture in which all move"
-        )
 
 
 def complete_digits(markers: Float[np.ndarray, "T M 3"], attachment: Attachment) -> Bool[np.ndarray, "T 5"]:

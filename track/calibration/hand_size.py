@@ -24,6 +24,7 @@ from track.calibration.energy import Estimate, Problem
 from track.calibration.hand_parameters import NUM_PARAMETERS
 from track.calibration.skin_coordinates import nearest_coordinates
 from track.calibration.solver import levenberg_marquardt, user_hand
+from track.config import TrackerConfig
 from track.kinematics.pose_solver import PoseSolver
 from track.streams.frame_source import StreamedFrame
 from track.tracked_frame import Status
@@ -43,6 +44,7 @@ _INDEPENDENT: Final = 4.0  # frames' worth of evidence: what glue and flesh do r
 _PROBE: Final = 0.006  # [m] of length to either side, where the cost tells how sure the length is
 _FRAMES: Final = 8  # of each hand with which length and breadth are searched
 _PROPORTION_FRAMES: Final = 40  # of each hand that its proportions are fitted to
+_MOST_FRAMES: Final = 0.5  # share of the frames in which measured hands must be found
 _FEWEST: Final = 3  # frames with which a size is trusted
 _MISSING: Final = 0.2  # share of the markers at most in such a frame
 _FITTED: Final = (Status.TRACKED, Status.INITIALIZED)
@@ -51,6 +53,9 @@ _WINDOWS: Final = 8  # parts of a capture that are looked at
 _WINDOW: Final = 16  # frames of each
 _FIT_NOISE: Final = 0.003  # [m] twice that of real gloves: flesh repeats in frames that are much alike
 _UNSURE: Final = 0.003  # [m] standard deviation of the length from which on it is told
+_SLIP_SPREAD, _LIFT_SPREAD = 0.006, 0.002  # [m] of markers around their places, so that tracking finds them
+_REPEATED: Final = 4.0  # a glove that slipped is the same in all frames: they tell the length as one does
+_LENIENT: Final = TrackerConfig(least_evidence=2.0)  # for hands of few markers, before they are measured
 _ROBUST_SCALE: Final = 0.015  # [m]
 _FIT_STEPS: Final = 15
 _SMALL_GAIN, _RELINEARIZE = 1e-3, 0.05  # ten times a calibration's: a size has 0.2 mm to spare
@@ -98,22 +103,50 @@ def fit_size(
     Returns:
         The hands, both of one shape; None if no hand is found that shows most of its markers.
     """
-    for length in _LENGTHS:
-        start = _hand(length, usual_breadth(length), layout)
-        markers = _label(frames, start, sides, labeler)
-        if not markers:
-            continue
+    usual = TrackerConfig()
+    for config in (usual, _LENIENT):
+        for length in _LENGTHS:
+            fit = _fit_from(length, frames, layout, sides, labeler, config)
+            if fit is not None and (config is usual or _is_found(fit, frames, sides, labeler)):
+                return fit
+    return None
+
+
+def _fit_from(
+    length: float,
+    frames: Sequence[StreamedFrame],
+    layout: MarkerLayout,
+    sides: Sequence[Side],
+    labeler: Labeler,
+    config: TrackerConfig,
+) -> SizeFit | None:
+    """The hands that are found as hands of a length [m]."""
+    start = _hand(length, usual_breadth(length), layout)
+    markers = _label(frames, start, sides, labeler, config)
+    if not markers:
+        return None
+    search = _Search(markers, start)
+    found = search.length(usual_breadth, _SHORTEST, _LONGEST)
+    if abs(found - length) > _FAR:  # the labels are better with its own size
+        start = _hand(found, usual_breadth(found), layout)
+        markers = _label(frames, start, sides, labeler, config) or markers
         search = _Search(markers, start)
         found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-        if abs(found - length) > _FAR:  # the labels are better with its own size
-            start = _hand(found, usual_breadth(found), layout)
-            markers = _label(frames, start, sides, labeler) or markers
-            search = _Search(markers, start)
-            found = search.length(usual_breadth, _SHORTEST, _LONGEST)
-        measures, spread = search.measures(found)
-        hand, rms = _fit_proportions(_as_right(markers), _hand(*measures, layout))
-        return SizeFit(hand, rms, spread)
-    return None
+    measures, spread = search.measures(found)
+    hand, rms = _fit_proportions(_as_right(markers), _hand(*measures, layout))
+    return SizeFit(hand, rms, spread)
+
+
+def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
+    """Whether hands that were measured by weak evidence are found by the usual one in most frames."""
+    tracker = Tracker(fit.hands(sides), labeler)
+    least = (1.0 - _MISSING) * fit.hand.layout.num_markers
+    tracked = [
+        any(hand.has_pose for hand in tracker.step(frame.points, frame.ids, frame.time).hands)
+        for frame in frames
+        if len(frame.points) >= least
+    ]
+    return bool(np.mean(tracked) >= _MOST_FRAMES) if tracked else False
 
 
 def usual_breadth(length: float) -> float:
@@ -129,13 +162,18 @@ def _hand(length: float, breadth: float, layout: MarkerLayout) -> GloveFit:
 
 
 def _label(
-    frames: Sequence[StreamedFrame], hand: GloveFit, sides: Sequence[Side], labeler: Labeler
+    frames: Sequence[StreamedFrame],
+    hand: GloveFit,
+    sides: Sequence[Side],
+    labeler: Labeler,
+    config: TrackerConfig,
 ) -> dict[Side, Float[np.ndarray, "F M 3"]]:
     """Labeled markers [m] of each hand, NaN where missing, in frames that show most of them.
 
     Hands that few frames show are left out.
     """
-    tracker, count = Tracker([hand.with_side(side) for side in sides], labeler), hand.layout.num_markers
+    tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
+    count = hand.layout.num_markers
     found: list[list[NDArray[np.float64]]] = [[] for _ in sides]
     in_vain = 0
     for frame in frames:
@@ -200,7 +238,8 @@ class _Search:
         length = self.length(lambda tried: breadth, 0.95 * length, 1.05 * length)
         around = [self._cost(length + step, breadth) for step in (-_PROBE, 0.0, _PROBE)]
         curvature = (around[0] - 2.0 * around[1] + around[2]) / _PROBE**2
-        return (length, breadth), max(curvature, _LENGTH_SPREAD**-2) ** -0.5
+        prior = _LENGTH_SPREAD**-2
+        return (length, breadth), (max(curvature - prior, 0.0) / _REPEATED + prior) ** -0.5
 
     def _cost(self, length: float, breadth: float) -> float:
         solver = PoseSolver(_hand(length, breadth, self._layout))
@@ -275,6 +314,7 @@ def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple
         robust_scale=_ROBUST_SCALE,
         relinearize=_RELINEARIZE,
     )
+    problem.position_spread, problem.height_spread = _SLIP_SPREAD, _LIFT_SPREAD
     poses = PoseSolver(start).solve(seen).qpos
     estimate = Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, poses)
     estimate, _, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, _SMALL_GAIN)

@@ -12,18 +12,18 @@ from handsim.hand.model import HandModel
 from handsim.hand.shape import HandShape
 from handsim.hand.skeleton import build_skeleton
 from handsim.hand.skin.surface import rest_vertices
-from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS
-from handsim.space.transforms import quaternion_matrix
+from handsim.hand.topology import JOINT_NAMES, NUM_JOINTS, PALM
+from handsim.space.transforms import quaternion_matrix, rigid_fit
 from track.calibration.contacts import contact_geometry, initialize_contacts
-from track.calibration.energy import Estimate, Fit, Problem
+from track.calibration.energy import HEIGHT_SPREAD, POSITION_SPREAD, Estimate, Fit, Problem
 from track.calibration.hand_parameters import BONE_LENGTHS, LENGTH, NUM_PARAMETERS, shape_jacobian
 from track.calibration.skin_coordinates import SkinPatch, skin_points, skin_weights
 from track.calibration.solver import eliminate_poses
 
-ENOUGH_RANGE: Final = 0.3
-"""Share of a joint's range that the user has to cover."""
+_ENOUGH_RANGE: Final = 0.3  # share of a joint's range that the user should cover
 _LEAST_NOISE, _MOST_NOISE = 0.0001, 0.003  # [m]
 _CHI2_MEDIAN: Final = 2.366  # median of the chi-squared distribution with three degrees of freedom
+_USUAL_WORTH: Final = 12.0  # coordinates of markers that the usual spread counts as
 _INDEPENDENT_POSES: Final = 14.0  # frames whose deformation of the flesh is independent
 
 
@@ -69,21 +69,62 @@ def effective_noise(noise: float, repeated: float, num_frames: int) -> float:
     return float(np.sqrt(noise**2 + flesh * max(num_frames / _INDEPENDENT_POSES - 1.0, 0.0)))
 
 
+def learn_spreads(problem: Problem, estimate: Estimate, fit: Fit) -> None:
+    """Set the spreads of marker places and heights to what the data tell of this glove (MacKay 1992).
+
+    Each marker counts as far as the data determine its place, beside a few of the usual spread.
+    """
+    reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
+    covariance = np.linalg.inv(reduced[:, :-1])
+    own = [slice(first, first + 3) for first in range(NUM_PARAMETERS, len(covariance), 3)]
+    blocks, normals = np.array([covariance[one, one] for one in own]), fit.normals
+    across = np.einsum("mi,mij,mj->m", normals, blocks, normals)
+    along = np.trace(blocks, axis1=1, axis2=2) - across
+    off = fit.design_residuals
+    slips = (off**2).sum(axis=1) - (off * normals).sum(axis=1) ** 2
+    lifts = (estimate.coordinates.heights - problem.heights) ** 2
+    problem.position_spread = _learned(slips, along, 2, problem.position_spread, POSITION_SPREAD)
+    problem.height_spread = _learned(lifts, across, 1, problem.height_spread, HEIGHT_SPREAD)
+
+
+def _learned(
+    squares: NDArray[np.float64], variances: NDArray[np.float64], axes: int, spread: float, usual: float
+) -> float:
+    """A spread [m] of offsets from zero.
+
+    Args:
+        squares: Estimated offsets, squared, summed over the axes (M,) [m^2].
+        variances: Their posterior variances, summed over the axes (M,) [m^2].
+        axes: Number of axes.
+        spread: The spread before [m].
+        usual: Of gloves [m].
+    """
+    determined = np.clip(axes - variances / spread**2, 0.0, None).sum()
+    return float(np.sqrt((squares.sum() + _USUAL_WORTH * usual**2) / (determined + _USUAL_WORTH)))
+
+
 def standard_errors(
     problem: Problem, estimate: Estimate, fit: Fit
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m]."""
+    """Standard errors of marker positions on their bones (M,) and of bone lengths (5, 3) [m].
+
+    Where the wrist is in the palm is a convention: of the palm's markers it is the error among the knuckles.
+    """
     reduced, _ = eliminate_poses(problem.normal_equations(estimate, fit), 0.0)
     covariance = np.linalg.inv(reduced[:, :-1])
     weights = skin_weights(estimate.coordinates)
     bones, patch = weights.argmax(axis=1), SkinPatch(estimate.coordinates.faces)
 
     def on_bones(shapes: list[HandShape]) -> NDArray[np.float64]:
-        local = []
+        local, knuckles = [], fit.model.skeleton.offsets[1::3]
         for shape, vertices in zip(shapes, rest_vertices(shapes), strict=True):
-            rest = build_skeleton(shape).rest_transforms()[bones]
+            skeleton = build_skeleton(shape)
+            rest = skeleton.rest_transforms()[bones]
             points = skin_points(estimate.coordinates, patch.corners(vertices))[0]
-            local.append(np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3]))
+            rotation, translation = rigid_fit(skeleton.offsets[1::3], knuckles)
+            among_knuckles = points @ rotation.T + translation
+            own = np.einsum("mji,mj->mi", rest[:, :3, :3], points - rest[:, :3, 3])
+            local.append(np.where((bones == PALM)[:, None], among_knuckles, own))
         return np.array(local)
 
     count = len(bones)
@@ -124,6 +165,6 @@ def still_joints(
     for joint in range(NUM_JOINTS):
         seen = angles[complete[:, joint // 4], joint]
         covered = np.ptp(np.quantile(seen, [0.02, 0.98])) if len(seen) else 0.0
-        if covered < ENOUGH_RANGE * (ranges[joint, 1] - ranges[joint, 0]):
+        if covered < _ENOUGH_RANGE * (ranges[joint, 1] - ranges[joint, 0]):
             still.append(JOINT_NAMES[joint])
     return tuple(still)

@@ -12,9 +12,7 @@ markers' residuals. The spreads were chosen on simulated people (docs/calibratio
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,7 +21,7 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim.hand.model import HandModel
-from handsim.hand.topology import DIGITS, Side
+from handsim.hand.topology import DIGITS
 from handsim.space.transforms import MIRROR
 from track.calibration.contacts import contact_weights, find_touches, initialize_contacts
 from track.calibration.energy import Estimate, Fit, Problem
@@ -31,7 +29,6 @@ from track.calibration.frames import (
     CalibrationError,
     PoseTrack,
     check_markers,
-    check_motion,
     complete_digits,
     informative_frames,
     initial_poses,
@@ -42,6 +39,7 @@ from track.calibration.hand_parameters import NUM_PARAMETERS, shape_at
 from track.calibration.report import (
     contact_gaps,
     effective_noise,
+    learn_spreads,
     marker_noise,
     repeated_share,
     standard_errors,
@@ -50,14 +48,16 @@ from track.calibration.report import (
 from track.calibration.skin_coordinates import SkinPatch, nearest_coordinates, skin_points
 from track.calibration.solver import Progress, levenberg_marquardt, user_hand
 
-__all__ = ["Calibration", "CalibrationError", "Touch", "calibrate_hand", "calibrate_hands"]
+__all__ = ["Calibration", "CalibrationError", "Touch", "calibrate_hand"]
 
 _WIDE_STEPS: Final = 6  # at the first robust scale, which keeps distant markers
 _STEPS_WITHOUT_CONTACTS: Final = 10  # steps, as in the paper
 MOST_STEPS: Final = 30
 """Steps in all, at most."""
+_SPREAD_ROUNDS: Final = 4  # in which the spreads of marker places are learned
 _FIRST_NOISE, _FIRST_SCALE = 0.001, 0.03  # [m]
 _SCALE_IN_NOISES: Final = 8.0  # robust scale over the noise
+_BETTER: Final = 0.98  # of the distance before; what is not better than that stays as it was
 _SIGNIFICANT: Final = 0.25  # weight above which a touch is significant
 
 
@@ -90,8 +90,8 @@ class HeldOut(NamedTuple):
 
     @property
     def is_better(self) -> bool:
-        """Whether the calibrated hand fits better."""
-        return self.after < self.before
+        """Whether the calibrated hand fits better, by more than chance."""
+        return self.after < _BETTER * self.before
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,14 +108,35 @@ class Calibration:
     shifts: Float[np.ndarray, "M"]
     """Distance of each marker from its position by the glove's design on this hand [m]."""
     position_errors: Float[np.ndarray, "M"]
-    """Standard error of each marker's position on its bone [m]."""
+    """Standard error of each marker's position on its bone, or among the knuckles on the palm [m]."""
     length_errors: Float[np.ndarray, "5 3"]
     """Standard error of each bone's length [m]."""
     touches: tuple[Touch, ...]
     still_joints: tuple[str, ...]
     """Joints that moved too little to determine the bones on either side."""
     held_out: HeldOut | None = None
-    """Whether it is better than no calibration on held-out frames; None if that was not measured."""
+    """How it does on frames that it was not solved on; None if that was not measured."""
+
+    @property
+    def is_better(self) -> bool:
+        """Whether it was tried on held-out frames, and fits them better than the hand before."""
+        return self.held_out is not None and self.held_out.is_better
+
+    @property
+    def place_error(self) -> float:
+        """What the capture leaves open of the markers' places, root of the mean square over markers [m]."""
+        return float(np.sqrt((self.position_errors**2).mean()))
+
+    def __str__(self) -> str:
+        """The markers on held-out frames and their places, in a line [mm]."""
+        if self.held_out is None:
+            return "too few frames to try a calibration on, so that it stays as it was"
+        before, after, frames = self.held_out
+        line = f"markers {1e3 * before:.2f} mm off before, {1e3 * after:.2f} mm calibrated"
+        line += f" on {frames} frames held out"
+        if not self.is_better:
+            return f"{line}: no better, so that it stays as it was"
+        return f"{line}, their places known to {1e3 * self.place_error:.1f} mm"
 
     @property
     def significant_touches(self) -> tuple[Touch, ...]:
@@ -155,8 +176,8 @@ def calibrate_hand(
     """Fit a hand and its glove to one user's labeled markers.
 
     Args:
-        markers: The markers of one hand in the glove's order [m]; NaN where missing. Half a minute or more in
-            which every joint moves and the thumb touches each fingertip and holds still for a moment.
+        markers: The markers of one hand in the glove's order [m]; NaN where missing. Of joints that do not
+            move and tips that do not touch, what is usual among people stays.
         start: Where to begin: `nominal_fit` of the nearest size, or an earlier calibration.
         rate: Frames per second [Hz].
         progress: Called after each step.
@@ -165,7 +186,7 @@ def calibrate_hand(
         The calibrated hand in its glove, residuals [m] before and after, and standard errors [m].
 
     Raises:
-        CalibrationError: Too few frames have enough markers, or the hand does not move.
+        CalibrationError: Too few frames have enough markers.
         ArgumentError: `markers` do not fit the glove, or `rate` is not positive.
     """
     mirror = MIRROR if start.side == "left" else np.eye(3)
@@ -173,14 +194,13 @@ def calibrate_hand(
     usable = usable_frames(markers, start)
     complete = complete_digits(markers, right.attachment)
     track = initial_poses(markers, right, usable)
-    check_motion(track, complete, start)
     problem, estimate = _initial_problem(markers, right, track)
     estimate, fit, steps = _solve_without_touches(problem, estimate, progress)
     rough = user_hand(right, problem, estimate)
     rough_track = solve_frames(markers, rough, usable)
     touches = find_touches(rough.model, rough_track.qpos[:, 7:], complete[usable], rate)
     problem, estimate = _with_touches(problem, estimate, fit, markers, rough_track, touches)
-    estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, MOST_STEPS, progress)
+    estimate, fit = _solve_with_spreads(problem, estimate, steps, progress)
     done = user_hand(right, problem, estimate)
     before = _gaps_before(right, markers, touches, usable)
     final = solve_frames(markers, done, usable, rough_track.qpos)
@@ -195,43 +215,6 @@ def calibrate_hand(
         length_errors=length_errors,
         touches=_touches(estimate, fit, touches, rough_track.frames, before, mirror),
         still_joints=still_joints(final.qpos[:, 7:], complete[usable], done.model),
-    )
-
-
-def calibrate_hands(
-    markers: Mapping[Side, Float[np.ndarray, "T M 3"]],
-    start: Sequence[GloveFit],
-    rate: float,
-    *,
-    progress: Callable[[Side, int, float, float], None] | None = None,
-) -> tuple[Calibration, ...]:
-    """Calibrate each of a user's hands that is in a capture.
-
-    Args:
-        markers: For each side the markers in the glove's order [m]; NaN where missing, everywhere for a hand
-            that is not in the capture.
-        start: Where to begin, each side at most once; sides that `markers` lacks are left out.
-        rate: Frames per second [Hz].
-        progress: Called after each step with the side and the values that `calibrate_hand` gives.
-
-    Raises:
-        CalibrationError: The capture has no hand, or determines too little of one.
-        ArgumentError: Markers do not fit a glove, or `rate` is not positive.
-    """
-    shown = [hand for hand in start if np.isfinite(markers.get(hand.side, np.nan)).any()]
-    if not shown:
-        sides = " or ".join(hand.side for hand in start) or "any"
-        raise CalibrationError(
-            f"the capture has no marker of the {sides} hand, expected half a minute of one"
-        )
-    return tuple(
-        calibrate_hand(
-            markers[hand.side],
-            hand,
-            rate,
-            progress=None if progress is None else partial(progress, hand.side),
-        )
-        for hand in shown
     )
 
 
@@ -260,6 +243,16 @@ def _solve_without_touches(
     estimate, fit, steps = levenberg_marquardt(problem, estimate, 0, _WIDE_STEPS, progress)
     problem.robust_scale = _SCALE_IN_NOISES * marker_noise(problem, fit)
     return levenberg_marquardt(problem, estimate, steps, _STEPS_WITHOUT_CONTACTS, progress)
+
+
+def _solve_with_spreads(
+    problem: Problem, estimate: Estimate, steps: int, progress: Progress | None
+) -> tuple[Estimate, Fit]:
+    """The last steps; how far the glove's markers are from their design is learned meanwhile."""
+    for last in np.linspace(steps, MOST_STEPS, 1 + _SPREAD_ROUNDS).astype(int)[1:]:
+        learn_spreads(problem, estimate, problem.fit(estimate))
+        estimate, fit, steps = levenberg_marquardt(problem, estimate, steps, int(last), progress)
+    return estimate, fit
 
 
 def _with_touches(

@@ -8,9 +8,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from handsim.hand.topology import BONES, DIGITS, JOINTS
+from handsim.hand.topology import BONE_NAMES, BONES, DIGITS, JOINTS
 from track.glove_advice.joint_spread import untold_spreads
 from track.glove_advice.layout_score import LayoutScore
+from track.glove_advice.trials import METHODS
 from train.reports.hand_plot import mistakes
 
 UNTOLD: Final = 0.6
@@ -19,6 +20,7 @@ _UNCERTAIN: Final = np.deg2rad(5.0)  # a joint that is known better needs no mar
 _CONFUSED: Final = 0.02  # share of a marker's points that are taken for another's
 _HIDDEN: Final = 0.85  # share of frames in which a marker should be seen
 _TOUCHING: Final = 0.02  # share of frames
+_WRONG: Final = 0.97  # share of frames in which a marker of a capture should be right
 _SIDES: Final = 0.99  # share of frames whose side should be right
 _DISPENSABLE: Final = np.deg2rad(0.3)  # by which no joint's spread grows without a marker
 _MOST_OF_A_KIND: Final = 4
@@ -34,11 +36,28 @@ class Advice(NamedTuple):
 
 def advice(score: LayoutScore) -> list[str]:
     """Sentences about a layout, the most important first."""
-    kinds = (_confusions, _untold_joints, _hidden, _touching, _sides, _dispensable)
+    kinds = (_captures, _confusions, _untold_joints, _hidden, _touching, _sides, _dispensable)
     found = [
         one for kind in kinds for one in sorted(kind(score), key=lambda item: -item.weight)[:_MOST_OF_A_KIND]
     ]
     return [one.sentence for one in sorted(found, key=lambda item: -item.weight)]
+
+
+def _captures(score: LayoutScore) -> Iterator[Advice]:
+    """The worst marker of the captures that were tried."""
+    for work, trial in score.trials.items():
+        shares = {method: float(trial.slots[method][trial.worst]) for method in METHODS}
+        if min(shares.values()) < _WRONG:
+            told = ", ".join(f"{100 * share:.0f} % with {method}" for method, share in shares.items())
+            yield Advice(
+                1.0 - min(shares.values()),
+                f"With {work} {score.layout.names[trial.worst]} is labeled worst: right in {told}. Give it "
+                "a marker next to it on the same digit, or other distances to the markers of the palm.",
+            )
+
+
+def _digit(bone: str) -> int:
+    return BONES[BONE_NAMES.index(bone)].digit
 
 
 def _confusions(score: LayoutScore) -> Iterator[Advice]:
@@ -66,7 +85,10 @@ def _untold_joints(score: LayoutScore) -> Iterator[Advice]:
         if not untold:
             continue
         bones = [BONES[JOINTS[number].bone].name for number in untold]
-        bone = next((one for one in reversed(bones) if one not in carried), bones[-1])
+        whole = [BONES[JOINTS[number].bone].name for number in joints]
+        bone = next((one for one in (*reversed(bones), *reversed(whole)) if one not in carried), None)
+        if bone is None:  # every bone has a marker already
+            continue
         listed = ", ".join(
             f"{JOINTS[number].name.removeprefix(name + '_').replace('_', ' ')} "
             f"({np.rad2deg(score.joints[number]):.0f} deg)"
@@ -89,9 +111,12 @@ def _hidden(score: LayoutScore) -> Iterator[Advice]:
 
 
 def _touching(score: LayoutScore) -> Iterator[Advice]:
-    names = score.layout.names
+    """Pairs that moving helps: not of tips that meet because fingers do."""
+    names, digits = score.layout.names, [_digit(marker.bone) for marker in score.layout.markers]
     for first, second in zip(*np.nonzero(np.triu(score.near) > _TOUCHING), strict=True):
         share = float(score.near[first, second])
+        if digits[first] != digits[second]:
+            continue
         yield Advice(
             share,
             f"Move {names[first]} and {names[second]} apart: they touch, or nearly, in "

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Final
 
 import numpy as np
 
 from gloves.attachment import attach_markers
-from gloves.layout import MarkerLayout, MarkerPlace
+from gloves.layout import ACROSS_RANGE, ALONG_RANGE, MarkerLayout, MarkerPlace
 from handsim.errors import LayoutError
 from handsim.hand.model import HandModel
 from handsim.hand.topology import BONE_NAMES, BONES, PALM
 from handsim.space.cameras import CameraRig
+from track.glove_advice.joint_spread import palm_spread
 from track.glove_advice.layout_worth import Worth, judge
 from track.glove_advice.worn_places import Columns, WornPlaces
 from train.any_layout.skin_bank import sample_places
@@ -24,8 +26,12 @@ _CANDIDATES: Final = 10  # places that are tried at once
 _LOCAL: Final = 6  # of them near the marker's own
 _ADDED: Final = 24  # places that are tried for a new marker
 _STEP: Final = (0.15, float(np.deg2rad(20.0)), 0.1)  # standard deviations: along, around, across
+_GRID: Final = (0.05, float(np.deg2rad(15.0)), 0.05)  # of places that a person finds with a ruler
 _CLEAR: Final = 0.006  # between two markers' surfaces on the flat hand [m]
-_FOLDS: Final = (0.12, 0.9)  # of a finger's bone: beyond these the skin folds and stretches
+_CREASE: Final = 0.005  # from a joint, within which the skin folds and stretches [m]
+_TIP: Final = 0.9  # of the last bone: beyond it is the nail's edge
+_ON_BACK: Final = 3  # markers on the palm's bone, from which its pose is known
+_PALM_SURE: Final = float(np.deg2rad(2.0))  # spread of the palm's pose that is enough [rad]
 _PALM_ALONG, _PALM_ACROSS = (-0.1, 0.95), 0.36
 _PADS: Final = float(np.deg2rad(80.0))  # beyond this angle a finger's marker touches what is held
 _GAIN: Final = 0.05  # of a better layout, at least [points]
@@ -58,6 +64,9 @@ class Improvement:
         self._model = HandModel.named("M")
         self._people = WornPlaces(_PEOPLE, _POSES_EACH, layout.radius, rig, rng=rng)
         self._seed = int(rng.integers(2**31))
+        self._spare_digits = True
+        self._most_of_bone = Counter(place.bone for place in layout.markers)
+        self._palm = palm_spread(layout.markers, self._model)
         self._columns = self._people.put_on(layout.markers)
         self.worth = self._judge(self._columns)
         """How good the layout so far is."""
@@ -73,6 +82,7 @@ class Improvement:
         Raises:
             LayoutError: More markers than that are to be kept.
         """
+        self._spare_digits = num_markers >= self._covered(self._start.markers)
         while len(self._columns.places) < num_markers:
             self._take(self._grown())
         while len(self._columns.places) > num_markers:
@@ -97,10 +107,11 @@ class Improvement:
     def smaller(self, fewest: int) -> list[tuple[int, Worth]]:
         """How good the layout is without its least useful markers, one after the other; it stays as it is."""
         kept, found = (self.worth, self._columns), []
+        spare, self._spare_digits = self._spare_digits, False
         while len(self._columns.places) > fewest:
             self._take(self._shrunk())
             found.append((len(self._columns.places), self.worth))
-        self.worth, self._columns = kept
+        self.worth, self._columns, self._spare_digits = *kept, spare
         return found
 
     def _judge(self, columns: Columns) -> Worth:
@@ -114,8 +125,29 @@ class Improvement:
         self.worth, self._columns = worth, columns
 
     def _best(self, layouts: Sequence[Columns]) -> tuple[Worth, Columns | None]:
-        judged = [(self._judge(layout), layout) for layout in layouts]
+        judged = [(self._judge(layout), layout) for layout in layouts if self._is_wearable(layout.places)]
         return min(judged, key=lambda one: one[0].cost) if judged else (self.worth, None)
+
+    def _is_wearable(self, places: Sequence[MarkerPlace]) -> bool:
+        """Whether every digit that had a marker has one, no bone a crowd, and the back enough of them."""
+        bones = Counter(place.bone for place in places)
+        crowded = any(
+            count > max(1, self._most_of_bone[bone])
+            for bone, count in bones.items()
+            if bone != BONE_NAMES[PALM]
+        )
+        if crowded or (self._spare_digits and self._covered(places) < self._covered(self._start.markers)):
+            return False
+        back = min(_ON_BACK, self._most_of_bone[BONE_NAMES[PALM]])
+        if not self._spare_digits:
+            return True
+        enough = palm_spread(places, self._model) <= max(self._palm, _PALM_SURE)
+        return bones[BONE_NAMES[PALM]] >= back and enough
+
+    def _covered(self, places: Sequence[MarkerPlace]) -> int:
+        """Digits of the first layout that have a marker."""
+        had = {_digit(place) for place in self._start.markers}
+        return len(had & {_digit(place) for place in places})
 
     def _shrunk(self) -> list[Columns]:
         """The layout without each of its markers."""
@@ -162,24 +194,37 @@ class Improvement:
         for _ in range(_TRIES):
             along, around, across = self._rng.standard_normal(3) * _STEP
             palm = place.bone == BONE_NAMES[PALM]
-            moved = dataclasses.replace(
-                place,
-                along=float(np.clip(place.along + along, *(_PALM_ALONG if palm else _FOLDS))),
-                around=place.around if palm else float(np.clip(place.around + around, -_PADS, _PADS)),
-                across=float(np.clip(place.across + across, -_PALM_ACROSS, _PALM_ACROSS)) if palm else 0.0,
+            moved = self._on_grid(
+                dataclasses.replace(
+                    place,
+                    along=float(np.clip(place.along + along, *ALONG_RANGE)),
+                    around=place.around if palm else float(np.clip(place.around + around, -_PADS, _PADS)),
+                    across=float(np.clip(place.across + across, *ACROSS_RANGE)) if palm else 0.0,
+                )
             )
-            if self._is_clear(moved, others):
+            if moved is not None and self._is_clear(moved, others):
                 yield moved
                 return
 
+    def _on_grid(self, place: MarkerPlace) -> MarkerPlace | None:
+        """The nearest place that a ruler finds, on the back or a side and off the creases; None without."""
+        bone = BONE_NAMES.index(place.bone)
+        low, high = _PALM_ALONG
+        if bone != PALM:
+            margin = _CREASE / float(self._model.skeleton.lengths[bone])
+            low, high = margin, _TIP if place.bone.endswith("distal") else 1.0 - margin
+        along, around, across = (
+            round(step * round(value / step), 6)
+            for value, step in zip((place.along, place.around, place.across), _GRID, strict=True)
+        )
+        fits = low <= along <= high and abs(around) <= _PADS and abs(across) <= _PALM_ACROSS
+        return dataclasses.replace(place, along=along, around=around, across=across) if fits else None
+
     def _anywhere(self, count: int, others: Sequence[MarkerPlace]) -> list[MarkerPlace]:
-        """Places anywhere on the back and the sides of the hand, clear of the folds and of other markers."""
+        """Places anywhere on the back and the sides of the hand, clear of the creases and other markers."""
         found: list[MarkerPlace] = []
-        for place in sample_places(_TRIES + 4 * count, rng=self._rng):
-            free = place.bone == BONE_NAMES[PALM] or (
-                _FOLDS[0] <= place.along <= _FOLDS[1] and abs(place.around) <= _PADS
-            )
-            if len(found) < count and free and self._is_clear(place, others):
+        for place in map(self._on_grid, sample_places(_TRIES + 4 * count, rng=self._rng)):
+            if place is not None and len(found) < count and self._is_clear(place, others):
                 found.append(place)
         return found
 
@@ -199,8 +244,8 @@ class Improvement:
         return bool(apart > 2.0 * self._start.radius + _CLEAR)
 
     def _name_after(self, old: MarkerPlace, new: MarkerPlace) -> str:
-        """The name of a marker that was moved: a new one if it went to another digit."""
-        return old.name if _digit(old) == _digit(new) else self._new_name(new.bone)
+        """The name of a marker that was moved: a new one if it went to another bone."""
+        return old.name if old.bone == new.bone else self._new_name(new.bone)
 
     def _new_name(self, bone: str) -> str:
         """A name for a marker on a bone, as IndexMiddle2."""

@@ -6,23 +6,29 @@ anything may be anywhere in its range. What hands usually do narrows that furthe
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import dataclasses
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from gloves.attachment import attach_markers
 from gloves.fit import GloveFit
-from handsim.hand.topology import DIGITS, JOINTS, NUM_JOINTS
+from gloves.layout import FEWEST_MARKERS, MarkerLayout, MarkerPlace
+from handsim.hand.model import HandModel
+from handsim.hand.topology import BONE_NAMES, JOINTS, NUM_JOINTS, PALM
 from track.glove_advice.observed_hands import ObservedHand
-from track.kinematics.joint_prior import JointPrior, resting_angles
 from track.kinematics.marker_kinematics import hand_arrays
-from track.kinematics.marker_prediction import empty_prediction, predict_markers
+from track.kinematics.pose_spread import known_hand, tip_lengths
+from track.kinematics.pose_spread import pose_spreads as spreads_of_poses
 
 NOISE: Final = 0.0015
 """Standard deviation of a marker around a calibrated hand's [m]: optics, and the skin that moves."""
-_ANYWHERE: Final = (10.0, 10.0)  # standard deviations of the wrist before any marker is seen [m, rad]
 _FEWEST: Final = 4  # markers of a pose
+_FEWEST_OF_BODY: Final = 3  # of a rigid body
+_IN_LINE: Final = 1e-8  # [m^2]
+_RADIUS: Final = 0.003  # [m]
 
 
 def joint_spreads(hands: Iterable[ObservedHand], *, without: int | None = None) -> Float[np.ndarray, "20"]:
@@ -55,6 +61,28 @@ def pose_spreads(
     return spreads
 
 
+def palm_spread(places: Sequence[MarkerPlace], model: HandModel) -> float:
+    """Standard deviation of the palm's rotation about its least certain axis, by its own markers [rad].
+
+    Args:
+        places: Markers of a layout.
+        model: A hand.
+
+    Returns:
+        Infinite with fewer than three markers on the palm, or three in a line.
+    """
+    palm = [place for place in places if place.bone == BONE_NAMES[PALM]]
+    if len(palm) < _FEWEST_OF_BODY:
+        return float("inf")
+    copies = (*palm, *[palm[0]] * (FEWEST_MARKERS - len(palm)))  # the fewest that a glove has
+    named = tuple(dataclasses.replace(place, name=str(number)) for number, place in enumerate(copies))
+    points = attach_markers(MarkerLayout("palm", named, _RADIUS), model).points[: len(palm)]
+    arms = points - points.mean(axis=0)
+    information = (arms**2).sum() * np.eye(3) - arms.T @ arms
+    least = float(np.linalg.eigvalsh(information)[0])
+    return float(NOISE / np.sqrt(least)) if least > _IN_LINE else float("inf")
+
+
 def untold_spreads() -> Float[np.ndarray, "20"]:
     """Standard deviation of each joint where nothing is seen: anywhere in its range [rad]."""
     spreads: Float[np.ndarray, "20"] = np.deg2rad([joint.high - joint.low for joint in JOINTS]) / np.sqrt(
@@ -63,21 +91,14 @@ def untold_spreads() -> Float[np.ndarray, "20"]:
     return spreads
 
 
-def _limits() -> JointPrior:
-    """The limits of the joints, as a normal distribution of the same spread."""
-    variance = untold_spreads() ** 2
-    return JointPrior(resting_angles(), np.diag(variance), np.diag(1.0 / variance))
-
-
 def _variances(
     fit: GloveFit, qpos: Float[np.ndarray, "T 27"], seen: Bool[np.ndarray, "T M"]
 ) -> Float[np.ndarray, "T 20"]:
     """Variance of each joint [rad^2]."""
-    arrays, prior, out = hand_arrays(fit), _limits(), empty_prediction(seen.shape[1])
-    on_part = np.array([(arrays.digits == part).sum() for part in (*range(len(DIGITS)), -1)])
-    markers = np.where(seen[..., None], fit.markers(qpos)[0], np.nan)
-    nothing, variances = np.zeros(seen.shape[1]), np.empty((len(qpos), NUM_JOINTS))
-    for frame, (pose, target) in enumerate(zip(np.ascontiguousarray(qpos), markers, strict=True)):
-        predict_markers(arrays, on_part, pose, target, prior, _ANYWHERE, nothing, NOISE, out)
-        variances[frame] = np.diag(out.joint_covariance)
+    hand, limits = hand_arrays(fit), np.diag(untold_spreads() ** -2.0)
+    unseen = np.where(seen, 0.0, np.inf)
+    spreads, _ = spreads_of_poses(
+        hand, tip_lengths(fit), limits, known_hand(hand.digits, NOISE), qpos, unseen
+    )
+    variances: Float[np.ndarray, "T 20"] = spreads**2
     return variances

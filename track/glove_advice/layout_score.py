@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from gloves.layout import MarkerLayout
 from handsim.space.transforms import MIRROR
 from track.glove_advice.joint_spread import joint_spreads
 from track.glove_advice.observed_hands import ObservedHand
+from track.glove_advice.trials import Trial
 from train.data.augmentation import Corruption, corrupt
 from train.data.batches import paper_corruption
 from train.evaluate import evaluate_labeler
@@ -41,11 +42,13 @@ class LayoutScore:
     near: Float[np.ndarray, "M M"]
     """Share of the frames in which two markers touch or nearly do."""
     joints: Float[np.ndarray, "20"]
-    """Standard deviation that the markers leave of each joint [rad]."""
+    """Standard deviation that the markers leave of each joint of a calibrated hand [rad]."""
     joints_without: Float[np.ndarray, "M 20"]
     """The same without each marker [rad]."""
     sides_right: float
     """Share of the frames in which left and right are told apart by the labeled markers."""
+    trials: Mapping[str, Trial] = field(default_factory=dict)
+    """What became of simulated captures of each kind of work; empty where none was tried."""
 
 
 def score_layout(

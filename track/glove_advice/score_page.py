@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from html import escape
 from pathlib import Path
@@ -10,12 +11,14 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
+from gloves.layout import MarkerLayout
 from handsim.app.page import Section, write_page
 from handsim.hand.topology import DIGITS
 from track.glove_advice.advice import advice
 from track.glove_advice.joint_picture import SIZE, draw_joints
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore
+from track.glove_advice.trials import METHODS, Trial
 from train.evaluation.metrics import percent
 from train.reports import hand_plot
 from train.reports.flat_hand import flat_hand
@@ -36,6 +39,7 @@ def write_score_page(path: Path, score: LayoutScore, *, seen_by: str, trained: b
     layout, frames = score.layout, score.observed.num_frames
     sections = [
         _advice_section(score),
+        *([_trials_section(score)] if score.trials else []),
         _labels_section(score),
         _markers_section(score),
         _joints_section(score),
@@ -57,6 +61,30 @@ def _advice_section(score: LayoutScore) -> Section:
     items = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences)
     text = f"<ol>{items}</ol>" if sentences else "Nothing stands out: no marker is in anybody's way."
     return Section("What to do", text)
+
+
+def trial_rows(trials: Mapping[str, Trial], layout: MarkerLayout) -> list[list[str]]:
+    """What became of simulated captures of each kind of work, the header first."""
+    rows = [
+        ["work", "label: slots, frames [%]", "track: slots, frames [%]", "worst marker", "joints [deg]",
+         "size off [mm]"]
+    ]  # fmt: skip
+    for work, trial in trials.items():
+        joints = np.rad2deg(np.sqrt(np.mean(trial.joints**2)))
+        rights = [f"{percent(trial.share(name))}, {100 * trial.frames[name]:.0f}" for name in METHODS]
+        worst = f"{layout.names[trial.worst]} ({100 * trial.right[trial.worst]:.0f} %)"
+        rows.append([work, *rights, worst, f"{joints:.1f}", f"{1e3 * trial.size_error:.1f}"])
+    return rows
+
+
+def _trials_section(score: LayoutScore) -> Section:
+    text = (
+        "Short captures of several people, simulated, then labeled and tracked as `handsim label` and "
+        "`handsim track` do, the size of the hands measured and nothing calibrated: slots and whole frames "
+        "that are right. Joints: root mean square error of all, of uncalibrated hands; the section on joints "
+        "is about calibrated ones."
+    )
+    return Section("Captures", text, table=trial_rows(score.trials, score.layout))
 
 
 def _labels_section(score: LayoutScore) -> Section:

@@ -9,7 +9,6 @@ from handsim._checks import check_type
 from handsim._plugins import is_plugin, list_plugins, make_plugin
 from handsim.errors import ArgumentError
 from track.network_address import split_address
-from track.streams.frame_source import FrameSource
 from track.streams.live_stream import SILENCE, LiveStream, SourceStream
 from track.streams.point_stream import open_stream
 from track.streams.qualisys import PORT, QualisysSource
@@ -43,12 +42,10 @@ def open_source(
         return LiveStream(open_stream(address), silence=silence, ended=ended)
     if scheme == "qtm":
         parts = split_address(address, options={}, port=PORT)
-        return _read(QualisysSource(parts.host, parts.port), address, silence, ended)
+        source = SourceStream(QualisysSource(parts.host, parts.port), address, waits=False)
+        return LiveStream(source, silence=silence, ended=ended)
     name = address.partition("?")[0]
     if scheme or not (is_plugin(name) or name in list_plugins(GROUP)):
         raise ArgumentError(f"'{address}' is not an address of a stream, expected {', '.join(VALID)}")
-    return _read(make_plugin(address, group=GROUP, noun="frame source"), name, silence, ended)
-
-
-def _read(source: FrameSource, name: str, silence: float, ended: Callable[[], bool]) -> LiveStream:
-    return LiveStream(SourceStream(source, name), silence=silence, ended=ended)
+    source = SourceStream(make_plugin(address, group=GROUP, noun="frame source"), name)
+    return LiveStream(source, silence=silence, ended=ended)

@@ -77,7 +77,7 @@ class FrameOrder:
         self._doubtful: list[StreamedFrame] = []  # that jump, as they came
         self._in_a_row = 0  # of them
         self._since: deque[int] = deque()  # how many had gone on when each came
-        self._recent: deque[StreamedFrame] = deque(maxlen=_RECENT)  # that went on
+        self._recent: dict[tuple[int, float], float] = {}  # number and time of those that went on: arrival
         self._strides: deque[int] = deque(maxlen=_STRIDES)
         self._interval: float | None = None  # [s] per frame number
         self._disordered = -math.inf  # [s], when a frame came out of order
@@ -111,7 +111,7 @@ class FrameOrder:
         elif frame.restarted:
             yield from self.end()
             yield from self._begin([frame], restarted=self._last is not None)
-        elif any(_is_again(one, frame) for one in (*self._held, *self._doubtful, *self._recent)):
+        elif self._is_again(frame):
             self.doubled += 1
         elif self._last is None or not (self._is_late(frame) or self._is_next(frame)):
             yield from self._doubt(frame)
@@ -119,7 +119,7 @@ class FrameOrder:
             self.late += 1
             if self._first is not None and frame.time > self._first.time:
                 self.missed -= self.missed > 0  # it was missing when others went on
-            self._recent.append(frame)
+            self._remember(frame)
             self._disordered = frame.arrived
         else:
             self._settle(frame)
@@ -184,7 +184,7 @@ class FrameOrder:
         """Let a frame go on."""
         last, self._last = self._last, frame
         self.passed += 1
-        self._recent.append(frame)
+        self._remember(frame)
         if last is None or frame.restarted:
             return frame
         self.missed += self._missing(last, frame)
@@ -270,6 +270,19 @@ class FrameOrder:
             yield self._pass(self._held.pop(0))
         yield from self._release()
 
+    def _is_again(self, new: StreamedFrame) -> bool:
+        """Whether a frame is one that came before."""
+        key = new.number, new.time
+        came = [one.arrived for one in (*self._held, *self._doubtful) if (one.number, one.time) == key]
+        came.append(self._recent.get(key, -math.inf))
+        return any(abs(arrived - new.arrived) < _BURST for arrived in came)
+
+    def _remember(self, frame: StreamedFrame) -> None:
+        """Know a frame that went on, or was too late, when it comes again."""
+        self._recent[frame.number, frame.time] = frame.arrived
+        if len(self._recent) > _RECENT:
+            del self._recent[next(iter(self._recent))]
+
     def _is_late(self, new: StreamedFrame) -> bool:
         """Whether a frame precedes one that has gone on."""
         last = self._last
@@ -332,12 +345,6 @@ class FrameOrder:
         if self._interval is not None:
             steps = min(steps, round(1.5 * (new.time - last.time) / self._interval))
         return max(-(-steps // self._stride) - 1, 0)
-
-
-def _is_again(one: StreamedFrame, other: StreamedFrame) -> bool:
-    """Whether two frames are the same one, that came twice."""
-    same = one.number == other.number and one.time == other.time
-    return same and abs(one.arrived - other.arrived) < _BURST
 
 
 def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:

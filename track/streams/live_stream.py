@@ -1,7 +1,6 @@
 """Live streams as a tracker takes them: in order, on a clock that never goes back, and now.
 
-Frames are taken from the network as they arrive, in a thread of their own. What the reader does not keep up
-with is dropped, oldest first, and counted.
+What the reader does not keep up with is dropped, oldest first, and counted.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, Protocol
 
 import numpy as np
@@ -25,9 +24,12 @@ from track.streams.frame_source import FrameSource, StreamedFrame
 
 SILENCE: Final = 2.0
 """Time without a frame [s] after which a stream yields a silent frame."""
-MOST_LAG: Final = 0.1
-"""Time [s] for which a frame waits for the reader before it is dropped."""
-_CATCHING_UP: Final = 0.5  # [s] per second by which a lag that is forgiven has to shrink
+MOST_LAG: Final = 0.03
+"""Time [s] for which a frame waits for a reader that was held up, before it is dropped."""
+_LEAST_LAG: Final = 0.01  # [s] for which it waits where the reader is too slow
+_TOO_SLOW: Final = 0.1  # [s] for which frames have waited all the time, from which the reader is too slow
+_FORGIVEN: Final = 2.0  # [s] of a lag that are forgiven, at most
+_CATCHING_UP: Final = 1.0  # [s] per second by which it has to shrink
 _WAITING: Final = 256  # frames that may wait of a source that is faster than its times; it waits after that
 _MOST_WAITING: Final = 1 << 14  # frames that may wait at all
 _PACE_FRAMES: Final = 64  # newest frames that show the pace of a source
@@ -41,19 +43,39 @@ _LEAVE: Final = 1.0  # [s] for a source to end after `close`
 
 
 class ArrivingFrames(Protocol):
-    """Frames as they arrive, in any order; iterated in a thread of their own."""
+    """Frames as they arrive, in any order."""
 
     @property
     def counts(self) -> dict[str, int]:
         """What became of other packets so far, by name."""
         ...
 
-    def __next__(self) -> StreamedFrame:
-        """Wait for the next frame."""
+    @property
+    def lost(self) -> int:
+        """Number of frames that waited too long to be asked for, and were left out."""
+        ...
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames come at their own pace, however slow their reader is."""
+        ...
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no further frame comes."""
+        ...
+
+    @property
+    def error(self) -> Exception | None:
+        """Why it is over, if it failed."""
+        ...
+
+    def poll(self, seconds: float) -> Sequence[StreamedFrame]:
+        """Wait for a frame, so long at most [s]; returns all that have arrived."""
         ...
 
     def end(self) -> None:
-        """No frame is wanted but those that have arrived; called from another thread."""
+        """No frame is wanted but those that have arrived."""
         ...
 
     def close(self) -> None:
@@ -67,7 +89,8 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
     They are in order (`track.streams.frame_order`), and their time never goes back: when the stream's time
     begins anew, as in a recording that starts again, it continues. During a silence frames without points
     come, at the time that has passed. Points 1000 m or more from the origin are left out and counted. A frame
-    that has waited for `MOST_LAG` while newer ones came is dropped and counted.
+    that has waited for `MOST_LAG` while newer ones came is dropped and counted; where the reader is too slow,
+    so that frames wait all the time, a third of that.
 
     Args:
         frames: The frames as they arrive.
@@ -88,21 +111,15 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         """Number of frames that were not kept up with."""
         self.points = self.far_points = 0
         """Numbers of points that came, and of those that were out of range."""
+        self.forgiven_until = -math.inf
+        """When a lag is no longer forgiven, by the monotonic clock [s]."""
         self._frames, self._silence, self._ended = frames, silence, ended
         self._ahead = 0.0  # [s] of this time over the stream's
         self._last: StreamedFrame | None = None  # on this clock
         self._ready: deque[tuple[StreamedFrame, float]] = deque()  # in order, and since when [s]
-        self._lost = 0  # frames that were dropped before they were put in order
-        self._forgiven = (-math.inf, 0.0)  # [s], when a lag was forgiven, and which
+        self._kept_up = time.monotonic()  # [s], when the reader had to wait for a frame
         self._end_at = math.inf  # [s], when the stream was ended from here
-        self._error: Exception | None = None
-        self._over = self._closed = False
-        self._changed = threading.Condition()
-        self._arrived: deque[StreamedFrame] = deque()
-        self._pace: deque[StreamedFrame] = deque(maxlen=_PACE_FRAMES)
-        self._faster = self._read_all = False
-        self._thread = threading.Thread(target=self._read, name="live stream", daemon=True)
-        self._thread.start()
+        self._over = self._closed = self._failed = False
 
     @property
     def counts(self) -> dict[str, int]:
@@ -113,14 +130,14 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         """
         order = self.order
         return {
-            "received_frames": order.received + self._lost,
+            "received_frames": order.received + self._frames.lost,
             "frames_in_order": order.passed - order.reordered,
             "reordered_frames": order.reordered,
             "doubled_frames": order.doubled,
             "late_frames": order.late,
             "frames_with_wild_times": order.wild,
-            "dropped_frames": self.dropped,
-            "missing_frames": max(order.missed - self._lost, 0),
+            "dropped_frames": self.dropped + self._frames.lost,
+            "missing_frames": max(order.missed - self._frames.lost, 0),
             "missing_at_end": order.missing_at_end(self._end_at) if self._end_at < math.inf else 0,
             "restarts": order.restarts,
             "points_out_of_range": self.far_points,
@@ -134,7 +151,11 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
             CaptureError: A source of the user's own failed.
         """
         quiet = time.monotonic() + self._silence
+        self._line_up(0.0)
         while not self._closed:
+            if not self._ready:
+                self._kept_up = time.monotonic()
+                self._line_up(min(quiet, self.order.deadline) - self._kept_up)
             self._drop_old()
             if self._ready:
                 return self._continue(self._ready.popleft()[0])
@@ -142,25 +163,22 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
                 break
             if self._end_at == math.inf and self._ended():
                 self.end()
-            self._wait(min(quiet, self.order.deadline, time.monotonic() + _STOP))
-            self._line_up()
-            if time.monotonic() >= quiet and not self._ready and self.order.deadline == math.inf:
+            if time.monotonic() >= quiet and self.order.deadline == math.inf:
                 return self._silent()
-        error, self._error = self._error, None
-        if error is not None:
-            raise error
+        if self._frames.error is not None and not self._failed:
+            self._failed = True
+            raise self._frames.error
         raise StopIteration
 
-    def forgive(self) -> None:
+    def forgive(self, most: float = _FORGIVEN) -> None:
         """Drop nothing for the time that the reader needed until now, if it catches up.
 
-        The lag may be what it is, less half a second for every second from now on.
+        The lag may be what it is, but for the most [s], less a second for every second from now on.
         """
+        self._line_up(0.0)
         now = time.monotonic()
-        with self._changed:
-            waiting = [since for _, since in self._ready] + [frame.arrived for frame in self._arrived]
-        oldest = min(waiting, default=now)
-        self._forgiven = (now, now - oldest)
+        oldest = min((since for _, since in self._ready), default=now)
+        self.forgiven_until = now + min(now - oldest, most) / _CATCHING_UP
 
     def end(self, at: float = math.inf) -> None:
         """End the stream after what has arrived; `at` is the monotonic time of its end, if before now [s]."""
@@ -172,75 +190,18 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
     def close(self) -> None:
         """End the stream; no further frame comes."""
         self.end()
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join(_LEAVE)  # a source that does not listen ends with the process
+        self._closed = True
         self._frames.close()
 
-    def _read(self) -> None:
-        """Take every frame as it arrives, in a thread of its own."""
-        try:
-            while True:
-                frame = next(self._frames)
-                if not self._put(frame):
-                    return
-        except StopIteration:
-            pass
-        except Exception as error:  # of the user's code: any
-            self._error = error
-        with self._changed:
-            self._read_all = True
-            self._changed.notify_all()
-
-    def _put(self, frame: StreamedFrame) -> bool:
-        """Let a frame wait for the reader; returns whether the reader is still there."""
-        with self._changed:
-            while len(self._arrived) >= _WAITING and self._is_ahead() and not self._closed:
-                self._changed.wait(_STOP)
-            if math.isnan(frame.arrived):
-                frame = dataclasses.replace(frame, arrived=time.monotonic())
-            if self._pace and not abs(frame.time - self._pace[-1].time) < _SAME_PACE:
-                self._pace.clear()
-            self._pace.append(frame)
-            self._arrived.append(frame)
-            if len(self._arrived) > _MOST_WAITING:
-                self._arrived.popleft()
-                self.dropped, self._lost = self.dropped + 1, self._lost + 1
-            self._changed.notify_all()
-            return not self._closed
-
-    def _is_ahead(self) -> bool:
-        """Whether frames come faster than their times go on, so that they are not live."""
-        if len(self._pace) >= _FEWEST_PACE:  # after a restart, it is as before until then
-            first, last = self._pace[0], self._pace[-1]
-            span = last.arrived - first.arrived
-            self._faster = last.time - first.time > _FASTER * span + _LOOP_GAP
-        return self._faster
-
-    def _wait(self, until: float) -> None:
-        with self._changed:
-            while not (self._arrived or self._read_all or self._closed):
-                seconds = until - time.monotonic()
-                if seconds <= 0.0:
-                    return
-                self._changed.wait(seconds)
-
-    def _line_up(self) -> None:
-        """Put what has arrived in order."""
-        while True:
-            with self._changed:
-                if len(self._ready) >= _WAITING and self._is_ahead():
-                    return
-                frame = self._arrived.popleft() if self._arrived else None
-                over = frame is None and self._read_all
-                self._changed.notify_all()
-            if frame is None:
-                break
+    def _line_up(self, seconds: float) -> None:
+        """Put what has arrived in order; wait for it, so long at most [s]."""
+        if self._over or (self._ready and not self._frames.is_live):
+            return
+        for frame in self._frames.poll(min(max(seconds, 0.0), _STOP)):
             passed = (*self.order.expire(frame.arrived), *self.order.add(frame))
             self._ready.extend((one, frame.arrived) for one in passed)
         now = time.monotonic()
-        if over or now > self._end_at + _LEAVE:
+        if self._frames.is_over or now > self._end_at + _LEAVE:
             self._ready.extend((one, now) for one in self.order.end())
             self._over = True
         else:
@@ -248,15 +209,12 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
 
     def _drop_old(self) -> None:
         """Leave out what has waited for too long while newer frames came."""
-        if not self._over:
-            self._line_up()
-        with self._changed:
-            if self._is_ahead():
-                return
+        if self._over or not self._frames.is_live:
+            return
         now = time.monotonic()
-        since, lag = self._forgiven
-        most = MOST_LAG + max(0.0, lag - _CATCHING_UP * (now - since) if lag else 0.0)
-        while len(self._ready) > 1 and now - self._ready[0][1] > most and not self._over:
+        most = MOST_LAG if now < self._kept_up + _TOO_SLOW else _LEAST_LAG
+        most += max(0.0, _CATCHING_UP * (self.forgiven_until - now))
+        while len(self._ready) > 1 and now - self._ready[0][1] > most:
             dropped, _ = self._ready.popleft()
             self.dropped += 1
             if dropped.restarted:
@@ -287,48 +245,95 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         )
 
 
-class SourceStream(Iterator[StreamedFrame]):
-    """The checked frames of a source of the user's own.
+class SourceStream:
+    """The checked frames of a source of the user's own, which is iterated in a thread of its own.
+
+    One that is faster than the times of its frames is made to wait.
 
     Args:
         source: Delivers the frames.
         name: What messages call it.
+        waits: Whether it may be made to wait; a system that measures goes on.
 
     Raises:
         ArgumentError: The source is not a `FrameSource`.
     """
 
-    def __init__(self, source: FrameSource, name: str) -> None:
+    def __init__(self, source: FrameSource, name: str, *, waits: bool = True) -> None:
         for method in ("__iter__", "close"):
             if not callable(getattr(source, method, None)):
                 raise ArgumentError(
                     f"{name} has no method {method}, expected __iter__ and close of a frame source"
                 )
-        self._source, self._name = source, name
-        self._frames: Iterator[StreamedFrame] | None = None
-        self._ended = False
+        self.lost = 0
+        """Number of frames that waited too long to be asked for, and were left out."""
+        self.error: CaptureError | None = None
+        """Why it is over, if it failed."""
+        self._source, self._name, self._waits = source, name, waits
+        self._changed = threading.Condition()
+        self._arrived: deque[StreamedFrame] = deque()
+        self._pace: deque[StreamedFrame] = deque(maxlen=_PACE_FRAMES)
+        self._ahead = self._read_all = self._ended = self._closed = False
+        self._thread = threading.Thread(target=self._read, name="frame source", daemon=True)
+        self._thread.start()
 
     @property
     def counts(self) -> dict[str, int]:
         """Nothing beside frames comes."""
         return {}
 
-    def __next__(self) -> StreamedFrame:
-        """Wait for the next frame.
+    @property
+    def is_live(self) -> bool:
+        """Whether frames come no faster than their times go on."""
+        return not self._ahead
 
-        Raises:
-            CaptureError: The source failed.
-        """
+    @property
+    def is_over(self) -> bool:
+        """Whether no further frame comes."""
+        with self._changed:
+            return (self._read_all or self._closed) and not self._arrived
+
+    def poll(self, seconds: float) -> list[StreamedFrame]:
+        """Wait for a frame, so long at most [s]; returns all that have arrived."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._arrived or self._read_all or self._closed, seconds)
+            arrived, self._arrived = list(self._arrived), deque()
+            self._changed.notify_all()
+        return arrived
+
+    def _read(self) -> None:
+        """Take every frame as it arrives, in a thread of its own."""
         try:
-            if self._frames is None:
-                self._frames = iter(self._source)
-            return _checked(next(self._frames))
-        except StopIteration:
-            raise
+            for frame in self._source:
+                if not self._put(_checked(frame)):
+                    return
         except Exception as error:  # of the user's code: any
-            raise CaptureError(
-                f"{self._name}: the stream failed ({type(error).__name__}: {error})"
-            ) from error
+            self.error = CaptureError(f"{self._name}: the stream failed ({type(error).__name__}: {error})")
+            self.error.__cause__ = error
+        with self._changed:
+            self._read_all = True
+            self._changed.notify_all()
+
+    def _put(self, frame: StreamedFrame) -> bool:
+        """Let a frame wait for the reader; returns whether the reader is still there."""
+        with self._changed:
+            while len(self._arrived) >= _WAITING and self._ahead and not self._closed:
+                self._changed.wait()
+            if math.isnan(frame.arrived):
+                frame = dataclasses.replace(frame, arrived=time.monotonic())
+            if self._pace and not abs(frame.time - self._pace[-1].time) < _SAME_PACE:
+                self._pace.clear()
+            self._pace.append(frame)
+            if self._waits and len(self._pace) >= _FEWEST_PACE:  # after a restart, it is as before until then
+                first, last = self._pace[0], self._pace[-1]
+                span = last.arrived - first.arrived
+                self._ahead = last.time - first.time > _FASTER * span + _LOOP_GAP
+            self._arrived.append(frame)
+            if len(self._arrived) > _MOST_WAITING:
+                self._arrived.popleft()
+                self.lost += 1
+            self._changed.notify_all()
+            return not self._closed
 
     def end(self) -> None:
         """Close the source, once."""
@@ -345,6 +350,10 @@ class SourceStream(Iterator[StreamedFrame]):
     def close(self) -> None:
         """Close the source."""
         self.end()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(_LEAVE)  # a source that does not listen ends with the process
 
 
 def _checked(frame: StreamedFrame) -> StreamedFrame:

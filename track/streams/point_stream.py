@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import ipaddress
-import math
 import os
 import select
 import socket
+import struct
+import sys
 import threading
 import time
-from collections.abc import Iterator
-from typing import Final
+from collections import deque
+from typing import Final, NamedTuple
 from urllib.parse import urlsplit
 
 from handsim._closing import Closing
@@ -22,9 +23,12 @@ from track.streams.natnet import COMMAND_PORT, DamagedPacket, Kind, MarkerFrame,
 _PATIENCE: Final = 3.0  # [s] to wait for a server
 _RETRY: Final = 0.5  # [s] between requests to a server that does not answer
 _KEEP_ALIVE: Final = 2.0  # [s] between keep-alive packets to one that does
-_DRAIN: Final = 1.0  # [s] to read the packets that have arrived at the end, at most: others keep coming
-_STOP: Final = 0.1  # [s] between two looks at whether the stream shall end
-_BUFFER: Final = 1 << 20  # bytes of frames that may wait for the reader
+_ATTENDED: Final = 0.1  # [s] between two looks at whether the reader is busy and packets wait for it
+_BUFFER: Final = 1 << 22  # bytes of frames that may wait in the socket
+_MOST_WAITING: Final = 1 << 14  # frames that may wait for the reader at all
+_STAMPS: Final = 35 if sys.platform == "linux" else None  # SO_TIMESTAMPNS, which Python does not name
+_STAMP: Final = struct.Struct("@ll")  # seconds and nanoseconds
+_LONGEST_STAY: Final = 60.0  # [s] in the socket; more is a clock that was set
 
 
 def open_stream(
@@ -57,13 +61,20 @@ def open_stream(
     return PointStream(sockets, address, info)
 
 
-class PointStream(Closing, Iterator[StreamedFrame]):
-    """Iterator of the frames of a stream as they arrive, in any order; a `LiveStream` puts them in order.
+class PointStream(Closing):
+    """The frames of a stream as they arrive, in any order; a `LiveStream` puts them in order.
 
-    Packets are taken from the server's address, and its ports for commands and for data, only.
+    Packets are taken from the server's address, and its ports for commands and for data, only. They wait in
+    the socket, and whoever asks takes them out of it: a thread that reads would contend with the tracker for
+    the interpreter at every packet. While nobody asks for long, as when hands are measured, a thread keeps
+    the socket from running over.
     """
 
     def __init__(self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo) -> None:
+        self.is_live = True
+        """Whether frames come at their own pace."""
+        self.error: Exception | None = None
+        """Nothing makes it fail: a server that is gone may come again."""
         self.server = server
         """The server's description of itself."""
         self.packets = 0
@@ -72,60 +83,88 @@ class PointStream(Closing, Iterator[StreamedFrame]):
         """Number of damaged packets, which were left out."""
         self.foreign = 0
         """Number of packets of other senders, which were left out."""
+        self.lost = 0
+        """Number of frames that waited too long for the reader, and were left out."""
         self._sockets, self._address = sockets, address
         self._version = min(server.version, natnet.NEWEST)
-        self._kept_alive = self._heard = time.monotonic()
-        self._ended = threading.Event()
-        self._drained_until = math.inf
+        self._asked = self._kept_alive = self._heard = time.monotonic()
+        self._arrived: deque[StreamedFrame] = deque()
+        self._reading = threading.Lock()
+        self._ending = False
+        self._closed = threading.Event()
+        self._attendant = threading.Thread(target=self._attend, name="natnet client", daemon=True)
+        self._attendant.start()
 
     @property
     def counts(self) -> dict[str, int]:
         """What became of other packets so far, as a take records it."""
         return {"damaged_packets": self.damaged, "foreign_packets": self.foreign}
 
-    def __next__(self) -> StreamedFrame:
-        """Wait for the next frame, until `end`."""
-        while self._sockets:
-            if self._ended.is_set():
-                self._drained_until = min(self._drained_until, time.monotonic() + _DRAIN)
-                received = self._receive(0.0) if time.monotonic() < self._drained_until else None
-                if received is None:
-                    break
-            else:
-                received = self._receive(self._keep_alive())
-            frame = None if received is None else self._take(*received)
-            if frame is not None:
-                return frame
-        raise StopIteration
+    @property
+    def is_over(self) -> bool:
+        """Whether no further frame comes."""
+        return self._closed.is_set() or (self._ending and not self._arrived)
+
+    def poll(self, seconds: float) -> list[StreamedFrame]:
+        """Wait for packets, so long at most [s]; returns the frames of all that have arrived."""
+        if self._closed.is_set():
+            return []
+        if seconds > 0.0 and not (self._arrived or self._ending):
+            select.select(self._sockets, [], [], seconds)
+        with self._reading:
+            self._asked = time.monotonic()
+            self._drain()
+            arrived, self._arrived = list(self._arrived), deque()
+        return arrived
 
     def end(self) -> None:
-        """No frame is wanted but those that have arrived; may be called from another thread."""
-        self._ended.set()
+        """No frame is wanted but those that have arrived."""
+        with self._reading:
+            self._drain()
+            self._ending = True
 
     def close(self) -> None:
         """Disconnect from the server; no further frame comes."""
-        if self._sockets:
-            _send(self._sockets[0], natnet.pack(Kind.DISCONNECT), self._address)
+        if self._closed.is_set():
+            return
+        self._closed.set()
+        self._attendant.join()
+        _send(self._sockets[0], natnet.pack(Kind.DISCONNECT), self._address)
         for one in self._sockets:
             one.close()
-        self._sockets = []
 
-    def _keep_alive(self) -> float:
-        """Send a keep-alive packet when it is due; returns how long to wait for a packet [s]."""
+    def _attend(self) -> None:
+        """Keep the server sending, and the socket from running over while the reader is busy."""
+        while not self._closed.wait(_ATTENDED):
+            self._keep_alive()
+            if time.monotonic() > self._asked + _ATTENDED:
+                with self._reading:
+                    self._drain()
+
+    def _keep_alive(self) -> None:
+        """Send a keep-alive packet when it is due."""
         now = time.monotonic()
         if now >= self._kept_alive + _KEEP_ALIVE:
             _send(self._sockets[0], natnet.pack(Kind.KEEP_ALIVE), self._address)
             if now >= self._heard + _KEEP_ALIVE:  # a restarted server does not know this client
                 _send(self._sockets[0], natnet.pack_connect(), self._address)
             self._kept_alive = now
-        return max(0.0, min(self._kept_alive + _KEEP_ALIVE - now, _STOP))
 
-    def _receive(self, seconds: float) -> tuple[bytes, tuple[str, int]] | None:
-        """Wait for a packet and its sender; None if none came."""
-        ready, _, _ = select.select(self._sockets, [], [], seconds)
-        return _receive(ready[0]) if ready else None
+    def _drain(self) -> None:
+        """Take what has arrived until now out of the sockets."""
+        begin = time.monotonic()
+        for one in () if self._ending or self._closed.is_set() else self._sockets:
+            while (received := _receive(one)) is not None:
+                frame = self._take(*received)
+                if frame is not None:
+                    self._arrived.append(frame)
+                if received.arrived > begin:  # others keep coming
+                    break
+        while len(self._arrived) > _MOST_WAITING:
+            self._arrived.popleft()
+            self.lost += 1
 
-    def _take(self, packet: bytes, sender: tuple[str, int]) -> StreamedFrame | None:
+    def _take(self, packet: bytes, sender: tuple[str, int], arrived: float) -> StreamedFrame | None:
         """The frame of a packet, if it holds one."""
         self.packets += 1
         if sender[0] != self._address[0] or sender[1] not in (self._address[1], self.server.data_port):
@@ -143,7 +182,7 @@ class PointStream(Closing, Iterator[StreamedFrame]):
             self.damaged += 1
             return None
         self._heard = time.monotonic()
-        return StreamedFrame(frame.number, frame.time, frame.points, frame.ids, arrived=self._heard)
+        return StreamedFrame(frame.number, frame.time, frame.points, frame.ids, arrived=arrived)
 
     def _parse(self, payload: bytes) -> MarkerFrame:
         """A frame of the server's version, or of the other layout: some servers send an older one."""
@@ -184,6 +223,8 @@ def _bind(address: str, port: int) -> socket.socket:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
         if port:  # of a multicast: other programs on this machine may listen too
             one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if _STAMPS is not None:
+            one.setsockopt(socket.SOL_SOCKET, _STAMPS, 1)
         one.bind((address, port))
         one.setblocking(False)
     except OSError:
@@ -212,13 +253,11 @@ def _connect(commands: socket.socket, server: tuple[str, int], url: str) -> Serv
     )
 
 
-def _server_info(
-    received: tuple[bytes, tuple[str, int]] | None, server: tuple[str, int]
-) -> ServerInfo | None:
-    if received is None or received[1] != server:
+def _server_info(received: _Received | None, server: tuple[str, int]) -> ServerInfo | None:
+    if received is None or received.sender != server:
         return None
     try:
-        kind, payload = natnet.unpack(received[0])
+        kind, payload = natnet.unpack(received.packet)
         return natnet.parse_server_info(payload) if kind == Kind.SERVER_INFO else None
     except DamagedPacket:
         return None
@@ -248,10 +287,26 @@ def _send(one: socket.socket, packet: bytes, address: tuple[str, int]) -> None:
         pass  # the network is down for now: the stream yields silent frames
 
 
-def _receive(one: socket.socket) -> tuple[bytes, tuple[str, int]] | None:
-    """A packet and its sender; None if there is none."""
+class _Received(NamedTuple):
+    packet: bytes
+    sender: tuple[str, int]
+    arrived: float
+    """Monotonic time at which it came to this machine [s], which may be long before it is read."""
+
+
+def _receive(one: socket.socket) -> _Received | None:
+    """A packet; None if there is none."""
     try:
-        packet, (host, port) = one.recvfrom(natnet.LARGEST)
+        if _STAMPS is None:
+            packet, (host, port) = one.recvfrom(natnet.LARGEST)
+            return _Received(packet, (host, port), time.monotonic())
+        packet, told, _, (host, port) = one.recvmsg(natnet.LARGEST, socket.CMSG_SPACE(_STAMP.size))
     except OSError:  # no packet, or a message that a port is closed
         return None
-    return packet, (host, port)
+    arrived = time.monotonic()
+    for level, kind, data in told:
+        if (level, kind, len(data)) == (socket.SOL_SOCKET, _STAMPS, _STAMP.size):
+            seconds, nanoseconds = _STAMP.unpack(data)
+            stayed = time.time() - seconds - 1e-9 * nanoseconds
+            arrived -= stayed if 0.0 < stayed < _LONGEST_STAY else 0.0
+    return _Received(packet, (host, port), arrived)

@@ -1,11 +1,11 @@
-"""The forecast of a rig: what captures of hands at work will miss, by simulated takes' optical system.
+"""The forecast of a rig: what captures of hands at work will miss, in the rooms of simulated takes.
 
 The error of points is a covariance, from the noise of blobs in the pictures.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gloves.captures.gaps import run_lengths
 from gloves.optics.blobs import MARKER_RADIUS
 from gloves.optics.reconstruction import OpticsConfig, reconstruct
-from gloves.optics.strays import StrayConfig
 from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
+from train.rig_advice.work import room_of_work
 from train.simulation.light_sources import LightSources, sample_light_sources
 from train.simulation.motion import SceneMotion
 from train.simulation.room import label_false_points
@@ -25,8 +25,8 @@ from train.simulation.room_settings import RoomConfig
 from train.simulation.sight import SceneSight
 
 _ERRORS: Final = 4000  # marker-frames of a scene from which the error is taken
-ROOM: Final = RoomConfig(strays=StrayConfig(number=0.0))
-"""A well-kept optical system; how many stray reflections a room has does not depend on its cameras."""
+OPTICS: Final = OpticsConfig()
+"""Noise of blobs, and size of visible spots: the same in every room."""
 
 
 class ErrorEllipsoid(NamedTuple):
@@ -45,17 +45,13 @@ class LitScene(NamedTuple):
 
     scene: SceneMotion
     sources: LightSources
+    optics: OpticsConfig
+    """Noise and losses of the room."""
 
     @property
     def num_markers(self) -> int:
         """Markers of the hands, the first of the sources."""
         return sum(hand.fit.layout.num_markers for hand in self.scene.hands)
-
-    @property
-    def num_worn(self) -> int:
-        """These and the markers of the object, which come next."""
-        held = self.scene.moving_object
-        return self.num_markers + (0 if held is None else len(held.rigid_object.markers))
 
     @property
     def seen(self) -> Bool[np.ndarray, "T M C"]:
@@ -99,33 +95,46 @@ class CameraLoss(NamedTuple):
     """Without it; None where two cameras are all there are."""
 
 
-def light(scenes: Sequence[SceneMotion], rig: CameraRig, *, rng: np.random.Generator) -> list[LitScene]:
+def light(
+    scenes: Sequence[SceneMotion], rig: CameraRig, room: RoomConfig, *, rng: np.random.Generator
+) -> list[LitScene]:
     """Cast all lines of sight.
 
     Args:
         scenes: Hands at work.
         rig: The cameras.
-        rng: Source of the spots of markers that are seen past an edge.
+        room: Losses and stray reflections of this work, see `train.simulation.room_settings.usual_room`.
+        rng: Source of the strays, and of the spots of markers that are seen past an edge.
 
     Raises:
         ArgumentError: A camera stands in the hands.
     """
-    return [LitScene(scene, sample_light_sources(SceneSight(scene, rig), ROOM, rng=rng)) for scene in scenes]
+    return [
+        LitScene(scene, sample_light_sources(SceneSight(scene, rig), room, rng=rng), room.optics)
+        for scene in scenes
+    ]
 
 
-def forecast(
-    lit: Sequence[LitScene], rig: CameraRig, optics: OpticsConfig = ROOM.optics, *, seed: int = 0
-) -> Forecast:
+def light_work(
+    work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, *, rng: np.random.Generator
+) -> dict[str, list[LitScene]]:
+    """`light` for scenes of each kind of work, in the rooms that simulated takes of it have by default."""
+    return {
+        kind: [lit for scene in scenes for lit in light([scene], rig, room_of_work(kind, scene), rng=rng)]
+        for kind, scenes in work.items()
+    }
+
+
+def forecast(lit: Sequence[LitScene], rig: CameraRig, *, seed: int = 0) -> Forecast:
     """What the optical system makes of scenes.
 
     Args:
         lit: Scenes as this rig sees them.
         rig: The cameras.
-        optics: Noise and losses.
         seed: Of noise and losses.
     """
     rng = np.random.default_rng(seed)
-    counted = [_count(one, rig, optics, rng) for one in lit]
+    counted = [_count(one, rig, rng) for one in lit]
     total = sum(one.marker_frames for one in counted)
     minutes = sum(one.minutes for one in counted)
     lengths = np.concatenate([one.lengths for one in counted])
@@ -173,8 +182,8 @@ class _Counts(NamedTuple):
     spread: np.ndarray  # of points (N, 3, 3) [m^2]
 
 
-def _count(one: LitScene, rig: CameraRig, optics: OpticsConfig, rng: np.random.Generator) -> _Counts:
-    sources, markers, rate = one.sources, one.num_markers, one.scene.rate
+def _count(one: LitScene, rig: CameraRig, rng: np.random.Generator) -> _Counts:
+    sources, optics, markers, rate = one.sources, one.optics, one.num_markers, one.scene.rate
     found = reconstruct(
         sources.positions, sources.visible, rig, optics, radii=sources.radii, continuous=True, rng=rng
     )
@@ -196,7 +205,7 @@ def _count(one: LitScene, rig: CameraRig, optics: OpticsConfig, rng: np.random.G
         int((views >= FEWEST_CAMERAS).sum()),
         int((views > FEWEST_CAMERAS).sum()),
         int((~present).sum()),
-        int(triangulated[:, one.num_worn :].sum() + false.sum()),
+        int(triangulated[:, sources.labels < 0].sum() + false.sum()),
         run_lengths(~present) / rate,
         covariances(sources.positions[rows, columns], one.seen[rows, columns], rig, noise),
     )

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from gloves.layout import MarkerLayout
 from handsim.space.camera import Camera
 from handsim.space.cameras import CameraRig
-from train.rig_advice.forecast import Forecast, forecast, light
+from train.rig_advice.forecast import Forecast, forecast, light_work
 from train.rig_advice.mounts import Mount, places
 from train.rig_advice.planning import Planning, view_candidates
 from train.rig_advice.work import sample_work
@@ -74,7 +73,8 @@ def plan(
     ahead = [one.T_world_camera[:3, 3] + one.T_world_camera[:3, 2] for one in old]
     targets = np.array([*ahead, *free.targets])
     rng = np.random.default_rng(seed)
-    scenes = [one.faster(_SKIPPED) for one in _scenes(layout, center, sides, _FRAMES, _PEOPLE, rng)]
+    work = sample_work(layout, center, sides, _FRAMES, _PEOPLE, rng=rng)
+    scenes = [one.faster(_SKIPPED) for part in work.values() for one in part]
     told(f"what cameras at {len(free.targets)} places would see")
     views = view_candidates(scenes, candidates, rng=rng)
     positions = np.stack([one.T_world_camera[:3, 3] for one in candidates])
@@ -88,22 +88,11 @@ def plan(
     ]
     rig = CameraRig(name, [*old, *new])
     told("forecasting")
-    fresh = _scenes(layout, center, sides, _JUDGED, 1, np.random.default_rng(seed + 1))
+    fresh = sample_work(layout, center, sides, _JUDGED, 1, rng=np.random.default_rng(seed + 1))
     before = None if kept is None else _forecast(fresh, kept, seed)
     return Plan(rig, targets[search.chosen], before, _forecast(fresh, rig, seed))
 
 
-def _scenes(
-    layout: MarkerLayout,
-    center: NDArray[np.float64],
-    sides: NDArray[np.float64],
-    frames: int,
-    people: int,
-    rng: np.random.Generator,
-) -> list[SceneMotion]:
-    work = sample_work(layout, center, sides, frames, people, rng=rng)
-    return [one for scenes in work.values() for one in scenes]
-
-
-def _forecast(scenes: Sequence[SceneMotion], rig: CameraRig, seed: int) -> Forecast:
-    return forecast(light(scenes, rig, rng=np.random.default_rng(seed)), rig, seed=seed)
+def _forecast(work: Mapping[str, Sequence[SceneMotion]], rig: CameraRig, seed: int) -> Forecast:
+    lit = light_work(work, rig, rng=np.random.default_rng(seed))
+    return forecast([one for scenes in lit.values() for one in scenes], rig, seed=seed)

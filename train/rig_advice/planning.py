@@ -17,7 +17,7 @@ from gloves.optics.blobs import MARKER_RADIUS
 from handsim.errors import ArgumentError
 from handsim.space.camera import Camera, focal_of_angle, look_at, pinhole
 from handsim.space.cameras import FEWEST_CAMERAS, MAX_CAMERAS, CameraRig
-from train.rig_advice.forecast import ROOM
+from train.rig_advice.forecast import OPTICS
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
 from train.simulation.sight import SceneSight
@@ -69,7 +69,7 @@ def view_candidates(
         inside = np.stack([one.in_view(centers) for one in candidates])
         seen.append(free[:, which].T & inside)
         points.append(centers)
-        noise.append(ROOM.optics.noise * np.sqrt(MARKER_RADIUS / radii))
+        noise.append(OPTICS.noise * np.sqrt(MARKER_RADIUS / radii))
     views, centers = np.concatenate(seen, axis=1), np.concatenate(points)
     sampled = rng.choice(len(centers), min(_SAMPLED, len(centers)), replace=False)
     focals = np.array([one.focal_length for one in candidates])
@@ -195,8 +195,8 @@ def _free_views(
         middle = scene.hands[0].qpos[:, :3].mean(axis=0)
         rig = CameraRig("candidates", [_WIDE.at(look_at(one, middle)) for one in some])
         sight = SceneSight(scene, rig)
-        radii = marker_radii(scene, ROOM.optics)
-        visible = sight.visible_markers(ROOM.optics.partial * radii, rng=rng)
+        radii = marker_radii(scene, OPTICS)
+        visible = sight.visible_markers(OPTICS.partial * radii, rng=rng)
         parts.append(visible[:, :count, : len(few)].reshape(-1, len(few)))
     centers = sight.markers[0][:, :count].reshape(-1, 3)
     return np.concatenate(parts, axis=1), centers, np.tile(radii[:count], scene.num_frames)

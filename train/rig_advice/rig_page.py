@@ -38,9 +38,9 @@ _COLUMNS: Final = (
 COLUMNS_TOLD: Final = (
     "By 2, by 3: share of the marker-frames (every marker of every hand in every frame) that so many "
     "cameras see. Missing: those without a point, whether unseen, merged with a neighbor or with too few "
-    "rays; a point begins with three rays and goes on with two. Gaps: of one marker, and their lengths. "
-    "Ghosts: points of a frame that are no marker, where rays meet by chance and in mirror images. Error: "
-    "root mean square distance from the true center."
+    "rays. Gaps: of one marker, and their lengths. Ghosts: points of a frame that are no marker, where rays "
+    "meet by chance, in mirror images, and of reflections. Losses and reflections are those of `handsim "
+    "simulate` with the same kind of work. Error: root mean square distance from the true center."
 )
 """What the columns of both tables are."""
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
-from train.rig_advice.forecast import CameraLoss, Forecast, camera_losses, forecast, light
+from train.rig_advice.forecast import CameraLoss, Forecast, camera_losses, forecast, light_work
 from train.rig_advice.rig_faults import faults
 from train.rig_advice.volume_map import VolumeMap, map_volume
 from train.simulation.motion import SceneMotion
@@ -85,7 +85,7 @@ def score_rig(
         ArgumentError: A camera stands in the hands.
     """
     rng = np.random.default_rng(seed)
-    lit = {kind: light(scenes, rig, rng=rng) for kind, scenes in work.items()}
+    lit = light_work(work, rig, rng=rng)
     everything = [one for scenes in lit.values() for one in scenes]
     return RigScore(
         rig,
@@ -175,9 +175,11 @@ def _error(score: RigScore) -> Iterator[str]:
 
 def _ghosts(score: RigScore) -> Iterator[str]:
     if score.whole.ghosts > _GHOSTS:
+        worst = max(score.kinds, key=lambda kind: score.kinds[kind].ghosts)
+        most = f", most with {worst} ({score.kinds[worst].ghosts:.1f})" if len(score.kinds) > 1 else ""
         yield (
-            f"{score.whole.ghosts:.2f} points a frame will be no marker: they appear where few cameras see a "
-            "marker, and go with more cameras."
+            f"{score.whole.ghosts:.1f} points a frame will be no marker{most}: reflections that cameras see, "
+            "mirror images, and rays that meet by chance where few cameras see a marker."
         )
 
 

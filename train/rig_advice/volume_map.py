@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gloves.fit import GlovedHand
 from gloves.optics.blobs import MARKER_RADIUS
 from handsim.space.cameras import FEWEST_CAMERAS, CameraRig
-from train.rig_advice.forecast import ROOM, covariances
+from train.rig_advice.forecast import OPTICS, covariances
 from train.rig_advice.rig_faults import cube_points
 from train.simulation.light_sources import marker_radii
 from train.simulation.motion import SceneMotion
@@ -61,8 +61,8 @@ def map_volume(
         qpos = np.tile(hand.qpos[rng.integers(scene.num_frames)], (len(points), 1))
         qpos[:, :3] = points
         placed = SceneMotion((GlovedHand(hand.fit, qpos),))
-        sight, radii = SceneSight(placed, rig), marker_radii(placed, ROOM.optics)
-        seen = sight.visible_markers(ROOM.optics.partial * radii, rng=rng)
+        sight, radii = SceneSight(placed, rig), marker_radii(placed, OPTICS)
+        seen = sight.visible_markers(OPTICS.partial * radii, rng=rng)
         views = seen.sum(axis=-1)
         two.append((views >= FEWEST_CAMERAS).mean(axis=1))
         three.append((views > FEWEST_CAMERAS).mean(axis=1))
@@ -79,7 +79,7 @@ def _errors(
     """Of each marker (G, M) [m], NaN where it has no point."""
     errors = np.full(seen.shape[:2], np.nan)
     rows, columns = np.nonzero(seen.sum(axis=-1) >= FEWEST_CAMERAS)
-    noise = ROOM.optics.noise * np.sqrt(MARKER_RADIUS / radii[columns])
+    noise = OPTICS.noise * np.sqrt(MARKER_RADIUS / radii[columns])
     spread = covariances(markers[rows, columns], seen[rows, columns], rig, noise)
     lengths = np.sqrt(np.trace(spread, axis1=1, axis2=2))
     errors[rows, columns] = np.where(lengths < _LONGEST, lengths, np.nan)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -21,7 +21,7 @@ from handsim.space.transforms import pose_matrices
 from train.rig_advice.rig_faults import HALF_SIDE
 from train.simulation.motion import MovingObject, SceneMotion
 from train.simulation.real_like import sample_real_like_scene
-from train.simulation.room_settings import KINDS
+from train.simulation.room_settings import KINDS, SIMULATED_KINDS, RoomConfig, SimulatedKind, usual_room
 from train.simulation.takes import sample_scene
 
 _REAL_LIKE: Final = "real-like"
@@ -119,6 +119,14 @@ def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> di
             f"the take has no {_FEWEST} frames in a row in which every hand has a pose, expected some"
         )
     return {"the take": scenes}
+
+
+def room_of_work(kind: str, scene: SceneMotion) -> RoomConfig:
+    """The room of simulated takes of this kind of work, or of the kind most like it, as for a take."""
+    if kind not in SIMULATED_KINDS:
+        free = "hand-hand" if len(scene.hands) > 1 else "single-hand"
+        kind = free if scene.moving_object is None else "hand-pen"
+    return usual_room(cast("SimulatedKind", kind))
 
 
 def _scene(take: Take, fits: list[GloveFit], part: slice) -> SceneMotion:

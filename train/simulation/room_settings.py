@@ -121,3 +121,12 @@ TWINS: Final[dict[str, TwinSettings]] = {
         GapCounts(2645, 382, 2.65, 1.62), 0.0450, _room(1.7, **_losses(0.115, 0.0, 1.0, 1)), draw=2
     ),
 }
+_ALIKE: Final[dict[str, str]] = {
+    "real-like": "hand-hand",
+    "free": "single-hand",
+}  # kinds whose rooms are alike
+
+
+def usual_room(kind: SimulatedKind) -> RoomConfig:
+    """The room of the paper's capture of a kind, or of the one most like it."""
+    return RoomConfig() if kind == "calibration" else TWINS[_ALIKE.get(kind, kind)].room

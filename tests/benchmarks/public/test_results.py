@@ -15,7 +15,7 @@ from benchmarks.public.manifest import label_names
 from benchmarks.public.results import find_results, read_result
 from gloves.captures.capture import Capture
 from gloves.captures.formats import write_capture
-from gloves.captures.markers import labeled_capture, unlabeled_frames
+from gloves.captures.markers import labeled_columns, unlabeled_frames
 from track.capture_tracking import track_capture
 
 NAME = "hand-controller-hard-1"
@@ -79,7 +79,7 @@ def test_labeled_points_give_the_labels(ending, capture, truth, tmp_path):
     there = np.isfinite(capture.positions[..., 0])
     labels = [row[here].astype(np.int64) for row, here in zip(truth.labels, there, strict=True)]
     path = tmp_path / f"{NAME}{ending}"
-    write_capture(path, labeled_capture(frames, labels, LABELS, capture.rate))
+    write_capture(path, labeled_columns(frames, labels, LABELS, capture.rate))
     np.testing.assert_array_equal(read_result(path, capture, LABELS).labels, truth.labels)
 
 

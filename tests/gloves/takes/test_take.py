@@ -167,6 +167,23 @@ def test_labels_count_through_hands_and_bodies(take):
         take.observed("middle")
 
 
+def test_labeled_points_become_columns_and_lose_none(take):
+    capture = take.labeled_capture()
+    assert capture.names[: len(take.label_names)] == take.label_names
+    assert np.isfinite(capture.positions).sum() == np.isfinite(take.points).sum()
+    frame, column = np.argwhere(take.labels >= 0)[-1]
+    np.testing.assert_array_equal(
+        capture.positions[frame, take.labels[frame, column]], take.points[frame, column]
+    )
+
+
+def test_paths_are_paths(take):
+    with pytest.raises(ArgumentError, match=r"path is 3, expected the path of a \.npz file"):
+        take.save(3)
+    with pytest.raises(ArgumentError, match="path is 3"):
+        take.export(3)
+
+
 def test_what_was_seen_is_told_from_what_is_filled_in(take):
     for number, side in enumerate(take.sides):
         seen, filled, markers = take.observed(side), take.filled(side), take.markers(side)

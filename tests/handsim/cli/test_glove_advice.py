@@ -17,16 +17,29 @@ def mine(tmp_path):
 
 @pytest.mark.slow
 def test_a_score_is_printed_and_drawn(mine, capsys):
-    assert main(["glove", "score", str(mine), "--frames", "120", "--rig", "six"]) == 0
+    assert main(["glove", "score", str(mine), "--frames", "120", "--rig", "six", "--captures", "1"]) == 0
     told = capsys.readouterr().out
     assert "% of the slots right as the rig sees them" in told
+    assert all(f"{work} " in told for work in ("one hand", "two apart", "two touching"))
     page = mine.with_suffix(".html").read_text("utf-8")
     assert page.count("data:image/svg+xml") == 2 and "What to do" in page and "ThumbTip" in page
 
 
 def test_an_improved_layout_is_written(mine, tmp_path, capsys):
     out = tmp_path / "better.toml"
-    command = ["glove", "improve", str(mine), "--out", str(out), "--minutes", "0", "--markers", "7"]
+    command = [
+        "glove",
+        "improve",
+        str(mine),
+        "--out",
+        str(out),
+        "--minutes",
+        "0",
+        "--markers",
+        "7",
+        "--captures",
+        "0",
+    ]
     assert main(command) == 0
     assert load_layout(out).num_markers == 7
     told = capsys.readouterr().out
@@ -37,6 +50,7 @@ def test_an_improved_layout_is_written(mine, tmp_path, capsys):
     ("options", "sentence"),
     [
         (["score", "GLOVE", "--motion", "dance"], "--motion is 'dance', expected poses, twins or a take"),
+        (["score", "GLOVE", "--captures", "-1"], "--captures is -1, expected 0 or more"),
         (["score", "GLOVE", "--frames", "1"], "--frames is 1, expected at least 100"),
         (
             ["score", "GLOVE", "--out", "page.pdf"],

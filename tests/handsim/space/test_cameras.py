@@ -30,7 +30,6 @@ from handsim.space.cameras import (
     load_rig,
     named_rig,
     rig_setting,
-    save_rig,
 )
 from tests.rigs import mixed_rig, square_rig
 
@@ -85,7 +84,7 @@ def test_a_file_of_ones_own(tmp_path):
 def test_whatever_stands_for_a_rig_gives_it(tmp_path):
     rig = mixed_rig()
     path = tmp_path / "mixed.toml"
-    save_rig(path, rig)
+    rig.save(path)
     record = json.loads(json.dumps(rig.record()))
     for source in (rig, path, str(path), record):
         assert as_rig(source) == rig and rig_setting(source) == record

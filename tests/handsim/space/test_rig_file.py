@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from handsim.errors import RigError
 from handsim.space.camera import look_at
-from handsim.space.cameras import load_rig, save_rig
+from handsim.space.cameras import load_rig
 from handsim.space.rig_formats.any_file import load_cameras
 from tests.rigs import mixed_rig, square_rig
 
@@ -99,7 +99,7 @@ def test_every_way_to_say_what_a_picture_is(tmp_path, keys, size, focal):
 @pytest.mark.parametrize("rig", [mixed_rig(), square_rig("alike", mixed_rig().T_world_camera)])
 def test_a_rig_comes_back_to_the_last_digit(tmp_path, rig):
     path = tmp_path / "rig.toml"
-    save_rig(path, rig)
+    rig.save(path)
     assert load_rig(path) == rig and load_cameras(path) == rig.cameras
     assert path.read_text().count("size = ") == (1 if rig.name == "alike" else 6)
 

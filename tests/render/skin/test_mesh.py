@@ -12,7 +12,7 @@ from handsim.hand.topology import BONES, NUM_BONES, SIDES, Side
 from handsim.space.transforms import MIRROR
 from poses.shapes.library import gesture
 from render.skin.atlas import skin_atlas
-from render.skin.forearm import FOREARM, Forearm, sample_forearm
+from render.skin.forearm import FOREARM, REACH, Forearm, sample_forearm
 from render.skin.mesh import PosableSkin, face_parts
 
 
@@ -121,6 +121,23 @@ def test_arms_are_as_thick_as_people_are() -> None:
     elbow = (behind > 0.24) & (behind < 0.31)
     assert girths[elbow].max() < girths[behind < 0.24].max()  # thinner than the forearm's flesh
     assert 0.30 < girths[-1] < 0.36  # men's upper arms, ANSUR II
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_an_arm_bends_at_its_elbow_and_stays_one_surface(side: Side, rng: np.random.Generator) -> None:
+    mesh = PosableSkin(HandModel.named("M", side=side), sample_forearm(rng=rng))
+    qpos = join_qpos(gesture("flat")[None], position=np.array([0.1, 0.2, 0.3]))[0]
+    qpos[3:7] = np.array([0.5, 0.5, -0.5, 0.5])
+    elbow, ahead = mesh.forearm_line(qpos)
+    for way in (ahead, np.cross(ahead, [0.6, 0.0, 0.8]), np.array([0.0, -0.6, 0.8])):
+        towards = way / np.linalg.norm(way)
+        bent = mesh.posed(qpos, towards).vertices
+        solid = trimesh.Trimesh(bent[np.unique(skin_atlas().corners, return_index=True)[1]], mesh.faces)
+        assert solid.is_watertight and solid.volume > 2e-3
+        end = bent[-1] - elbow
+        assert end @ towards > 0.98 * REACH and np.linalg.norm(end) < REACH + 0.05
+        before = skin_atlas().corners < skin_atlas().num_hand
+        np.testing.assert_array_equal(bent[before], mesh.posed(qpos).vertices[before])
 
 
 def test_impossible_forearms_are_told() -> None:

@@ -122,7 +122,9 @@ def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, tmp_path):
     assert (
         f"<td>20 to 29</td><td>{take.times[20]:.3f}</td><td>{take.times[29]:.3f}</td><td>{side}</td>" in page
     )
-    assert f"<td>frame 20, {take.times[20]:.3f} s</td><td>handsim view &#x27;my take.npz&#x27;</td>" in page
+    assert (
+        f"<td>frame 20, {take.times[20]:.3f} s</td><td>handsim view &#x27;my take.npz&#x27; --time " in page
+    )
     assert "Capture &lt;b&gt;.c3d, glove dense19, hands right and left" in page
     assert "size measured in the capture, 180 x 80 mm; 60 frames, 0.5 s at 120 Hz" in page
     assert "are not calibrated" in page and "handsim calibrate minute.c3d" in page
@@ -141,7 +143,7 @@ def test_whose_hands_they_are(take, tmp_path):
     for user, words in {
         "S": "mean hands of size S, in a glove as designed",
         "user.json": "a user&#x27;s (user.json), as calibrated or given",
-        "": "a user's, as calibrated or given",
+        "": "the take does not say whether they are calibrated",
     }.items():
         page, _ = written(tmp_path, dataclasses.replace(take, settings={**take.settings, "user": user}))
         assert words.replace("user&#x27;s", "user's") in page

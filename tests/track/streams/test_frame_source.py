@@ -11,7 +11,8 @@ import pytest
 
 from gloves.captures.capture import Capture
 from handsim.errors import ArgumentError, CaptureError, HandSimWarning
-from tests.waiting import LONG, wait_for
+from tests.waiting import LONG
+from track.streams import live_stream
 from track.streams.frame_source import StreamedFrame, capture_frames
 from track.streams.live_stream import LiveStream, SourceStream
 
@@ -138,15 +139,20 @@ def test_a_column_is_an_id_until_its_point_is_lost():
 class Arriving:
     """Frames that have arrived at given times, of which nothing else is counted."""
 
-    def __init__(self, frames: list[StreamedFrame]) -> None:
-        self.counts: dict[str, int] = {}
-        self.frames = iter(frames)
+    is_live, lost, error = True, 0, None
 
-    def __next__(self) -> StreamedFrame:
-        return next(self.frames)
+    def __init__(self, frames: list[StreamedFrame], *, ends: bool = True) -> None:
+        self.counts: dict[str, int] = {}
+        self.frames, self.is_over = frames, False
+        self.ends = ends
+
+    def poll(self, seconds: float) -> list[StreamedFrame]:
+        self.is_over |= self.ends
+        arrived, self.frames = self.frames, []
+        return arrived
 
     def end(self) -> None:
-        self.frames = iter(())
+        self.is_over = True
 
     def close(self) -> None:
         self.end()
@@ -173,23 +179,11 @@ class Slow(Arriving):
 
     def __init__(self, count: int) -> None:
         now = time.monotonic()
-        super().__init__([frame(n, arrived=now - 60.0 + n / 100) for n in range(count)])
-        self.over = threading.Event()
-
-    def __next__(self) -> StreamedFrame:
-        try:
-            return next(self.frames)
-        except StopIteration:
-            self.over.wait()
-            raise
-
-    def end(self) -> None:
-        self.over.set()
+        super().__init__([frame(n, arrived=now - 60.0 + n / 100) for n in range(count)], ends=False)
 
 
 def test_what_is_not_kept_up_with_is_dropped_oldest_first_and_counted():
     with LiveStream(Slow(500)) as stream:
-        wait_for(lambda: len(stream._arrived) == 500)
         assert next(stream).number == 499
         counts = stream.counts
         assert (counts["received_frames"], counts["dropped_frames"], counts["missing_frames"]) == (
@@ -199,9 +193,76 @@ def test_what_is_not_kept_up_with_is_dropped_oldest_first_and_counted():
         )
 
 
+class Clock:
+    """The time of a machine, and a stream at 100 Hz that arrives by it."""
+
+    is_live, is_over, lost, error = True, False, 0, None
+
+    def __init__(self) -> None:
+        self.now, self.sent = 1000.0, 0
+        self.counts: dict[str, int] = {}
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def poll(self, seconds: float) -> list[StreamedFrame]:
+        due = 1000.0 + self.sent / 100
+        if due > self.now and seconds > 0.0:
+            self.now = min(due, self.now + seconds)
+        arrived = []
+        while 1000.0 + self.sent / 100 <= self.now:
+            arrived.append(frame(self.sent, arrived=1000.0 + self.sent / 100))
+            self.sent += 1
+        return arrived
+
+    def end(self) -> None:
+        self.is_over = True
+
+    close = end
+
+
+def lags_of(monkeypatch, seconds: list[float]) -> tuple[list[float], int]:
+    """How late the frames are taken of a reader that needs so long for each [s]; how many were dropped."""
+    clock, lags = Clock(), []
+    monkeypatch.setattr(live_stream, "time", clock)
+    with LiveStream(clock) as stream:
+        for one in seconds:
+            taken = next(stream)
+            lags.append(clock.now - taken.arrived)
+            clock.now += one
+        return lags[5:], stream.counts["dropped_frames"]  # the first five are held until they fit together
+
+
+def test_a_reader_that_is_too_slow_settles_close_to_now(monkeypatch):
+    lags, dropped = lags_of(monkeypatch, [0.015] * 1000)
+    assert max(lags) <= live_stream.MOST_LAG and max(lags[100:]) <= 0.0101
+    assert dropped == pytest.approx(500, abs=10)
+
+
+def test_a_reader_that_was_held_up_catches_up_without_a_loss(monkeypatch):
+    late = [0.001] * 1000
+    late[200] = late[500] = 0.029
+    lags, dropped = lags_of(monkeypatch, late)
+    assert dropped == 0 and max(lags) <= live_stream.MOST_LAG
+    late[700] = 0.2
+    lags, dropped = lags_of(monkeypatch, late)
+    assert dropped in (16, 17, 18) and max(lags) <= live_stream.MOST_LAG, "what is older than may wait"
+
+
 def test_a_lag_may_be_forgiven():
-    with LiveStream(Slow(500)) as stream:
-        wait_for(lambda: len(stream._arrived) == 500)
+    now = time.monotonic()
+    with LiveStream(
+        Arriving([frame(n, arrived=now - 1.0 + n / 100) for n in range(100)], ends=False)
+    ) as stream:
         stream.forgive()
         assert [next(stream).number for _ in range(3)] == [0, 1, 2]
         assert stream.counts["dropped_frames"] == 0
+
+
+def test_more_than_two_seconds_are_not_forgiven():
+    now = time.monotonic()
+    with LiveStream(
+        Arriving([frame(n, arrived=now - 5.0 + n / 100) for n in range(500)], ends=False)
+    ) as stream:
+        stream.forgive()
+        assert next(stream).number == stream.counts["dropped_frames"] >= 295

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout, save_layout
+from gloves.layout import load_layout
 from handsim.errors import HandSimWarning, WeightsError
 from train.any_layout import layout_labeler
 from train.any_layout.fine_tuning import fine_tuned_labeler
@@ -51,7 +51,7 @@ def test_a_glove_without_a_labeler_is_labeled_and_that_is_told(tmp_path, monkeyp
     monkeypatch.setattr(fine_tuned_labeler, "__kwdefaults__", {"num_clouds": 192, "seed": 0})
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     layout = load_layout("starter6")
-    save_layout(tmp_path / "mine.toml", layout)
+    layout.save(tmp_path / "mine.toml")
     with pytest.warns(HandSimWarning, match="no labeler was trained on glove .*mine.toml"):
         found = load_labeler(str(tmp_path / "mine.toml"), None)
     assert isinstance(found, LayoutLabeler) and found.marker_names == layout.names

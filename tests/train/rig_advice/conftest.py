@@ -9,6 +9,7 @@ from gloves.layout import load_layout
 from handsim.space.cameras import ROOM_CENTER, named_rig
 from train.rig_advice.forecast import light
 from train.rig_advice.work import sample_work
+from train.simulation.room_settings import RoomConfig
 
 SIDES = np.full(3, 0.6)
 
@@ -22,4 +23,4 @@ def work():
 
 @pytest.fixture(scope="session")
 def six_lit(work):
-    return light(work, named_rig("six"), rng=np.random.default_rng(1))
+    return light(work, named_rig("six"), RoomConfig(), rng=np.random.default_rng(1))

@@ -14,6 +14,7 @@ from handsim.space.cameras import ROOM_CENTER, CameraRig, named_rig
 from train.rig_advice.forecast import light
 from train.rig_advice.plan import plan
 from train.rig_advice.planning import Planning, view_candidates
+from train.simulation.room_settings import RoomConfig
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def seen_of(views):
 def test_candidates_see_what_a_rig_of_them_sees(candidates, work):
     ten, views = candidates
     rig = CameraRig("ten", ten)
-    lit = light([one.faster(4) for one in work], rig, rng=np.random.default_rng(0))
+    lit = light([one.faster(4) for one in work], rig, RoomConfig(), rng=np.random.default_rng(0))
     expected = np.concatenate([one.seen.reshape(-1, 10) for one in lit])
     seen = seen_of(views)
     assert seen.shape == expected.shape

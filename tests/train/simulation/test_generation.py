@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gloves.layout import load_layout, save_layout
+from gloves.layout import load_layout
 from handsim.app.interrupts import Stopped
 from handsim.errors import ArgumentError, DatasetError, LayoutError, PoseError
 from handsim.files.inputs import checksum
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import Population
-from handsim.space.cameras import as_rig, save_rig
+from handsim.space.cameras import as_rig
 from poses.shapes.couplings import HIGH, LOW
 from tests.rigs import mixed_rig
 from tests.waiting import wait_for
@@ -142,7 +142,7 @@ def test_the_gloves_radius_reaches_the_optics(tmp_path):
     lost = {}
     for radius in (0.0032, 0.008):
         glove = tmp_path / f"{radius}.toml"
-        save_layout(glove, dataclasses.replace(load_layout("dense19"), radius=radius))
+        dataclasses.replace(load_layout("dense19"), radius=radius).save(glove)
         config = dataclasses.replace(CONFIG, num_frames=200, glove=str(glove))
         manifest = make_dataset(config, tmp_path / f"set{radius}", workers=1)
         assert manifest.config["optics"]["marker_radius"] == radius
@@ -242,7 +242,7 @@ def test_a_set_of_a_rig_of_ones_own_holds_its_cameras_and_is_drawn(tmp_path):
     assert as_rig(dataset.manifest.config["rig"]) == rig
     assert DatasetRecording(dataset).rig == rig
     write_report(dataset)
-    save_rig(tmp_path / "mixed.toml", rig)  # the same cameras, whatever names them
+    rig.save(tmp_path / "mixed.toml")  # the same cameras, whatever names them
     same = dataclasses.replace(config, rig=str(tmp_path / "mixed.toml"))
     make_dataset(same, tmp_path / "set", workers=1)
     with pytest.raises(DatasetError, match=r"begun with other settings \(rig"):

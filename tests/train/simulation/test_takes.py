@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from gloves.captures.gaps import count_gaps
-from gloves.layout import load_layout, save_layout
+from gloves.layout import load_layout
 from gloves.optics.reconstruction import OpticsConfig
 from gloves.takes.take import Take, load_take
 from handsim.errors import ArgumentError, HandSimError, PoseError
 from handsim.hand.model import HandModel
-from handsim.space.cameras import ROOM_CENTER, as_rig, named_rig, save_rig
+from handsim.space.cameras import ROOM_CENTER, as_rig, named_rig
 from handsim.space.objects import named_object
 from handsim.space.transforms import pose_matrices, quaternion_matrix
 from poses.contact.two_hands import two_hands_penetration
@@ -112,7 +112,7 @@ def test_a_seed_is_a_capture_and_a_glove_and_a_rig_may_be_others():
 
 def test_a_rig_of_ones_own_is_kept_in_the_take_with_its_cameras(tmp_path):
     rig = mixed_rig()
-    save_rig(tmp_path / "mixed.toml", rig)
+    rig.save(tmp_path / "mixed.toml")
     takes = []
     for given in (rig, str(tmp_path / "mixed.toml")):
         take = simulate_take(num_frames=40, rig=given)
@@ -130,7 +130,7 @@ def test_a_rig_of_ones_own_is_kept_in_the_take_with_its_cameras(tmp_path):
 
 def thick_glove(folder: Path, radius_mm: float) -> str:
     file = folder / f"balls{radius_mm:g}.toml"
-    save_layout(file, dataclasses.replace(load_layout("dense19"), radius=radius_mm * 1e-3))
+    dataclasses.replace(load_layout("dense19"), radius=radius_mm * 1e-3).save(file)
     return str(file)
 
 

@@ -1,0 +1,132 @@
+"""Whether a calibration keeps what it says: held-out against fresh frames, places told against true ones.
+
+    python -m benchmarks.held_out_calibration [--gloves dense19 dfki13 starter10]
+        [--motions calibration hand-controller] [--people 2] [--seconds 30] [--captures DATA]
+
+Simulated people in gloves that slipped as `handsim simulate` has it; labels are those of the tracker. Rich
+motion is "calibration" (touches) or "free", poor motion "hand-controller", which leaves most joints where
+they are. `track.calibrate` has the first seconds of a capture; the fresh ones are 20 s of the same motion
+after them. Angles are those of `handsim track` on the first seconds, without and with --calibrate, and of
+the true hands, below which no calibration gets.
+
+DATA is a folder of Mocap_SIG18_Data: each person's capture1 calibrates, capture2 is fresh (right hands).
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.paper.hand_errors import hand_errors
+from benchmarks.record import describe
+from gloves.captures.capture import Capture
+from gloves.captures.collection import read_markers
+from gloves.fit import GloveFit
+from gloves.layout import load_layout
+from gloves.takes.take import Take
+from handsim.errors import HandSimWarning
+from handsim.hand.topology import Side
+from track.capture_calibration import calibrate
+from track.capture_tracking import track_capture
+from track.kinematics.pose_solver import PoseSolver
+from track.setup import measure_hands
+from train.simulation.takes import simulate_take
+
+FRESH, RATE = 20.0, 120.0  # [s], [Hz]
+NAMES = (
+    "held out before", "after", "fresh before", "after", "places told", "true",
+    "angles before", "after", "of the true hand",
+)  # fmt: skip
+
+
+def fit_error(hand: GloveFit, markers: np.ndarray) -> float:
+    """Median over frames that show nearly all markers (T, M, 3) [m] of the RMS distance [mm]."""
+    seen = markers[np.isfinite(markers[..., 0]).mean(axis=1) >= 0.75]
+    return 1e3 * float(np.median(PoseSolver(hand).solve(seen[:: max(1, len(seen) // 300)]).rms))
+
+
+def angle_error(take: Take, truth: Take, side: Side) -> float:
+    """RMS over frames and joints [deg]."""
+    found, true = (one.qpos[:, one.hand(side), 7:] for one in (take, truth))
+    return float(np.rad2deg(np.sqrt(np.nanmean((found - true) ** 2))))
+
+
+def run_capture(truth: Take, seconds: float) -> list[list[float]]:
+    """The figures of `NAMES` for each hand of a simulated capture."""
+    count = round(seconds * RATE)
+    seen, layout = truth.cut(0, count - 1), truth.hands[0].layout
+    before = measure_hands(seen, layout, hands=truth.sides)
+    user = calibrate(seen, layout, hands=truth.sides)
+    takes = [track_capture(seen, hands=hands) for hands in (before, user, truth.hands)]
+    rows = []
+    for done, worn in zip(user.calibrations, user, strict=True):
+        side = worn.side
+        true = truth.hands[truth.hand(side)]
+        fresh = truth.observed(side)[count:]
+        assert done.held_out is not None
+        kept = done.held_out.after if done.is_better else done.held_out.before
+        rows.append(
+            [1e3 * done.held_out.before, 1e3 * kept]
+            + [fit_error(hand, fresh) for hand in (before.of_side(side), worn)]
+            + [1e3 * done.place_error, 1e3 * float(np.sqrt((hand_errors(worn, true).positions ** 2).mean()))]
+            + [angle_error(take, seen, side) for take in takes]
+        )
+    return rows
+
+
+def run_person(person: Path) -> list[float]:
+    """The first five figures of `NAMES` for the right hand of a real person."""
+    layout = load_layout("dense19")
+    first, second = (
+        read_markers(sorted((person / name).rglob("*_right.trc")), layout.names)
+        for name in ("capture1", "capture2")
+    )
+    capture = Capture(tuple(f"*{column}" for column in range(first.shape[1])), first, RATE)
+    before = measure_hands(capture, layout, hands="right")
+    user = calibrate(capture, layout, hands="right")
+    (done,) = user.calibrations
+    assert done.held_out is not None
+    kept = done.held_out.after if done.is_better else done.held_out.before
+    told = [1e3 * done.held_out.before, 1e3 * kept]
+    return told + [fit_error(one[0], second) for one in (before, user)] + [1e3 * done.place_error]
+
+
+def tell(name: str, values: np.ndarray) -> None:
+    """A row of the table."""
+    print(f"{name} | " + " | ".join(f"{value:.2f}" for value in values), flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gloves", nargs="+", default=["dense19", "dfki13", "starter10"])
+    parser.add_argument("--motions", nargs="+", default=["calibration", "hand-controller"])
+    parser.add_argument("--people", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--captures", type=Path)
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", HandSimWarning)
+    print(describe("scipy", "numba"))
+    print("[mm], [deg] | " + " | ".join(NAMES))
+    if options.captures:
+        for person in sorted(options.captures.glob("User*")):
+            tell(person.name, np.array(run_person(person)))
+    count = round((options.seconds + FRESH) * RATE)
+    for glove in options.gloves:
+        for motion in options.motions:
+            rows = []
+            for person in range(options.people):
+                truth = simulate_take(motion, glove=glove, num_frames=count, seed=100 + person)
+                for row in run_capture(truth, options.seconds):
+                    tell(f"{glove}, {motion}, person {person}", np.array(row))
+                    rows.append(row)
+            tell(f"{glove}, {motion}, mean", np.mean(rows, axis=0))
+            tell(f"{glove}, {motion}, worst", np.max(rows, axis=0))
+
+
+if __name__ == "__main__":
+    main()

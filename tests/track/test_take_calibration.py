@@ -1,0 +1,84 @@
+"""Hands of a take are calibrated on two thirds of it; what fits the other third better is kept."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gloves.fit import nominal_fit
+from gloves.takes.take import LOST, Take
+from handsim.errors import HandSimWarning
+from track.calibration.frames import CalibrationError
+from track.capture_tracking import track_capture
+from track.kinematics.pose_solver import PoseSolver
+from track.take_calibration import calibrate_take, kept_user
+from train.simulation.takes import simulate_take
+
+FRAMES, FRESH = 900, 600
+
+
+@pytest.fixture(scope="module")
+def truth() -> Take:
+    return simulate_take("free", num_frames=FRAMES + FRESH, seed=3, hands=("right",))
+
+
+@pytest.fixture(scope="module")
+def seen(truth) -> Take:
+    return truth.cut(0, FRAMES - 1)
+
+
+def angle_error(take: Take, truth: Take) -> float:
+    """Of the right hand's joint angles [deg]."""
+    found, true = (one.qpos[:, one.hand("right"), 7:] for one in (take, truth))
+    return float(np.rad2deg(np.sqrt(np.nanmean((found - true) ** 2))))
+
+
+@pytest.mark.slow
+def test_what_is_told_is_true_of_a_fresh_capture(truth, seen):
+    start = [nominal_fit("dense19", "M", "right")]
+    done = calibrate_take(seen, start, start, None)
+    user = kept_user(seen, done, start, "from a test", None)
+    (one,) = user.calibrations
+    markers = truth.observed("right")[FRAMES:]
+    fresh = markers[np.isfinite(markers[..., 0]).all(axis=1)][::4]
+    before, after = (np.median(PoseSolver(hand).solve(fresh).rms) for hand in (start[0], user[0]))
+    assert one.is_better and one.held_out.num_frames > 200
+    assert 0.8 * one.held_out.before < before < 1.25 * one.held_out.before
+    assert 0.8 * one.held_out.after < after < 1.25 * one.held_out.after
+    assert user.notes == f"from a test; right hand: {one}"
+
+
+@pytest.mark.slow
+def test_a_hand_that_becomes_no_better_stays(seen):
+    start, before = [nominal_fit("dense19", "M", "right")], seen.hands
+    done = calibrate_take(seen, start, before, None)
+    user = kept_user(seen, done, before, "from a test", None)
+    assert user[0] is before[0] and "it stays as it was" in user.notes
+
+
+def test_a_take_without_a_hand_is_told(seen):
+    no_pose = np.full_like(seen.qpos, np.nan)
+    lost = dataclasses.replace(seen, qpos=no_pose, status=np.full_like(seen.status, LOST))
+    with pytest.raises(CalibrationError, match="no right hand was found in the capture"):
+        calibrate_take(lost, seen.hands, seen.hands, None)
+
+
+@pytest.mark.slow
+def test_a_take_is_calibrated_on_itself(seen):
+    first = track_capture(seen, hands=["right"])
+    steps = []
+    second = track_capture(
+        seen, hands=["right"], calibrate=True, progress=lambda *values: steps.append(values)
+    )
+    assert angle_error(second, seen) < 0.6 * angle_error(first, seen)
+    assert np.nanmedian(second.rms) < 0.5 * np.nanmedian(first.rms)
+    assert second.settings["user"].startswith("calibrated on the take itself, ")
+    assert steps[0] == (1, FRAMES) and steps.count((FRAMES, FRAMES)) == 2
+
+
+def test_a_take_too_short_to_be_calibrated_is_tracked_all_the_same(seen):
+    with pytest.warns(HandSimWarning, match="not calibrated: .* at least 100 such frames"):
+        take = track_capture(seen.cut(0, 59), hands=["right"], calibrate=True)
+    assert take.settings["user"].startswith("auto, ") and np.isfinite(take.qpos).all()

@@ -1,0 +1,148 @@
+"""Calibration of the hands of a labeled take, and whether it fits frames that it has not seen better."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from gloves.fit import GloveFit
+from gloves.takes.take import INITIALIZED, TRACKED, Take
+from handsim.hand.topology import Side
+from track.calibration.frames import CalibrationError
+from track.calibration.solver import Progress
+from track.calibration.user_calibration import MOST_STEPS, Calibration, HeldOut, calibrate_hand
+from track.kinematics.pose_solver import PoseSolver
+from track.user import User
+
+CalibrationProgress = Callable[[str, int, int], None]
+"""Called with what is done, such as "frames", how much of it, and of how much."""
+_SHOWN: Final = 0.05  # share of the frames in which a hand must be tracked to be calibrated
+_NEAR: Final = 0.015  # [m]: largest residual of a marker on a hand of another size
+_LEFT_OVER: Final = 0.005  # share of the markers that the first round may leave unlabeled
+_BLOCK: Final = 1.0  # [s] of frames that are held out together, since neighbors are much alike
+_BLOCKS: Final = 6  # at least
+_HELD_OUT: Final = 3  # one block of so many is held out
+_MOST_CHECKED: Final = 400  # frames that are held out
+_FEWEST_SEEN: Final = 0.75  # share of the markers of such a frame
+
+
+def calibrate_take(
+    take: Take,
+    start: Sequence[GloveFit],
+    before: Sequence[GloveFit],
+    progress: CalibrationProgress | None,
+) -> tuple[Calibration, ...]:
+    """Calibrate the hands that are in a take on two thirds of its frames, and try them on the others.
+
+    Args:
+        take: The take; labels of hands that are tracked count.
+        start: Where to begin, for each side.
+        before: The hands that it was labeled with.
+        progress: Called with what is done.
+
+    Raises:
+        CalibrationError: No hand is in the take, or it tells too little of one.
+    """
+    shown = [hand for hand in start if _reliable(take, hand.side).mean() > _SHOWN]
+    if not shown:
+        raise CalibrationError(
+            f"no {' and no '.join(take.sides)} hand was found in the capture; expected half a minute of one"
+        )
+    worn = {hand.side: hand for hand in before}
+    out = _held_out(take.num_frames, take.rate)
+    done = []
+    for hand in shown:
+        markers = _markers(take, hand.side)
+        seen = np.where(out[:, None, None], np.nan, markers)
+        one = calibrate_hand(seen, hand, take.rate, progress=_steps(hand.side, progress))
+        tried = _tried(markers[out], worn[hand.side], one.hand)
+        done.append(dataclasses.replace(one, held_out=tried))
+    return tuple(done)
+
+
+def kept_user(
+    take: Take,
+    done: Sequence[Calibration],
+    before: Sequence[GloveFit],
+    notes: str,
+    progress: CalibrationProgress | None,
+) -> User:
+    """The user with the hands that fit held-out frames better: calibrated on all frames, or as before.
+
+    Args:
+        take: The take.
+        done: What `calibrate_take` made of it.
+        before: The hands that it was labeled with, for each side in `done`.
+        notes: Where the user is from.
+        progress: Called with what is done.
+    """
+    whole = tuple(_solved_again(take, one, progress) if one.is_better else one for one in done)
+    worn = {hand.side: hand for hand in before}
+    hands = tuple(one.hand if one.is_better else worn[one.hand.side] for one in whole)
+    told = [f"{one.hand.side} hand: {one}" for one in whole]
+    return User(hands, "; ".join([notes, *told]), whole)
+
+
+def _solved_again(take: Take, one: Calibration, progress: CalibrationProgress | None) -> Calibration:
+    """A calibration on all frames, with what it did on held-out ones."""
+    side = one.hand.side
+    whole = calibrate_hand(_markers(take, side), one.start, take.rate, progress=_steps(side, progress))
+    return dataclasses.replace(whole, held_out=one.held_out)
+
+
+def leaves_markers(take: Take, done: Sequence[Calibration]) -> bool:
+    """Whether too many missing markers had an unlabeled point nearby."""
+    from scipy.spatial.distance import cdist
+
+    left, total = 0, 0
+    for one in done:
+        side = one.hand.side
+        filled, markers = take.filled(side), take.markers(side)
+        total += filled.size
+        for frame in np.flatnonzero(filled.any(axis=1) & _reliable(take, side)):
+            free = take.points[frame, take.labels[frame] < 0]
+            expected = markers[frame, filled[frame]]
+            left += int((cdist(expected, free[np.isfinite(free[:, 0])]) < _NEAR).any(axis=1).sum())
+    return left > _LEFT_OVER * total
+
+
+def _held_out(num_frames: int, rate: float) -> Bool[np.ndarray, "T"]:
+    """Frames that a calibration does not see: every third second, or less of a short take."""
+    block = max(1, min(round(_BLOCK * rate), num_frames // _BLOCKS))
+    out: NDArray[np.bool_] = np.arange(num_frames) // block % _HELD_OUT == _HELD_OUT - 1
+    return out
+
+
+def _tried(markers: Float[np.ndarray, "T M 3"], before: GloveFit, after: GloveFit) -> HeldOut | None:
+    """How well two hands fit held-out markers [m], NaN where missing; None if they tell too little."""
+    frames = np.flatnonzero(np.isfinite(markers[..., 0]).mean(axis=1) >= _FEWEST_SEEN)
+    if not len(frames):
+        return None
+    seen = markers[frames[:: -(-len(frames) // _MOST_CHECKED)]]
+    off = [float(np.median(PoseSolver(hand).solve(seen).rms)) for hand in (before, after)]
+    return HeldOut(off[0], off[1], len(seen))
+
+
+def _steps(side: Side, progress: CalibrationProgress | None) -> Progress | None:
+    """The progress of one hand."""
+    if progress is None:
+        return None
+    return lambda step, rms, gap: progress(f"steps for the {side} hand", step, MOST_STEPS)
+
+
+def _markers(take: Take, side: Side) -> Float[np.ndarray, "T M 3"]:
+    """The reliably labeled markers of a hand [m]; NaN for the others."""
+    markers = take.observed(side)
+    markers[~_reliable(take, side)] = np.nan
+    return markers
+
+
+def _reliable(take: Take, side: Side) -> Bool[np.ndarray, "T"]:
+    """Frames whose labels are reliable."""
+    reliable: NDArray[np.bool_] = np.isin(take.status[:, take.hand(side)], (TRACKED, INITIALIZED))
+    return reliable
