@@ -138,7 +138,7 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
 
 @kernel
 def _covered(first: NDArray[np.int32]) -> Any:
-    """Numbers (N,) of the pixels with a surface in one of their four samples; the nearest face is -1 for none."""
+    """Numbers (N,) of the pixels with a surface in one of their samples (2 H, 2 W), which are -1 for none."""
     height, width = first.shape[0] // 2, first.shape[1] // 2
     covered, count = np.empty(height * width, np.int32), 0
     for row in range(height):
@@ -338,6 +338,8 @@ def _write_spot(
         cu, cv = rows[c, 9] - rows[a, 9], rows[c, 10] - rows[a, 10]
         sign = 1.0 if bu * cv - cu * bv >= 0.0 else -1.0
         for i in range(3):
-            spots[spot, TANGENT + i] = sign * (cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i]))
+            spots[spot, TANGENT + i] = sign * (
+                cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i])
+            )
     spots[spot, COLOR], spots[spot, COLOR + 1], spots[spot, COLOR + 2] = red, green, blue
     spots[spot, ROUGH] = max(rough, _ROUGHEST)
