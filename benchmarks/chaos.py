@@ -57,6 +57,16 @@ CASES = {
     "simulate": Case(("simulate", "--num-frames", "240", "--out", "OUT/take.c3d")),
     "track": Case(("track", "WORK/take.c3d", "--out", "OUT/tracked.npz")),
     "calibrate": Case(("calibrate", "WORK/long.c3d", "--hands", "right", "--out", "OUT/user.json")),
+    "label": Case(("label", "WORK/take.c3d", "--out", "OUT/labeled.c3d")),
+    "cnn": Case(
+        (
+            *("train", "WORK/set", "--out", "OUT", "--labeler", "cnn", "--samples", "640", "--batch", "32"),
+            *("--threads", "1"),
+        ),
+        "*.safetensors",
+    ),
+    "improve": Case(("glove", "improve", "sparse13", "--minutes", "0", "--out", "OUT/better.toml")),
+    "plan": Case(("rig", "plan", "--cameras", "3", "--room", "3", "3", "2.5", "--out", "OUT/rig.toml")),
 }
 
 

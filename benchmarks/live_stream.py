@@ -1,17 +1,20 @@
-"""A live stream for an hour, on a bad network: frames lost, memory, and what is on disk after a kill.
+"""A live stream for an hour, on a bad network: frames lost, memory, lag, and what is on disk after a kill.
 
 Two hands at 120 Hz are tracked and recorded as `handsim track --live` does it. The server sends as fast as
 the tracker reads. On the way 5 % of the packets are dropped, as many doubled, overtaken by the next one, and
 corrupted; others bring junk, wild times and frames of another sender. The server restarts now and then, on
-its port; another one on another port is not heard. Then the command itself is killed.
+its port; another one on another port is not heard. Then the command itself is killed. At last two hands come
+at 120 Hz for a minute while as many processes as there are cores do nothing but compute: how late the command
+sends them on, and what it drops.
 
-python -m benchmarks.live_stream [--seconds 3600] [--no-hands]
+python -m benchmarks.live_stream [soak kill lag] [--seconds 3600] [--no-hands]
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import os
 import signal
 import socket
@@ -32,7 +35,7 @@ from gloves.takes.growing import GrownArchive
 from gloves.takes.take import Take, load_take
 from track.recorder import Recorder
 from track.streams import natnet
-from track.streams.live_stream import LiveStream
+from track.streams.live_stream import MOST_LAG, LiveStream
 from track.streams.natnet import Kind, MarkerFrame, ServerInfo
 from track.streams.natnet_server import LOOPBACK, ReplayServer
 from track.streams.point_stream import open_stream
@@ -47,6 +50,8 @@ AHEAD = 40  # packets that may wait for the reader
 RESTARTS = 4
 WARM = 10.0  # [s] of the stream before memory is measured
 SETTLED = 12.0  # [s] of a recording before it is killed: the size of the hands is measured first
+LAG_SECONDS = 60.0  # of the stream on a busy machine
+PROGRAM = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
 WILD = (1e17, 1e9, -1e9, np.inf, 7e4, -3.0)
 
 
@@ -171,14 +176,20 @@ def _socket(port: int = 0) -> socket.socket:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=3600.0, help="of the stream, at 120 Hz")
+    parser.add_argument("parts", nargs="*", help="some of soak, kill, lag; all when not given")
+    parser.add_argument("--seconds", type=float, default=3600.0, help="of the bad stream, at 120 Hz")
     parser.add_argument("--no-hands", action="store_true", help="only other markers: the tracker has no work")
     options = parser.parse_args()
+    parts, pace = set(options.parts or ("soak", "kill", "lag")), np.inf
     print(describe("numba", "torch"))
     take = simulate_take(kind="hand-hand", num_frames=1200)
     with tempfile.TemporaryDirectory() as folder:
-        pace = soak(take, round(options.seconds * RATE), not options.no_hands, Path(folder))
-        kill(take, min(1.0, 0.4 * pace) * RATE, Path(folder))  # a busy machine needs a slower stream
+        if "soak" in parts:
+            pace = soak(take, round(options.seconds * RATE), not options.no_hands, Path(folder))
+        if "kill" in parts:
+            kill(take, min(1.0, 0.4 * pace) * RATE, Path(folder))  # a busy machine needs a slower stream
+        if "lag" in parts:
+            lag(take, Path(folder))
 
 
 def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
@@ -192,6 +203,7 @@ def soak(take: Take, frames: int, hands: bool, folder: Path) -> float:
     start, memory, first = time.perf_counter(), [], 0
     there = np.zeros(frames, dtype=bool)
     packets = open_stream(server.url)
+    packets.is_live = False  # this server waits for its reader
     with LiveStream(packets, ended=server.ended.is_set) as stream:
         with Recorder(out, tracker) as recorder:
             for frame in stream:
@@ -230,8 +242,7 @@ def kill(take: Take, rate: float, folder: Path) -> None:
         part = out.with_name(out.name + ".part")
         points, ids = np.tile(take.points, (20, 1, 1)), np.tile(take.ids, (20, 1))
         with ReplayServer(SimpleNamespace(points=points, ids=ids, rate=rate)) as server:
-            program = "import sys; from handsim.cli.main import main; sys.exit(main(sys.argv[1:]))"
-            command = [sys.executable, "-c", program, "track", "--live", server.url, "--out", str(out)]
+            command = [sys.executable, "-c", PROGRAM, "track", "--live", server.url, "--out", str(out)]
             process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             fewest = SETTLED * rate
             while process.poll() is None and not (part.exists() and GrownArchive(part).num_frames > fewest):
@@ -247,6 +258,58 @@ def kill(take: Take, rate: float, folder: Path) -> None:
         name = (part if part.exists() else out).name
         told = f"{max(missing, 0)} of those sent are missing ({max(missing, 0) / rate:.2f} s)"
         print(f"{number.name}: exit code {code}, {name} has {len(numbers)} frames, {told}")
+
+
+class StampedServer(ReplayServer):
+    """A server that notes when it sent which frame."""
+
+    def __init__(self, take: Take) -> None:
+        self.stamps: list[float] = []
+        super().__init__(take, loop=True)
+
+    def _send_all(self, packet: bytes) -> None:
+        self.stamps.append(time.monotonic())
+        super()._send_all(packet)
+
+
+def lag(take: Take, folder: Path) -> None:
+    """How late the command is on a machine all of whose cores are busy."""
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(os.cpu_count() or 1)]
+    over, heard = threading.Event(), []
+    listener = _socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    listener.settimeout(0.5)
+
+    def listen() -> None:
+        while not over.is_set():
+            try:
+                packet, now = listener.recv(1 << 16), time.monotonic()
+            except TimeoutError:
+                continue
+            if (document := json.loads(packet))["type"] == "frame" and not document["silent"]:
+                heard.append((document["number"], now))
+
+    thread = threading.Thread(target=listen)
+    thread.start()
+    address = "{}:{}".format(*listener.getsockname())
+    try:
+        with StampedServer(take) as server:
+            command = ["track", "--live", server.url, "--out", str(folder / "lag.npz")]
+            command += ["--seconds", str(LAG_SECONDS), "--send", f"udp://{address}"]
+            told = subprocess.run(
+                [sys.executable, "-c", PROGRAM, *command], capture_output=True, text=True, check=True
+            )
+    finally:
+        over.set()
+        thread.join()
+        for process in busy:
+            process.kill()
+    print(f"with {len(busy)} processes that compute beside it:", *told.stdout.splitlines()[2:5], sep="\n  ")
+    late = 1e3 * np.array([now - server.stamps[number] for number, now in heard])
+    began = int(np.argmax(late < 1e3 * MOST_LAG))
+    p50, p99, most = np.percentile(late[began:], [50, 99, 100])
+    print(f"from the server's sendto to the receiver of the hands, behind the first {began} frames:")
+    print(f"  p50 {p50:.0f} ms, p99 {p99:.0f} ms, {most:.0f} ms at most")
 
 
 def _resident() -> int:

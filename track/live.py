@@ -171,7 +171,7 @@ def track_live(
             try:
                 kept_up, asked = _Now(), False
                 for frame in frames:
-                    if seconds is not None:
+                    if seconds is not None and not frame.silent:
                         until[0] = min(until[0], frame.arrived + seconds)
                     if frame.arrived > until[0]:
                         break

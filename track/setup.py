@@ -21,9 +21,10 @@ from track.bodies.rigid_body import RigidTemplate
 from track.calibration.hand_size import fit_size, sample_frames
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
+from track.hand_check import check_hands
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
-from track.user import User, as_user, checked_sides, nominal_user
+from track.user import MEASURED, User, as_user, checked_sides, nominal_user
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
@@ -85,10 +86,16 @@ class TrackerSetup:
         return _SHOWN * self.user.layout.num_markers
 
     def measured(self, frames: Sequence[StreamedFrame]) -> TrackerSetup:
-        """The setup with the hands as measured in some frames, if they are to be measured."""
+        """The setup with the hands as measured in some frames, if they are to be measured.
+
+        Raises:
+            ArgumentError: See `check_hands`, which warns of hands that do not fit.
+        """
         if not self.is_measured:
+            check_hands(frames, self.user, self.labeler)
             return self
         user = measured_user(frames, self.user.layout, self.user.sides, self.labeler)
+        check_hands(frames, user, self.labeler)
         settings = {**self.settings, "user": user.notes}
         return dataclasses.replace(self, user=user, is_measured=False, settings=settings)
 
@@ -141,7 +148,7 @@ def measured_user(
         stacklevel=3,
     )
     usual = nominal_user(layout, USUAL_SIZE, sides)
-    return User(usual.hands, f"auto, {USUAL_SIZE}")
+    return User(usual.hands, f"{MEASURED}{USUAL_SIZE}")
 
 
 def found_user(
@@ -149,7 +156,7 @@ def found_user(
 ) -> User | None:
     """The user whose hands are in some frames, measured; None if no hand is found."""
     size = fit_size(frames, layout, sides, labeler)
-    return None if size is None else User(size.hands(sides), f"auto, {size}")
+    return None if size is None else User(size.hands(sides), f"{MEASURED}{size}")
 
 
 def as_designed(user: User) -> tuple[GloveFit, ...]:

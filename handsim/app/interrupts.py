@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ ENDING: Final = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 """Ctrl-C, the end of a batch job, and a terminal that closes."""
+_AGAIN: Final = 0.05  # [s] after which a signal comes again whose exception was lost
 
 
 class Stopped(KeyboardInterrupt):
@@ -72,18 +74,51 @@ def interrupt_flag(*, again: bool = True) -> Iterator[InterruptFlag]:
         yield flag
 
 
-@contextmanager
-def signals_raise() -> Iterator[None]:
-    """Within the block SIGTERM and SIGHUP raise `Stopped`, as Ctrl-C raises KeyboardInterrupt.
+class _Block:
+    """Whether a block of code was left."""
 
-    So a command that a batch system ends cleans up like one that its user interrupts.
+    left = False
+
+    def send(self, number: int) -> None:
+        """Send a signal to this process unless the block was left."""
+        if not self.left:
+            os.kill(os.getpid(), number)
+
+
+class _Persistent(Stopped):
+    """A `Stopped` that comes again when it is lost, until a block is left.
+
+    Args:
+        number: The signal.
+        block: The block.
     """
 
-    def stop(number: int, _frame: FrameType | None) -> None:
-        raise Stopped(number)
+    def __init__(self, number: int, block: _Block) -> None:
+        super().__init__(number)
+        self._block = block
 
-    with _handled(stop, ENDING[1:]):
-        yield
+    def __del__(self) -> None:
+        if not self._block.left:  # from another thread: here it would be raised, and lost, at once
+            threading.Timer(_AGAIN, self._block.send, (self.number,)).start()
+
+
+@contextmanager
+def signals_raise() -> Iterator[None]:
+    """Within the block a signal to end raises `Stopped`, also SIGTERM and SIGHUP.
+
+    So a command that a batch system ends cleans up like one that its user interrupts. Compiled code that
+    calls back into Python swallows exceptions; then the signal comes again.
+    """
+    block = _Block()
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        raise _Persistent(number, block)
+
+    with _handled(stop, ENDING):
+        try:
+            yield
+        finally:
+            block.left = True
 
 
 @contextmanager

@@ -41,6 +41,7 @@ def label(
     from handsim.app.progress import progress_bar
     from handsim.files.outputs import check_outputs
     from track.capture_labeling import label_capture
+    from track.take_summary import no_points
     from train.threads import label_on
 
     label_on(threads)
@@ -63,7 +64,7 @@ def label(
     )
     if not labeled.any():
         told = f"no hand in {capture}, expected hands in glove '{glove}' (--glove names another)"
-        warnings.warn(told, HandSimWarning, stacklevel=2)
+        warnings.warn(told if points.any() else no_points(take), HandSimWarning, stacklevel=2)
 
 
 def _hands_there(take: Take) -> tuple[Bool[np.ndarray, "T"], Bool[np.ndarray, "T"]]:

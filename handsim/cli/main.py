@@ -52,12 +52,8 @@ def run(commands: Mapping[str, tuple[str, str]], args: Sequence[str]) -> int:
         return _leave(end)
     except KeyboardInterrupt as stop:
         return _say_stopped(program, stop)
-    except (HandSimError, OSError, MemoryError, ImportError) as error:
-        _complain(f"{program}: {sentence(error)}")
-        return 1
     except Exception as error:
-        _complain(f"{program}: {_unexpected(program, error)}")
-        return 1
+        return _say_failed(program, error)
 
 
 def _prepare_streams() -> None:
@@ -83,6 +79,15 @@ def _leave(end: SystemExit) -> int:
         raise end
     _abandon_stdout()
     return _BROKEN_PIPE
+
+
+def _say_failed(program: str, error: Exception) -> int:
+    """Say in one line what went wrong; the exit code."""
+    if isinstance(error, SystemError) and isinstance(error.__cause__, KeyboardInterrupt):
+        return _say_stopped(program, error.__cause__)  # it came while compiled code was left
+    expected = isinstance(error, HandSimError | OSError | MemoryError | ImportError)
+    _complain(f"{program}: {sentence(error) if expected else _unexpected(program, error)}")
+    return 1
 
 
 def _say_stopped(program: str, stop: KeyboardInterrupt) -> int:

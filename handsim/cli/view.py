@@ -39,6 +39,7 @@ def view(
     body: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     labeler: str | None = None,
     video: Path | None = None,
+    time: float | None = None,
 ) -> None:
     """Show a file or a live tracker in the browser; Ctrl-C ends it.
 
@@ -62,6 +63,7 @@ def view(
         body: A rigid body for a live tracker, once per body.
         labeler: Folder of a trained labeler for a live tracker, or an exported .onnx file.
         video: File for a video of a take, capture or training set (.mp4), which is drawn instead of a page.
+        time: Time of a take, capture or training set that the page opens at [s]; its begin when not given.
     """
     from handsim.cli.options import check_take_file, chosen_hands
     from track.setup import USUAL_SIZE, TrackerSetup
@@ -73,6 +75,8 @@ def view(
     if live is not None:
         if video is not None:
             raise ArgumentError(f"--video is {video}, but a live view is not drawn; see handsim track")
+        if time is not None:
+            raise ArgumentError(f"--time is {time:g} with --live, expected a file")
         if out is not None:
             check_take_file(out, live=True)
             check_outputs((shape, glove, labeler, rig, *body), (out,))
@@ -80,7 +84,7 @@ def view(
         _view_live(live, setup, host, port, rig, out)
         return
     content = open_content(
-        str(file), out=out, size=USUAL_SIZE if size is None or size == "auto" else size, rig=rig
+        str(file), out=out, size=USUAL_SIZE if size is None or size == "auto" else size, rig=rig, time=time
     )
     if video is not None:
         _draw(str(file), content, video)

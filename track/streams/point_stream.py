@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import math
 import os
 import select
 import socket
@@ -67,14 +66,15 @@ class PointStream(Closing):
 
     Packets are taken from the server's address, and its ports for commands and for data, only. They wait in
     the socket, and whoever asks takes them out of it: a thread that reads would contend with the tracker for
-    the interpreter at every packet. While nobody asks for long, as when hands are measured, a thread keeps the
-    socket from running over.
+    the interpreter at every packet. While nobody asks for long, as when hands are measured, a thread keeps
+    the socket from running over.
     """
 
-    is_live: Final = True
-    error: Final = None
-
     def __init__(self, sockets: list[socket.socket], address: tuple[str, int], server: ServerInfo) -> None:
+        self.is_live = True
+        """Whether frames come at their own pace."""
+        self.error: Exception | None = None
+        """Nothing makes it fail: a server that is gone may come again."""
         self.server = server
         """The server's description of itself."""
         self.packets = 0

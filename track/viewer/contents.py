@@ -43,6 +43,7 @@ ACCEPTED: Final = (
     f"({', '.join(READABLE)}), a tracked take or a simulated take's truth (.npz), or a user's file (.json)"
 )
 """What can be viewed."""
+_ROUNDED: Final = 0.01  # [s] by which a time may lie outside
 _LOOKED_AT: Final = 30  # frames that decide where the first look goes
 
 Run = Callable[[Callable[[], bool]], None]
@@ -61,7 +62,12 @@ class Content(NamedTuple):
 
 
 def open_content(
-    name: str, *, out: Path | None = None, size: str = "M", rig: CameraRig | str | None = None
+    name: str,
+    *,
+    out: Path | None = None,
+    size: str = "M",
+    rig: CameraRig | str | None = None,
+    time: float | None = None,
 ) -> Content:
     """Read what shall be shown.
 
@@ -70,11 +76,19 @@ def open_content(
         out: Where a changed layout is saved; a new name beside it when None.
         size: Size of the hand that wears a layout.
         rig: Cameras of a capture or take: a rig, a shipped name or the path of a .toml file.
+        time: Which of its frames is shown first [s].
 
     Raises:
         ArgumentError: It is nothing that can be viewed, or an option is for something else.
         FileError: It cannot be read.
     """
+    content = _open(name, out, size, rig, time)
+    if time is not None and content.recording is None:
+        raise ArgumentError(f"--time is {time:g}, but {name} is a {content.kind}: nothing in it moves")
+    return content
+
+
+def _open(name: str, out: Path | None, size: str, rig: CameraRig | str | None, time: float | None) -> Content:
     path = Path(name)
     if not path.exists() and name in list_layouts():
         return _layout(name, None, out, size)
@@ -97,7 +111,21 @@ def open_content(
         return Content("user", lambda server: _still(UserView(server, hands)))
     recording, corrector = _recording(path, None if rig is None else load_rig(rig))
     kind = type(recording).__name__.removesuffix("Recording").lower()
-    return Content(kind, lambda server: show_recording(server, recording, corrector), recording)
+    first = 0 if time is None else _frame_at(recording, time, name)
+    return Content(kind, lambda server: show_recording(server, recording, corrector, first), recording)
+
+
+def _frame_at(recording: Recording, time: float, name: str) -> int:
+    """The frame that is nearest to a time [s].
+
+    Raises:
+        ArgumentError: The time lies outside.
+    """
+    begin, end = float(recording.times[0]), float(recording.times[-1])
+    nearest = int(np.argmin(np.abs(recording.times - time)))
+    if not begin - _ROUNDED <= time <= end + _ROUNDED:
+        raise ArgumentError(f"--time is {time:g} s, but {name} lasts from {begin:g} to {end:.3f} s")
+    return nearest
 
 
 def _recording(path: Path, rig: CameraRig | None) -> tuple[Recording, Corrector | None]:
@@ -146,13 +174,16 @@ def _rig(name: str | Path) -> Content:
     return Content("rig", show)
 
 
-def show_recording(server: ViserServer, recording: Recording, corrector: Corrector | None = None) -> Run:
+def show_recording(
+    server: ViserServer, recording: Recording, corrector: Corrector | None = None, first: int = 0
+) -> Run:
     """Put a recording into a page, with its timeline.
 
     Args:
         server: Where the page is.
         recording: What is shown.
         corrector: Where its labels can be corrected: the tracked take that the recording shows.
+        first: The frame that is shown first.
 
     Returns:
         What serves the page.
@@ -179,6 +210,7 @@ def show_recording(server: ViserServer, recording: Recording, corrector: Correct
         view.on_pick = editor.pick
     panel.add_plots()
     set_stage(server, first_look(recording))
+    timeline.go_to(first)
     timeline.update()
 
     def run(ended: Callable[[], bool]) -> None:

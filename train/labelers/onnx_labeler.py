@@ -39,6 +39,7 @@ _MATCHING: Final = "handsim.matching"  # key of the constants that labels are ch
 _IMAGES: Final = "images"  # its input
 _INPUTS: Final = "points", "present"
 _OUTPUTS: Final = "point_scores", "label_scores"
+_PAIRED: Final = "pairs", "costs"  # outputs for other programs
 _OPSET: Final = 17
 _DESCRIPTION: Final = (
     "Labels the reflective markers of one hand in one frame. Compute in float32: runtimes that choose "
@@ -51,6 +52,10 @@ _MEANINGS: Final = {
     "point_scores": "Log-probability for each point of each marker, in the order of handsim.marker_names; "
     "the last column is a ghost.",
     "label_scores": "Log-probability for each marker of each point; the last column is that it is not seen.",
+    "pairs": "Probability for each point of each marker, no two points of one marker; the last column is a "
+    "ghost.",
+    "costs": "What each marker costs each point, then each point as a ghost, in its own column: labels are "
+    "the assignment of least cost, verified by a prior of hands (docs/how_to/onnx.md).",
     "images": "Depth images of Han et al. 2018: 52 x 52, a pixel a point, brightness its depth; 0 where "
     "there is none.",
     "positions": "Predicted position of each marker in the view: x right, y down, z away; 1 is half an "
@@ -91,6 +96,8 @@ class OnnxLabeler:
                 content, options, providers=["CPUExecutionProvider"], enable_fallback=0
             )
             metadata = self._session.get_modelmeta().custom_metadata_map
+            self._scores_alone = onnxruntime.RunOptions()  # not what other programs need beside them
+            self._scores_alone.only_execute_path_to_fetches = True
             self.marker_names = checked_names(json.loads(metadata[_NAMES]))
             self.prior = _unpacked(metadata[_PRIOR]) if _PRIOR in metadata else None
             self._label = self._label_by_images(metadata[_CNN]) if _CNN in metadata else self._label_by_scores
@@ -122,7 +129,7 @@ class OnnxLabeler:
     def _label_by_scores(self, clouds: list[NDArray[np.float64]]) -> list[Labeling]:
         """The set labeler."""
         given = dict(zip(_INPUTS, pad_clouds(clouds), strict=True))
-        by_point, by_label = self._session.run(_OUTPUTS, given)
+        by_point, by_label = self._session.run(_OUTPUTS, given, self._scores_alone)
         return label_by_scores(clouds, by_point, by_label, self.prior)
 
     def _label_by_images(self, settings: str) -> Callable[[list[NDArray[np.float64]]], list[Labeling]]:
@@ -184,6 +191,7 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
     import torch
 
     from train.labelers.cnn_network import DeepLabelCNN
+    from train.labelers.set_network import PairedScores
 
     try:
         import onnx
@@ -205,6 +213,9 @@ def export_onnx(network: nn.Module, marker_names: Sequence[str], path: Path) -> 
         if isinstance(prior, PosePrior):
             properties[_PRIOR] = _packed(prior)
             properties[_MATCHING] = json.dumps(matching_constants())
+            network, outputs = PairedScores(network), [*outputs, *_PAIRED]
+            axes |= {name: {0: "frames", 1: "points"} for name in _PAIRED}
+            axes[_PAIRED[1]][2] = "markers_and_points"
     with atomic_write(path) as temporary, warnings.catch_warnings():
         # The newer exporter needs another package and fixes the sizes of expanded arrays.
         warnings.simplefilter("ignore")

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from train.config import SetLabelerConfig
 from train.data.batches import WHOLE, Batch, Weights
+from train.matching.assignment import IMPOSSIBLE, SINKHORN
 from train.matching.pose_prior import PosePrior
 
 
@@ -76,6 +77,43 @@ class SetLabeler(nn.Module):
     def numpy_weights(self) -> dict[str, np.ndarray]:
         """The weights by name, in the network's own memory."""
         return {name: value.detach().numpy() for name, value in self.state_dict().items()}
+
+
+class PairedScores(nn.Module):
+    """A network with two more outputs, for exported files: what its labels are assigned by.
+
+    They are as `train.matching.assignment` makes them of the scores: the probabilities of pairs of a point
+    and a label, ghosts last (B, N, M+1); and what each label costs each point, and each point as a ghost
+    (B, N, M+N).
+
+    Args:
+        network: The network.
+    """
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(
+        self, points: Float[Tensor, "B N 3"], present: Bool[Tensor, "B N"]
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Scores of clouds [m], probabilities of pairs, and costs."""
+        point_scores, label_scores = self.network(points, present)
+        by_point, by_label, labels = point_scores.double(), label_scores.double(), label_scores.shape[1]
+        weight, least = SINKHORN["score_weight"], SINKHORN["least_probability"]
+        both = by_point[..., :labels] + by_label[..., :-1].transpose(1, 2)
+        pairs = torch.exp(weight * torch.cat([both, 2.0 * by_point[..., labels:]], -1)) + least
+        pairs = pairs * present[..., None]
+        hidden = torch.exp(2.0 * weight * by_label[..., -1:].transpose(1, 2)) + least
+        for _ in range(int(SINKHORN["sinkhorn_rounds"])):
+            total = pairs[..., :labels].sum(1, keepdim=True) + hidden
+            pairs = torch.cat([pairs[..., :labels] / total, pairs[..., labels:]], -1)
+            pairs, hidden = pairs / pairs.sum(-1, keepdim=True).clamp_min(least), hidden / total
+        logs = torch.log(pairs.clamp_min(least))
+        costs = torch.log(hidden.clamp_min(least)) - 2.0 * logs[..., :labels]
+        numbers = torch.arange(points.shape[1], device=points.device)
+        alone = torch.where(numbers[:, None] == numbers, -logs[..., labels:], IMPOSSIBLE)
+        return point_scores, label_scores, pairs, torch.cat([costs, alone], -1)
 
 
 class MessageRound(nn.Module):

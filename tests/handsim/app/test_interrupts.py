@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 
 import pytest
 
+import handsim.cli.main as command
 from handsim.app.interrupts import Stopped, interrupt_flag, signals_raise
+from tests.waiting import LONG
 
 
 def test_the_first_interrupt_is_told_and_the_second_raises():
@@ -63,3 +66,26 @@ def test_a_signal_that_is_ignored_stays_ignored():
             assert not interrupted()
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_signal_whose_exception_is_lost_comes_again():
+    with pytest.raises(Stopped) as caught, signals_raise():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            pass  # as compiled code does
+        try:
+            time.sleep(LONG)
+        except KeyboardInterrupt:
+            pass
+        time.sleep(LONG)
+    assert caught.value.number == signal.SIGTERM
+
+
+def test_an_interrupt_while_compiled_code_is_left_is_no_mistake_of_ours(monkeypatch, capsys):
+    def interrupted(*_: object) -> int:
+        raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(command, "_dispatch", interrupted)
+    assert command.run({}, []) == 130
+    assert capsys.readouterr().err == "handsim: interrupted\n"

@@ -290,11 +290,37 @@ def test_a_stream_is_tracked_for_some_seconds(capture, tmp_path, capsys, monkeyp
     assert (take.status[-1] != LOST).all()
     told = capsys.readouterr()
     assert "right hand: tracked" in told.out and "; 0 missing" in told.out
-    assert "frames received: " in told.out and " ms behind the arrival of frames" in told.out
+    assert "frames received: " in told.out and "which came while hands were measured" in told.out
     assert told.out.startswith("size of the hands: ") and take.settings["user"].startswith("auto, ")
     lines = told.err.splitlines()
     assert lines[0] == "waiting for hands, to measure their size" and lines[1].startswith("size of the hands")
     assert lines[2] == f"recording to {out}.part, which becomes {out} at the end; Ctrl-C ends it"
+
+
+LATE = """
+import time
+import numpy as np
+from track import StreamedFrame
+
+class Late:
+    def __iter__(self):
+        time.sleep(1.0)
+        for number in range(30):
+            yield StreamedFrame(number, number / 100, np.full((6, 3), 0.1 * number), np.arange(6))
+
+    def close(self):
+        pass
+"""
+
+
+def test_seconds_count_from_the_first_frame(tmp_path, monkeypatch):
+    (tmp_path / "late_source.py").write_text(LATE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("track.live.open_source", functools.partial(open_source, silence=0.1))
+    out = tmp_path / "live.npz"
+    options = ["--size", "M", "--seconds", "0.5", "--out", str(out)]
+    assert main(["track", "--live", "late_source:Late", *options]) == 0
+    assert load_take(out).num_frames == 30, "not from the first silence"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

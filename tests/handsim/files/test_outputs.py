@@ -25,6 +25,17 @@ def test_an_input_is_refused_by_every_name(tmp_path, monkeypatch):
     check_outputs([source, "dense19"], [tmp_path / "same.c3d", tmp_path / "new.c3d", None])
 
 
+def test_an_output_below_a_file_is_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "take.c3d").write_text("x")
+    for name in ("take.c3d/x.npz", "take.c3d/folder/x.npz", str(tmp_path / "take.c3d" / "x.npz")):
+        with pytest.raises(
+            ArgumentError, match=r"x\.npz lies in take\.c3d, which is a file, expected a folder"
+        ):
+            check_outputs([], [tmp_path / name])
+    check_outputs([], [tmp_path / "new" / "folder" / "x.npz"])
+
+
 def test_commands_refuse_it(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "take.c3d").write_text("x")

@@ -122,7 +122,9 @@ def test_the_page_is_whole_and_leads_to_the_frames_to_look_at(take, tmp_path):
     assert (
         f"<td>20 to 29</td><td>{take.times[20]:.3f}</td><td>{take.times[29]:.3f}</td><td>{side}</td>" in page
     )
-    assert f"<td>frame 20, {take.times[20]:.3f} s</td><td>handsim view &#x27;my take.npz&#x27;</td>" in page
+    assert (
+        f"<td>frame 20, {take.times[20]:.3f} s</td><td>handsim view &#x27;my take.npz&#x27; --time " in page
+    )
     assert "Capture &lt;b&gt;.c3d, glove dense19, hands right and left" in page
     assert "size measured in the capture, 180 x 80 mm; 60 frames, 0.5 s at 120 Hz" in page
     assert "are not calibrated" in page and "handsim calibrate minute.c3d" in page

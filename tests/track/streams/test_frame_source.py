@@ -251,7 +251,9 @@ def test_a_reader_that_was_held_up_catches_up_without_a_loss(monkeypatch):
 
 def test_a_lag_may_be_forgiven():
     now = time.monotonic()
-    with LiveStream(Arriving([frame(n, arrived=now - 1.0 + n / 100) for n in range(100)], ends=False)) as stream:
+    with LiveStream(
+        Arriving([frame(n, arrived=now - 1.0 + n / 100) for n in range(100)], ends=False)
+    ) as stream:
         stream.forgive()
         assert [next(stream).number for _ in range(3)] == [0, 1, 2]
         assert stream.counts["dropped_frames"] == 0
@@ -259,6 +261,8 @@ def test_a_lag_may_be_forgiven():
 
 def test_more_than_two_seconds_are_not_forgiven():
     now = time.monotonic()
-    with LiveStream(Arriving([frame(n, arrived=now - 5.0 + n / 100) for n in range(500)], ends=False)) as stream:
+    with LiveStream(
+        Arriving([frame(n, arrived=now - 5.0 + n / 100) for n in range(500)], ends=False)
+    ) as stream:
         stream.forgive()
         assert next(stream).number == stream.counts["dropped_frames"] >= 295

@@ -162,3 +162,15 @@ def test_the_size_of_the_hand_under_a_layout_is_chosen(tmp_path, server, page_of
     open_content(str(tmp_path / "glove.toml"), size="XL").show(server)
     vertices = page_of(server).nodes["/hand"]["vertices"].reshape(-1, 3)
     np.testing.assert_allclose(vertices, HandModel.named("XL").surface.vertices, atol=1e-6)
+
+
+def test_a_take_opens_at_a_time(files, server, page_of):
+    content = open_content(str(files["take"]), time=0.1)
+    content.show(server)(lambda: True)
+    (slider,) = [one for one in page_of(server).panel.values() if one.get("label") == "frame"]
+    times = content.recording.times
+    assert slider["value"] == np.abs(times - 0.1).argmin() > 0
+    with pytest.raises(ArgumentError, match=r"--time is 99 s, but .*a\.npz lasts from 0 to 0\.\d+ s"):
+        open_content(str(files["take"]), time=99.0)
+    with pytest.raises(ArgumentError, match="--time is 1, but sparse13 is a layout: nothing in it moves"):
+        open_content("sparse13", time=1.0)

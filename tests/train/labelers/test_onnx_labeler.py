@@ -86,13 +86,14 @@ def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exp
         "onnxruntime",
         "scipy",
     }
-    assert all(one.end_lineno - one.lineno < 40 for one in nodes if isinstance(one, ast.FunctionDef))
+    (function,) = [one for one in nodes if isinstance(one, ast.FunctionDef) and one.name == "label"]
+    assert function.end_lineno - function.lineno < 40
     page = {}
     exec(program, page)
-    labeler, clouds, rng = page["open_labeler"](str(exported)), [], np.random.default_rng(8)
+    labeler, clouds, rng = page["open_labeler"](str(exported)), [], np.random.default_rng(3)
     for size, side in itertools.product(("XS", "S", "M", "L", "XL"), ("right", "left")):
         model = HandModel.named(size, side=side)
-        markers, _ = attach("dense19", model).markers(sample_poses(model, 40, rng=rng))
+        markers, _ = attach("dense19", model).markers(sample_poses(model, 100, rng=rng))
         cloud = corrupt(markers, Corruption(occlude=5, ghosts=2), rng=rng)
         clouds += [points[there] for points, there in zip(cloud.points, cloud.present, strict=True)]
     expected = load_labeler("dense19").label_frames(clouds)
@@ -100,7 +101,7 @@ def test_the_program_of_the_page_labels_as_handsim_does_and_needs_no_handsim(exp
         np.array_equal(page["label"](cloud, *labeler), one.labels)
         for cloud, one in zip(clouds, expected, strict=True)
     ]
-    assert len(same) == 400 and np.mean(same) >= 0.999
+    assert len(same) == 1000 and np.mean(same) >= 0.999
 
 
 def test_damaged_files_are_told(exported, tmp_path):
@@ -180,7 +181,14 @@ def test_the_file_tells_what_goes_in_and_out(exported):
     model = onnx.load(str(exported))
     told = {entry.key: entry.value for entry in model.metadata_props}
     ends = [*model.graph.input, *model.graph.output]
-    assert [end.name for end in ends] == ["points", "present", "point_scores", "label_scores"]
+    assert [end.name for end in ends] == [
+        "points",
+        "present",
+        "point_scores",
+        "label_scores",
+        "pairs",
+        "costs",
+    ]
     for end in ends:
         assert told[f"handsim.{end.name}"] == end.doc_string != ""
     assert "meters" in told["handsim.points"]
