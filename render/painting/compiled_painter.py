@@ -74,7 +74,7 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     with np.errstate(invalid="ignore"):  # NaN behind the camera
         inside = np.abs(corners[:, :2] - 0.5 * sides) < (0.5 + _SHADED_AROUND) * sides
     points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
-    shadows = shadow_map(points, casting, lamps[0, :3], inside.all(axis=1))
+    shadows = shadow_map(points, casting, lamps[0, :3], inside[:, 0] & inside[:, 1])
     sums = np.zeros((height, width, 4), dtype=np.float32)
     covered = _covered(first)
     for mesh in meshes:
