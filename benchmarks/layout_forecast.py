@@ -1,10 +1,11 @@
-"""What `handsim glove score` says of layouts, beside labelers that are trained on them and solved poses.
+"""What `handsim glove score` says of layouts, beside captures that are labeled and tracked afterwards.
 
-Twelve layouts of 6 to 30 markers: the shipped ones, even and crowded random ones, and one without thumb and
-palm, whose fingers look alike. Each gets a training set and a labeler of its own; forecast and measurement
-use other people, poses and losses. Layouts that are finished stay in the folder; run again to continue.
+Twelve layouts of 6 to 30 markers: symmetric, sparse, on the palm's side, without thumb, in clusters, and
+shipped ones. Forecast and outcome have other people and motions. With --labelers each layout also gets a
+training set and a labeler of its own, and its joints are solved. Layouts that are finished stay in the
+folder; run again to continue.
 
-python -m benchmarks.layout_forecast FOLDER [--frames 60000] [--samples 300000]
+python -m benchmarks.layout_forecast FOLDER [--labelers] [--frames 60000] [--samples 300000]
 """
 
 from __future__ import annotations
@@ -28,9 +29,12 @@ from handsim.space.cameras import load_rig
 from track.glove_advice.joint_spread import NOISE
 from track.glove_advice.layout_score import LayoutScore, score_layout
 from track.glove_advice.observed_hands import ObservedHand, observe_poses
+from track.glove_advice.trials import FRAMES, METHODS, WORK, try_layout
 from track.kinematics.pose_solver import PoseSolver
 from train.any_layout.fine_tuning import fine_tuned_labeler
+from train.any_layout.learned_gloves import learned_labeler
 from train.glove_labeler import load_labeler
+from train.labelers.protocol import Labeler
 
 SCORED_FRAMES = 1500  # as `handsim glove score`
 MEASURED_FRAMES = 3000
@@ -41,18 +45,69 @@ Figures = dict[str, Any]
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path, help="training sets, runs and results")
+    parser.add_argument("--labelers", action="store_true", help="train a labeler of each layout, too")
     parser.add_argument("--frames", type=int, default=60_000, help="of each training set")
     parser.add_argument("--samples", type=int, default=300_000, help="of each training: minutes on one core")
     options = parser.parse_args()
     print(describe("torch", "numpy"))
+    compare_captures(options.folder)
+    if options.labelers:
+        compare_labelers(options.folder, options.frames, options.samples)
+
+
+def compare_captures(folder: Path) -> None:
+    """Print what the score says of captures and what becomes of others, and how alike their ranks are."""
+    told, found, listed = [], [], 0
+    for layout in chosen_layouts():
+        path = folder / layout.name
+        path.mkdir(parents=True, exist_ok=True)
+        labeler = learned_labeler(layout)
+        told.append(stored(path / "told.json", lambda: trial_figures(layout, labeler, 0, FRAMES)))  # noqa: B023
+        found.append(stored(path / "found.json", lambda: trial_figures(layout, labeler, 50, 600)))  # noqa: B023
+        for work, shares in told[-1].items():
+            pairs = ", ".join(
+                f"{method} {100 * share:.2f} / {100 * found[-1][work]['share'][method]:.2f}"
+                for method, share in shares["share"].items()
+            )
+            joints = f"{shares['joints']:.1f} / {found[-1][work]['joints']:.1f} deg"
+            print(
+                f"{layout.name}, {work}: forecast / outcome {pairs}; joints {joints}, size off "
+                f"{found[-1][work]['size']:.1f} mm",
+                flush=True,
+            )
+        worst = int(np.argmin(told[-1]["two touching"]["right"]))
+        listed += worst in np.argsort(found[-1]["two touching"]["right"])[:3]
+    for work in WORK:
+        for method in METHODS:
+            pairs = [[one[work]["share"][method] for one in rows] for rows in (told, found)]
+            print(f"{work}, {method}: rank correlation {spearmanr(*pairs).statistic:.3f}")
+    print(f"worst marker of touching hands among the worst three: {listed} of {len(told)}")
+
+
+def trial_figures(layout: MarkerLayout, labeler: Labeler, first: int, frames: int) -> Figures:
+    """What became of captures of a layout, by kind of work."""
+    trials = try_layout(layout, "figure5", labeler, first=first, frames=frames)
+    return {
+        work: {
+            "share": {method: one.share(method) for method in METHODS},
+            "right": one.right.tolist(),
+            "joints": float(np.rad2deg(np.sqrt(np.mean(one.joints**2)))),
+            "size": 1e3 * one.size_error,
+        }
+        for work, one in trials.items()
+    }
+
+
+def compare_labelers(parent: Path, frames: int, samples: int) -> None:
+    """Print what the score says of single frames and what a labeler of the layout does."""
     found = []
     for layout in chosen_layouts():
-        folder = options.folder / layout.name
+        folder = parent / layout.name
         folder.mkdir(parents=True, exist_ok=True)
         told = stored(folder / "forecast.json", lambda layout=layout: forecast(layout))
         measured = stored(
             folder / "measured.json",
-            lambda layout=layout, folder=folder: measure(layout, folder, options.frames, options.samples),
+            lambda layout=layout, folder=folder: measure(layout, folder, frames, samples),
         )
         found.append((told, measured))
         print_layout(layout, told, measured)

@@ -1,7 +1,7 @@
 """How well `handsim rig score` forecasts what simulated captures miss: rank correlation over rigs.
 
 Eight rigs, shipped, planned and bad ones, of 3 to 16 cameras. The captures have other people and motions than
-the forecast, with the forecast's well-kept optical system and with the losses fitted to each kind of capture.
+the forecast, and the losses and reflections that `handsim simulate` has by default for each kind of work.
 
 python -m benchmarks.rig_forecast [--frames 1500] [--folder RIGS]
 
@@ -22,30 +22,24 @@ from gloves.captures.gaps import run_lengths
 from gloves.layout import load_layout
 from handsim.space.camera import look_at
 from handsim.space.cameras import ROOM_CENTER, CameraRig, list_rigs, named_rig
-from train.rig_advice.forecast import ROOM, forecast, light
+from train.rig_advice.forecast import Forecast, forecast, light_work
 from train.rig_advice.plan import plan
 from train.rig_advice.work import sample_work
-from train.simulation.room_settings import OpticsOptions, SimulatedKind
-from train.simulation.takes import TakeConfig, record_config
+from train.simulation.room_settings import SimulatedKind
+from train.simulation.takes import simulate_take
 
 GLOVE = "dense19"
 CAPTURES: tuple[tuple[SimulatedKind, int], ...] = (
     ("real-like", 101),
-    ("free", 102),
+    ("single-hand", 102),
     ("hand-hand", 103),
-    ("hand-controller", 104),
-    ("calibration", 105),
+    ("hand-pen", 104),
+    ("hand-controller", 105),
 )
 CENTER, SIDES = np.array(ROOM_CENTER), np.full(3, 0.6)
 FRAME = np.array([2.4, 1.8, 2.2])
 CAMERA = named_rig("six").cameras[0]
-WELL_KEPT = OpticsOptions(
-    **{
-        name: getattr(ROOM.optics, name)
-        for name in ("blob_loss", "dropout", "dropout_length", "dropout_cameras", "min_rays_to_start")
-    }
-)
-FIGURES = ("missing [%]", "gaps [1/marker/min]", "median length [frames]")
+FIGURES = ("missing [%]", "gaps [1/marker/min]", "ghosts [1/frame]")
 
 
 def main() -> None:
@@ -63,25 +57,31 @@ def main() -> None:
 
 
 def compare(folder: Path, frames: int) -> None:
-    """Print the forecast and the captures of every rig, and how alike their ranks are."""
+    """Print the forecast and the captures of every rig by kind of work, and how alike their ranks are."""
     work = sample_work(load_layout(GLOVE), CENTER, SIDES, 900, 2, rng=np.random.default_rng(0))
-    scenes = [one for part in work.values() for one in part]
-    table = []
+    told, found = [], []
     for rig in rigs():
         path = folder / f"{rig.name}.toml"
         rig.save(path)
-        told = forecast(light(scenes, rig, rng=np.random.default_rng(0)), rig)
-        expected = (100 * told.missing, told.gaps, 120 * told.gap_median)
-        kept = captured(path, frames, WELL_KEPT)
-        fitted = captured(path, frames, OpticsOptions())
-        table.append((expected, kept, fitted))
-        print(f"{rig.name} ({len(rig.positions)} cameras): {', '.join(FIGURES)}", flush=True)
-        for title, figures in (("forecast", expected), ("well-kept", kept), ("as fitted", fitted)):
-            print(f"  {title:10s} " + "  ".join(f"{one:7.1f}" for one in figures), flush=True)
-    for column, title in ((1, "well-kept"), (2, "as fitted")):
-        for number, figure in enumerate(FIGURES):
-            rank = spearmanr([row[0][number] for row in table], [row[column][number] for row in table])
-            print(f"rank correlation, captures {title}, {figure}: {rank.statistic:.3f}")
+        lit = light_work(work, rig, rng=np.random.default_rng(0))
+        told.append([figures_of(forecast(lit[kind], rig)) for kind, _ in CAPTURES])
+        found.append([captured(path, frames, kind, seed) for kind, seed in CAPTURES])
+        print(f"{rig.name} ({len(rig.positions)} cameras), forecast / captured: {', '.join(FIGURES)}")
+        for (kind, _), expected, seen in zip(CAPTURES, told[-1], found[-1], strict=True):
+            pairs = "  ".join(f"{one:7.1f} /{other:7.1f}" for one, other in zip(expected, seen, strict=True))
+            print(f"  {kind:16s} {pairs}", flush=True)
+    for number, figure in enumerate(FIGURES):
+        ranks = [
+            spearmanr(np.array(told)[:, kind, number], np.array(found)[:, kind, number]).statistic
+            for kind in range(len(CAPTURES))
+        ]
+        listed = ", ".join(f"{kind} {rank:.2f}" for (kind, _), rank in zip(CAPTURES, ranks, strict=True))
+        print(f"rank correlation over the rigs, {figure}: {listed}")
+
+
+def figures_of(one: Forecast) -> tuple[float, float, float]:
+    """The figures that are compared."""
+    return 100 * one.missing, one.gaps, one.ghosts
 
 
 def rigs() -> list[CameraRig]:
@@ -100,18 +100,13 @@ def rigs() -> list[CameraRig]:
     ]
 
 
-def captured(rig: Path, frames: int, optics: OpticsOptions) -> tuple[float, float, float]:
-    """What simulated captures miss: share of marker-frames [%], gaps per marker-minute, median length."""
-    missing, lengths, total = 0, [], 0
-    for kind, seed in CAPTURES:
-        take = record_config(TakeConfig(kind, frames, GLOVE, str(rig), seed, optics))
-        present = take.markers_present()[:, : take.hand_labels[-1].stop]
-        missing += int((~present).sum())
-        total += present.size
-        lengths.append(run_lengths(~present))
-    gaps = np.concatenate(lengths)
-    median = float(np.median(gaps)) if len(gaps) else 0.0
-    return 100 * missing / total, len(gaps) / (total / 120.0 / 60.0), median
+def captured(rig: Path, frames: int, kind: SimulatedKind, seed: int) -> tuple[float, float, float]:
+    """What a simulated capture misses: share of marker-frames [%], gaps per marker-minute, ghosts a frame."""
+    take = simulate_take(kind, glove=GLOVE, num_frames=frames, rig=rig, seed=seed)
+    present = take.markers_present()[:, : take.hand_labels[-1].stop]
+    ghosts = np.isfinite(take.points[..., 0]) & (take.labels < 0)
+    minutes = present.size / take.rate / 60.0
+    return 100 * (~present).mean(), len(run_lengths(~present)) / minutes, ghosts.sum(axis=1).mean()
 
 
 if __name__ == "__main__":

@@ -101,15 +101,22 @@ class MarkerPlace:
         if self.bone not in BONE_NAMES:
             raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
         degrees = math.degrees(self.around)
-        for key, value, (low, high), unit in (
-            ("along", self.along, ALONG_RANGE, ""),
-            ("around", round(degrees, 9), _AROUND_RANGE, " degrees"),
-            ("across", self.across, ACROSS_RANGE, ""),
-            ("height_mm", round(1e3 * self.height, 9), (0.0, 1e3 * HEIGHT_RANGE[1]), " millimeters"),
+        for key, value, (low, high), unit, given in (
+            ("along", self.along, ALONG_RANGE, "", ""),
+            ("around", round(degrees, 9), _AROUND_RANGE, " degrees", f" ({self.around:g} rad)"),
+            ("across", self.across, ACROSS_RANGE, "", ""),
+            (
+                "height",
+                round(1e3 * self.height, 9),
+                (0.0, 1e3 * HEIGHT_RANGE[1]),
+                " mm",
+                f" ({self.height:g} m)",
+            ),
         ):
             if not low <= value <= high:
                 raise LayoutError(
-                    f"marker '{self.name}': {key} is {value:g}, expected {low:g} to {high:g}{unit}"
+                    f"marker '{self.name}': {key} is {value:g}{unit}{given}, "
+                    f"expected {low:g} to {high:g}{unit}"
                 )
         if self.across != 0.0 and self.bone != BONES[PALM].name:
             raise LayoutError(
@@ -154,7 +161,8 @@ class MarkerLayout:
         low, high = _RADIUS_RANGE
         if not low <= self.radius <= high:
             raise LayoutError(
-                f"radius_mm is {self.radius * 1e3:g}, expected {low * 1e3:g} to {high * 1e3:g} millimeters"
+                f"radius is {self.radius * 1e3:g} mm ({self.radius:g} m), expected {low * 1e3:g} to "
+                f"{high * 1e3:g} mm"
             )
 
         for side in self.sides:

@@ -24,6 +24,7 @@ from track.both_directions import label_both_ways
 from track.calibration.hand_size import sample_frames
 from track.config import BOTH
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of
+from track.hand_check import check_hands
 from track.setup import AnyHands, choose_user, found_user
 from track.streams.frame_source import StreamedFrame, checked_frames
 from train.glove_labeler import load_labeler
@@ -70,8 +71,10 @@ def label_capture(
     frames = checked_frames(source)
     worn = [side for side in BOTH if side in layout.sides]
     user, is_measured = choose_user(layout, worn if hands is None else hands, "auto")
+    sample = sample_frames(frames)
     if is_measured:
-        user = found_user(sample_frames(frames), layout, user.sides, network) or user
+        user = found_user(sample, layout, user.sides, network) or user
+    check_hands(sample, user, network)
     told = (lambda count: None) if progress is None else (lambda count: progress(count, len(frames)))
     if _is_continuous(frames):
         found = label_both_ways(frames, user, network, told)

@@ -48,7 +48,7 @@ class TakeRecorder:
 
     def __init__(self, tracker: Tracker) -> None:
         self._hands = tracker.hands
-        self._config = tracker.config
+        self._settings = settings_of(tracker)
         self._bodies = tracker.bodies
         self._rows: list[dict[str, NDArray[Any]]] = []
 
@@ -80,8 +80,13 @@ class TakeRecorder:
         rows = self._rows
         if not rows or (capture is None and len(rows) < 2):
             raise CaptureError(f"{len(rows)} frames came, expected two or more")
-        settings = {"tracker": dataclasses.asdict(self._config)}
-        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=settings)
+        return Take.of_frames(rows, self._hands, self._bodies, capture=capture, settings=self._settings)
+
+
+def settings_of(tracker: Tracker) -> dict[str, Any]:
+    """What a take's settings say of the tracker that made it, as JSON."""
+    known = {"user": tracker.user.notes} if tracker.user.notes else {}
+    return {"glove": tracker.user.layout.name, **known, "tracker": dataclasses.asdict(tracker.config)}
 
 
 def frame_values(frame: StreamedFrame, tracked: TrackedFrame) -> dict[str, NDArray[Any]]:
@@ -133,7 +138,7 @@ class Recorder:
         self.part = growing_path(out)
         """The file of the recording."""
         self._out, self._hands, self._bodies = out, tracker.hands, tracker.bodies
-        self._settings = {"tracker": dataclasses.asdict(tracker.config), **settings}
+        self._settings = {**settings_of(tracker), **settings}
         sizes = {"H": len(self._hands), "B": len(self._bodies)}
         self._archive = GrowingArchive(
             self.part,

@@ -21,9 +21,10 @@ from track.bodies.rigid_body import RigidTemplate
 from track.calibration.hand_size import fit_size, sample_frames
 from track.config import BOTH, Size, TrackerConfig
 from track.given import AnyCapture, AnyGlove, AnyLabeler, capture_of, designed_glove
+from track.hand_check import check_hands
 from track.streams.frame_source import StreamedFrame, checked_frames
 from track.tracker import Tracker
-from track.user import User, checked_sides, load_user, nominal_user
+from track.user import User, as_user, checked_sides, nominal_user
 from train.glove_labeler import load_labeler
 from train.labelers.protocol import Labeler
 
@@ -85,10 +86,16 @@ class TrackerSetup:
         return _SHOWN * self.user.layout.num_markers
 
     def measured(self, frames: Sequence[StreamedFrame]) -> TrackerSetup:
-        """The setup with the hands as measured in some frames, if they are to be measured."""
+        """The setup with the hands as measured in some frames, if they are to be measured.
+
+        Raises:
+            ArgumentError: See `check_hands`, which warns of hands that do not fit.
+        """
         if not self.is_measured:
+            check_hands(frames, self.user, self.labeler)
             return self
         user = measured_user(frames, self.user.layout, self.user.sides, self.labeler)
+        check_hands(frames, user, self.labeler)
         settings = {**self.settings, "user": user.notes}
         return dataclasses.replace(self, user=user, is_measured=False, settings=settings)
 
@@ -199,17 +206,14 @@ def choose_user(glove: AnyGlove | None, hands: AnyHands, size: Size) -> tuple[Us
     check_type("hands", hands, (Sequence, Path), _HANDS)
     if isinstance(hands, str) and hands in SIDES:
         hands = (hands,)
-    if isinstance(hands, str | Path):
-        known = dataclasses.replace(load_user(hands), notes=Path(hands).name)
-        return _in_glove(known, glove, size), False
-    if isinstance(hands, User):
-        return _in_glove(hands, glove, size), False
+    if isinstance(hands, str | Path | User):
+        return _in_glove(as_user(hands), glove, size), False
     for hand in hands:
         check_type("one of hands", hand, (GloveFit, str), _HANDS)
     sides = [hand for hand in hands if not isinstance(hand, GloveFit)]
     if not sides and hands:
-        fits = tuple(hand for hand in hands if isinstance(hand, GloveFit))
-        return _in_glove(User(fits), glove, size), False
+        fits = [hand for hand in hands if isinstance(hand, GloveFit)]
+        return _in_glove(as_user(fits), glove, size), False
     layout = load_layout(USUAL_GLOVE if glove is None else glove)
     return nominal_user(layout, USUAL_SIZE if size == "auto" else size, sides), size == "auto"
 

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from gloves.captures.plausibility import AT_ORIGIN, all_at_origin, unit_fault
 from gloves.takes.take import COASTING, LOST, STATUSES, Take
 from handsim.hand.topology import Side
+from track.association.point_groups import distances_to_nearest
 
 _LEAST_SEEN: Final = 0.1  # share of the frames that a hand should have a pose in
 _MOST_FILLED: Final = 0.35  # share of a hand's markers; two hands that hide each other reach 0.31
 _MOST_RMS: Final = 0.005  # [m]; hands of the nearest size reach 0.004
-_MOST_UNLABELED: Final = 0.25  # share of the points
+_MOST_UNLABELED: Final = 0.25  # share of the points at the hands
+_AT_HAND: Final = 0.04  # [m] from the markers of a hand
 _CERTAIN: Final = 0.95  # confidence of every label of a frame that needs no look
 _MOST_DOUBTS: Final = 12  # rows of a list that is read at a glance
 
@@ -49,15 +51,18 @@ def summarize(take: Take) -> list[str]:
             missing = take.filled(side)[status != LOST].mean()
             line += f"; {', '.join([*_median_rms(rms), f'{100 * missing:.1f} % of markers filled in'])}"
         else:
-            line += "; it was never found; --hands selects the hands"
+            line = f"{side} hand: not there"
         lines.append(line)
     for number, body in enumerate(take.bodies):
         status, rms = take.body_status[:, number], take.body_rms[:, number]
         never = [] if (status != LOST).any() else ["it was never found: are these its markers?"]
         lines.append("; ".join([f"{body.name}: {_status_shares(status)}", *_median_rms(rms), *never]))
-    there = np.isfinite(take.points[..., 0])
-    unlabeled = int((there & (take.labels < 0)).sum())
-    return [*lines, f"{unlabeled} of {int(there.sum())} points are not markers"]
+    there, foreign = np.isfinite(take.points[..., 0]), _unlabeled(take)
+    near = int(_at_hands(take, foreign).sum())
+    return [
+        *lines,
+        f"{int(foreign.sum())} of {int(there.sum())} points are not markers, {near} of them at the hands",
+    ]
 
 
 def no_points(take: Take) -> str:
@@ -77,13 +82,32 @@ def suspicions(take: Take) -> list[str]:
     if fault is not None:
         return [f"{fault.found}, expected meters; set the unit of the stream to meters{fault.hint}"]
     found = [sentence for side in take.sides for sentence in _suspicions_of(take, side)]
-    unlabeled = float((take.labels[there] < 0).mean())
-    if unlabeled > _MOST_UNLABELED:
+    near = int(_at_hands(take, _unlabeled(take)).sum())
+    share = near / max(1, near + int((take.labels >= 0).sum()))
+    if share > _MOST_UNLABELED:
         found.append(
-            f"{100 * unlabeled:.1f} % of the points are not markers of what was tracked; name the glove worn "
-            "(--glove), the hands (--hands) and the rigid bodies (--body) that are in the capture"
+            f"{100 * share:.1f} % of the points at the hands are not markers of what was tracked; name the "
+            "glove worn (--glove), the hands (--hands) and the rigid bodies (--body) that are in the capture"
         )
     return found
+
+
+def _unlabeled(take: Take) -> Bool[np.ndarray, "T N"]:
+    """Which points have no label."""
+    unlabeled: Bool[np.ndarray, "T N"] = np.isfinite(take.points[..., 0]) & (take.labels < 0)
+    return unlabeled
+
+
+def _at_hands(take: Take, which: Bool[np.ndarray, "T N"]) -> Bool[np.ndarray, "T N"]:
+    """Those of some points that are at a hand; markers of others that are elsewhere tell of no mistake."""
+    markers = np.concatenate([take.markers(side) for side in take.sides], axis=1)
+    near = np.zeros_like(which)
+    for frame in np.flatnonzero(which.any(axis=1)):
+        seen = markers[frame, np.isfinite(markers[frame, :, 0])]
+        if len(seen):
+            columns = np.flatnonzero(which[frame])
+            near[frame, columns] = distances_to_nearest(take.points[frame, columns], seen) < _AT_HAND
+    return near
 
 
 def _suspicions_of(take: Take, side: Side) -> list[str]:
@@ -91,10 +115,11 @@ def _suspicions_of(take: Take, side: Side) -> list[str]:
     hand = take.hand(side)
     shown = take.status[:, hand] != LOST
     if shown.mean() < _LEAST_SEEN:
-        others = [f" (--hands {other})" for other in take.sides if other != side]
+        if ((take.status != LOST).mean(axis=0) >= _LEAST_SEEN).any():
+            return []  # one hand is there, the other one is not
         return [
             f"the {side} hand was seen in {100 * shown.mean():.1f} % of the frames; name the glove worn "
-            f"(--glove), or track the other hand alone{''.join(others)}"
+            "(--glove) and the hands (--hands)"
         ]
     found = []
     filled, rms = float(take.filled(side)[shown].mean()), float(np.nanmedian(take.rms[:, hand]))

@@ -8,6 +8,7 @@ the labeler. A frame goes one way, as a `FrameState` that every step replaces by
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from time import perf_counter
 from typing import Final, NamedTuple
 
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from gloves.fit import GloveFit
 from handsim._checks import check_type
-from handsim.errors import ArgumentError
 from handsim.hand.topology import NUM_QPOS
 from handsim.space.transforms import rotation_quaternions
 from track.association.candidates import SETTLED_EVIDENCE
@@ -33,6 +33,7 @@ from track.config import TrackerConfig
 from track.given import AnyLabeler, designed_glove
 from track.intake import IncomingFrame, Intake
 from track.tracked_frame import Status, TrackedBody, TrackedFrame, TrackedHand
+from track.user import User, as_user
 from train.glove_labeler import load_labeler
 
 _EVIDENCE_PER_FRAME: Final = 2.0  # of a label (log-odds), less half its point's squared Mahalanobis distance
@@ -59,7 +60,7 @@ class Tracker:
     """Tracks the user's hands, and bodies with markers of their own, from frame to frame.
 
     Args:
-        hands: The user's hands, each side at most once, or a `User`.
+        hands: The user's hands, each side at most once; a `User`, or the path of a user's file.
         labeler: Labels the markers of the hands' glove; or its name or path for `train.load_labeler`. That of
             the glove when not given.
         bodies: Rigid bodies beside the hands.
@@ -67,18 +68,20 @@ class Tracker:
 
     Raises:
         ArgumentError: An argument is of another type, or two hands are of one side.
+        UserError: The user's file cannot be read.
         WeightsError: There is no labeler of that name, or it knows other markers.
     """
 
     def __init__(
         self,
-        hands: Sequence[GloveFit],
+        hands: User | Sequence[GloveFit] | str | Path,
         labeler: AnyLabeler = None,
         bodies: Sequence[RigidTemplate] = (),
         config: TrackerConfig = TrackerConfig(),  # noqa: B008 (frozen)
     ) -> None:
         check_type("config", config, TrackerConfig, "a TrackerConfig")
-        self.hands = _checked_hands(hands)
+        self.user = as_user(hands)
+        self.hands = self.user.hands
         self.bodies = tuple(bodies)
         self.config = config
         asked = load_labeler(designed_glove(self.hands[0].layout), labeler)
@@ -303,21 +306,6 @@ class Tracker:
         started = _Outcome(Status.INITIALIZED, state.rms_without_bias(estimate))
         others = outcomes[: found.index], outcomes[found.index + 1 :]
         return frame.with_markers(found.index, markers), (*others[0], started, *others[1])
-
-
-def _checked_hands(hands: Sequence[GloveFit]) -> tuple[GloveFit, ...]:
-    """The hands of a sequence or a user.
-
-    Raises:
-        ArgumentError: It is something else or empty, or two are of one side.
-    """
-    check_type("hands", hands, Sequence, "a User, or hands in their gloves (GloveFit)")
-    for hand in hands:
-        check_type("a hand", hand, GloveFit, "one in its glove (GloveFit)")
-    sides = [hand.side for hand in hands]
-    if not sides or len(set(sides)) < len(sides):
-        raise ArgumentError(f"hands are {sides}, expected a left hand, a right hand, or one of each")
-    return tuple(hands)
 
 
 def _tracked_hand(

@@ -181,6 +181,19 @@ def checked_sides(sides: str | Sequence[str]) -> tuple[Side, ...]:
     return cast("tuple[Side, ...]", sides)
 
 
+def as_user(hands: User | Sequence[GloveFit] | str | Path) -> User:
+    """The user of hands, of a user's file, or one that is given.
+
+    Raises:
+        ArgumentError: It is of another type, or the hands are no user's.
+        UserError: The file cannot be read.
+    """
+    if isinstance(hands, str | Path):
+        return dataclasses.replace(load_user(hands), notes=Path(hands).name)
+    check_type("hands", hands, Sequence, "a User, hands in their gloves (GloveFit), or a user's file")
+    return hands if isinstance(hands, User) else User(tuple(hands))
+
+
 def load_user(path: str | Path) -> User:
     """Hands and gloves of a user, from the JSON file that `handsim calibrate` or `User.save` wrote.
 

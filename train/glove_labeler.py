@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import warnings
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +15,7 @@ from train.labelers.storage import load_stored_labeler, shipped_labelers
 
 ANY_LAYOUT: Final = "any-layout"
 """Name of the labeler that needs no training."""
+_FEW_POSES: Final = 6000  # from which a layout is known that nobody asked for
 _EXPECTED: Final = (
     "a MarkerLayout, the name or path of one, a Labeler, the folder of a trained one, an .onnx file, or "
     "module:name"
@@ -60,6 +62,24 @@ def load_labeler(
             f"{', '.join(layout.names)}"
         )
     return found
+
+
+@functools.lru_cache(maxsize=32)
+def labeler_at_once(layout: MarkerLayout) -> Labeler:
+    """A labeler of a glove without a minute of learning: good enough to tell which glove is worn.
+
+    Raises:
+        LayoutError: A marker misses the skin.
+    """
+    for name in shipped_labelers():
+        if load_layout(name) == layout:
+            return load_stored_labeler(name)
+    from train.any_layout.layout_labeler import LayoutLabeler  # torch
+    from train.any_layout.learned_gloves import is_learned, learned_labeler
+
+    return (
+        learned_labeler(layout) if is_learned(layout) else LayoutLabeler.at_once(layout, num_poses=_FEW_POSES)
+    )
 
 
 def _is_layout(glove: Any) -> bool:

@@ -116,7 +116,12 @@ def write_capture(path: str | Path, capture: Capture, *, title: str | None = Non
         CaptureError: The suffix is unknown, a name cannot be written to the file, or writing fails.
     """
     check_type("path", path, (str, Path), "the path of a file", WRITABLE)
-    check_type("capture", capture, Capture, "a Capture, as read_capture gives it")
+    check_type(
+        "capture",
+        capture,
+        Capture,
+        "a Capture, as read_capture, Take.capture() or Take.labeled_capture() give it",
+    )
     path = Path(path)
     check_suffix(path, WRITABLE)
     for name in capture.names:

@@ -119,6 +119,8 @@ def _read_cut_off(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 
 def _damaged(path: Path) -> str:
+    if path.suffix.lower() != ".npz":
+        return f"{path}: not a take (.npz); handsim track makes one of a capture"
     return f"{path}: not a take, or a damaged one"
 
 

@@ -130,6 +130,14 @@ class Take:
     numbers: Int[np.ndarray, "T"] | None = None
     """The server's number of each frame of a stream, which shows where frames are missing; None otherwise."""
 
+    def __repr__(self) -> str:
+        """What the take holds, without its arrays."""
+        bodies = "".join(f", {body.name}" for body in self.bodies)
+        return (
+            f"Take({self.num_frames} frames at {self.rate:g} Hz of {', '.join(self.sides)}{bodies}; "
+            f"{self.points.shape[1]} columns of points)"
+        )
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "hands", tuple(self.hands))
         object.__setattr__(self, "bodies", tuple(self.bodies))

@@ -18,7 +18,7 @@ from handsim._checks import check_type
 from handsim.errors import ArgumentError, HandSimError, RigError, choices
 from handsim.files.atomic import atomic_write
 from handsim.space.camera import Camera, CameraArrays, camera_arrays, camera_from_record, points_in_view
-from handsim.space.rig_file import check_near, read_rig_file, rig_lines
+from handsim.space.rig_file import check_names, check_near, read_rig_file, rig_lines
 
 FEWEST_CAMERAS: Final = 2
 MAX_CAMERAS: Final = 32
@@ -39,7 +39,7 @@ class CameraRig:
 
     Raises:
         ArgumentError: What is given are no cameras.
-        RigError: Too few or too many cameras, two at one position, or one beyond 50 m.
+        RigError: Too few or too many cameras, two of one name or at one position, or one beyond 50 m.
     """
 
     name: str
@@ -58,6 +58,7 @@ class CameraRig:
                 f"rig '{self.name}' has {len(self.cameras)} cameras, "
                 f"expected {FEWEST_CAMERAS} to {MAX_CAMERAS}"
             )
+        check_names(f"rig '{self.name}'", self.cameras)
         for number, camera in enumerate(self.cameras, 1):
             check_near(f"camera {number} of rig '{self.name}'", camera)
         _check_apart(self.name, self.positions)

@@ -74,19 +74,29 @@ def checked_cameras(path: Path, cameras: Sequence[Camera]) -> tuple[Camera, ...]
     """
     if not 1 <= len(cameras) <= _MOST:
         raise RigError(f"{path}: {len(cameras)} cameras, expected 1 to {_MOST}")
-    names = [camera.name for camera in cameras]
+    check_names(str(path), cameras)
     for camera in cameras:
         if not _NAME.fullmatch(camera.name):
             raise RigError(
                 f"{path}: a camera is called {shown(camera.name)}, expected up to 64 letters, digits, - and _"
             )
-        if names.count(camera.name) > 1:
-            raise RigError(f"{path}: two cameras are called '{camera.name}', expected different names")
         try:
             check_near(f"camera '{camera.name}'", camera)
         except RigError as error:
             raise RigError(f"{path}: {error}") from error
     return tuple(cameras)
+
+
+def check_names(owner: str, cameras: Sequence[Camera]) -> None:
+    """Refuse two cameras of one name.
+
+    Raises:
+        RigError: There are such.
+    """
+    names = [camera.name for camera in cameras]
+    for name in names:
+        if names.count(name) > 1:
+            raise RigError(f"{owner}: two cameras are called '{name}', expected different names")
 
 
 def check_near(owner: str, camera: Camera) -> None:

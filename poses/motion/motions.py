@@ -64,7 +64,7 @@ def sample_motion(
 
 
 def motion_through(
-    model: HandModel,
+    model: HandModel | HandShape | str,
     poses: Float[np.ndarray, "K 20"],
     config: MotionConfig | None = None,
     *,
@@ -76,7 +76,7 @@ def motion_through(
     random.
 
     Args:
-        model: The hand.
+        model: The hand; a shape or the name of a size is a right one.
         poses: Joint angles [rad], at least two poses.
         config: Speeds and positions; human ones by default.
         rng: Source of all randomness.
@@ -85,6 +85,7 @@ def motion_through(
         ArgumentError: There are fewer than two poses, or one is not valid on this hand.
         PoseError: No path leads out of one.
     """
+    model = load_model(model)
     config = config or MotionConfig()
     poses = check_array("poses", poses, (None, NUM_JOINTS))
     if poses.ndim != 2 or len(poses) < 2:

@@ -14,8 +14,9 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from handsim.errors import ArgumentError, PoseError, choices
-from handsim.hand.model import HandModel
+from handsim.hand.model import HandModel, load_model
 from handsim.hand.motion import HandMotion
+from handsim.hand.shape import HandShape
 from handsim.hand.topology import NUM_JOINTS
 from poses.motion.minimum_jerk import MotionConfig
 from poses.motion.motions import angles_through, count_frames, sample_motion, with_wrist
@@ -42,7 +43,7 @@ def script_names() -> tuple[str, ...]:
 
 
 def scripted_motion(
-    model: HandModel,
+    model: HandModel | HandShape | str,
     script: str,
     duration: float,
     config: MotionConfig | None = None,
@@ -52,7 +53,7 @@ def scripted_motion(
     """Smooth motion of one hand that follows a named script, valid at every frame.
 
     Args:
-        model: The hand.
+        model: The hand; a shape or the name of a size is a right one.
         script: One of `script_names`.
         duration: How long [s]; the motion has `round(duration * rate) + 1` frames.
         config: Speeds and positions; human ones by default. Except for "free",
@@ -63,6 +64,7 @@ def scripted_motion(
         ArgumentError: There is no such script, or the duration is not positive or less than a step.
         PoseError: This hand cannot do what the script asks for.
     """
+    model = load_model(model)
     if script not in _scripts():
         raise ArgumentError(choices(script, _scripts(), noun="script"))
     if script == FREE:

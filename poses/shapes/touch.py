@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from handsim._checks import check_array
 from handsim.errors import ArgumentError, PoseError, choices
 from handsim.hand.capsules import Capsules
-from handsim.hand.model import HandModel, join_qpos
+from handsim.hand.model import HandModel, join_qpos, load_model
+from handsim.hand.shape import HandShape
 from handsim.hand.topology import DIGITS, NUM_JOINTS, bones_of
 from handsim.kernels.kernel import kernel
 from handsim.kernels.segments import segment_distance_squared
@@ -58,17 +59,20 @@ class ThumbContact:
     """Cosine between pad direction and direction to the other bone, for thumb and finger; 1: pad to pad."""
 
 
-def thumb_contact(model: HandModel, angles: Float[np.ndarray, "T 20"], finger: str) -> ThumbContact:
+def thumb_contact(
+    model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"], finger: str
+) -> ThumbContact:
     """The nearest points of thumb and finger, touching or not.
 
     Args:
-        model: The hand.
+        model: The hand; a shape or the name of a size is a right one.
         angles: Joint angles [rad].
         finger: "index", "middle", "ring" or "little".
 
     Raises:
         ArgumentError: There is no such finger, or `angles` is not (T, 20).
     """
+    model = load_model(model)
     if finger not in FINGERS:
         raise ArgumentError(choices(finger, FINGERS, noun="finger"))
     return _contact(model.capsules, model.forward_kinematics(join_qpos(angles)), finger)
@@ -92,7 +96,7 @@ def _contact(capsules: Capsules, frames: NDArray[np.float64], finger: str) -> Th
 
 
 def touching_angles(
-    model: HandModel, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
+    model: HandModel | HandShape | str, finger: str, start: Float[np.ndarray, "*starts 20"] | None = None
 ) -> Float[np.ndarray, "20"]:
     """Joint angles [rad] at which the pads of thumb and finger touch, the rest of the hand as in `start`.
 
@@ -100,7 +104,7 @@ def touching_angles(
     other, and nothing else penetrates deeper than `MAX_PENETRATION`.
 
     Args:
-        model: The hand.
+        model: The hand; a shape or the name of a size is a right one.
         finger: "index", "middle", "ring" or "little".
         start: Where to begin [rad], one pose or several that are tried in turn; the library's pinches of this
             finger, made valid, when not given.
@@ -109,6 +113,7 @@ def touching_angles(
         ArgumentError: There is no such finger.
         PoseError: This hand's thumb was not brought to it.
     """
+    model = load_model(model)
     if finger not in FINGERS:
         raise ArgumentError(choices(finger, FINGERS, noun="finger"))
     if start is None:

@@ -63,7 +63,9 @@ def resting_angles(model: HandModel) -> Float[np.ndarray, "20"]:
     return resting
 
 
-def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.ndarray, "T 20"]:
+def make_valid(
+    model: HandModel | HandShape | str, angles: Float[np.ndarray, "T 20"]
+) -> Float[np.ndarray, "T 20"]:
     """Poses [rad] moved towards rest just until they are valid; valid ones stay as they are.
 
     The thumb alone moves first, then thumb and abductions, and the whole hand opens only where that is not
@@ -71,12 +73,13 @@ def make_valid(model: HandModel, angles: Float[np.ndarray, "T 20"]) -> Float[np.
     fingers touch.
 
     Args:
-        model: The hand.
+        model: The hand; a shape or the name of a size is a right one.
         angles: Joint angles [rad].
 
     Raises:
         PoseError: This hand has no valid pose at rest.
     """
+    model = load_model(model)
     resting = resting_angles(model)
     result = np.array(angles, dtype=np.float64)
     todo = np.flatnonzero(~is_valid(model, result))

@@ -76,8 +76,9 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
     points = np.concatenate([mesh.rows[:, :3] for mesh in meshes])
     shadows = shadow_map(points, casting, lamps[0, :3], inside.all(axis=1))
     sums = np.zeros((height, width, 4), dtype=np.float32)
+    covered = _covered(first)
     for mesh in meshes:
-        spots, pixels, shares = _spots(nearness, first, *mesh, TO_LINEAR)
+        spots, pixels, shares = _spots(nearness, first, covered, *mesh, TO_LINEAR)
         _add_colors(
             spots,
             pixels,
@@ -90,8 +91,17 @@ def paint_compiled(camera: Camera, drawn: Sequence[Drawn], lighting: Lighting) -
             TO_DISPLAY,
             sums,
         )
-    painted: NDArray[np.uint8] = np.rint(63.75 * sums).astype(np.uint8)
+    painted = np.zeros((height, width, 4), dtype=np.uint8)
+    _as_bytes(sums.reshape(-1, 4), covered, painted.reshape(-1, 4))
     return painted
+
+
+@kernel
+def _as_bytes(sums: NDArray[np.float32], covered: NDArray[np.int32], painted: NDArray[np.uint8]) -> None:
+    """Write the bytes of covered pixels (P, 4), of sums over four samples (P, 4)."""
+    for pixel in covered:
+        for channel in range(4):
+            painted[pixel, channel] = int(np.rint(np.float32(63.75) * sums[pixel, channel]))
 
 
 def _meshes(camera: Camera, drawn: Sequence[Drawn]) -> list[_Mesh]:
@@ -126,11 +136,26 @@ def _lamp_table(lighting: Lighting) -> Float[np.ndarray, "L 9"]:
     return np.stack(list(rows.values()))
 
 
+@kernel
+def _covered(first: NDArray[np.int32]) -> Any:
+    """Numbers (N,) of the pixels with a surface in one of their four samples; the nearest face is -1 for none."""
+    height, width = first.shape[0] // 2, first.shape[1] // 2
+    covered, count = np.empty(height * width, np.int32), 0
+    for row in range(height):
+        upper, lower = first[2 * row], first[2 * row + 1]
+        for column in range(width):
+            both = (upper[2 * column] & upper[2 * column + 1]) & (lower[2 * column] & lower[2 * column + 1])
+            covered[count] = row * width + column
+            count += both >= 0  # all bits of -1 are set: only four of them are negative
+    return covered[:count]
+
+
 # Arrays come one by one: those in a tuple are counted at every access, which costs more than the shading.
 @kernel
 def _spots(
     nearness: NDArray[np.float32],
     first: NDArray[np.int32],
+    covered: NDArray[np.int32],
     begin: int,
     faces: NDArray[np.int64],
     corners: NDArray[np.float64],
@@ -144,6 +169,7 @@ def _spots(
     Args:
         nearness: One over the depth (2 H, 2 W) [1/m].
         first: Nearest face of each sample (2 H, 2 W), counted over all surfaces; -1 for none.
+        covered: See `_covered` (N,).
         begin: Number of this surface's first face.
         faces: Triangles (F, 3).
         corners: See `_Mesh.corners` (V, 3).
@@ -152,40 +178,38 @@ def _spots(
         finish: Linear color (3), roughness, glow and scatter (3).
         to_linear: `shading.TO_LINEAR` (256,).
     """
-    height, width = first.shape[0] // 2, first.shape[1] // 2
-    end, most = begin + len(faces), 0
-    for row in range(2 * height):
-        for column in range(2 * width):
-            most += begin <= first[row, column] < end
+    width = first.shape[1] // 2
+    end, most = begin + len(faces), 4 * len(covered)  # what is not used of these arrays takes no memory
     spots = np.empty((most, SPOT), np.float32)
     pixels, shares = np.empty(most, np.int64), np.empty(most, np.float32)
     spot = 0
-    for row in range(height):
-        for column in range(width):
-            count, smooth = _samples(nearness, first, begin, end, row, column)
-            if count == 0:
-                continue
-            for i in range(1 if smooth else 2):
-                for j in range(1 if smooth else 2):
-                    face = first[2 * row + i, 2 * column + j] - begin
-                    if not 0 <= face < len(faces):
-                        continue
-                    x, y = (1.0, 1.0) if smooth else (j + 0.5, i + 0.5)
-                    place = faces[face]
-                    _write_spot(
-                        corners,
-                        rows,
-                        place,
-                        2 * column + x,
-                        2 * row + y,
-                        texels,
-                        finish,
-                        to_linear,
-                        spots,
-                        spot,
-                    )
-                    pixels[spot], shares[spot] = row * width + column, 4.0 if smooth else 1.0
-                    spot += 1
+    for pixel in covered:
+        row, column = pixel // width, pixel % width
+        count, smooth = _samples(nearness, first, begin, end, row, column)
+        if count == 0:
+            continue
+        for i in range(1 if smooth else 2):
+            for j in range(1 if smooth else 2):
+                face = first[2 * row + i, 2 * column + j] - begin
+                if not 0 <= face < len(faces):
+                    continue
+                x, y = (1.0, 1.0) if smooth else (j + 0.5, i + 0.5)
+                _write_spot(
+                    corners,
+                    rows,
+                    faces[face, 0],
+                    faces[face, 1],
+                    faces[face, 2],
+                    2 * column + x,
+                    2 * row + y,
+                    texels,
+                    finish,
+                    to_linear,
+                    spots,
+                    spot,
+                )
+                pixels[spot], shares[spot] = pixel, 4.0 if smooth else 1.0
+                spot += 1
     return spots[:spot], pixels[:spot], shares[:spot]
 
 
@@ -259,7 +283,9 @@ def _samples(
 def _write_spot(
     corners: NDArray[np.float64],
     rows: NDArray[np.float32],
-    place: NDArray[np.int64],
+    a: int,
+    b: int,
+    c: int,
     x: float,
     y: float,
     texels: NDArray[np.uint8],
@@ -273,7 +299,9 @@ def _write_spot(
     Args:
         corners: See `_Mesh.corners` (V, 3).
         rows: See `_Mesh.rows` (V, 11).
-        place: The face's vertices (3,).
+        a: The first of the face's vertices, as `b` and `c` the others.
+        b: See `a`.
+        c: See `a`.
         x: Column in the doubled picture [px].
         y: Row in the doubled picture [px].
         texels: See `_spots`.
@@ -282,7 +310,6 @@ def _write_spot(
         spots: Rows as the columns of `shading.SPOT`; one is written.
         spot: Which.
     """
-    a, b, c = place[0], place[1], place[2]
     ax, ay = corners[a, 0], corners[a, 1]
     bx, by = corners[b, 0] - ax, corners[b, 1] - ay
     cx, cy = corners[c, 0] - ax, corners[c, 1] - ay
@@ -293,25 +320,24 @@ def _write_spot(
     second, third = second * corners[b, 2], third * corners[c, 2]
     scale = 1.0 / (first + second + third)
     first, second, third = first * scale, second * scale, third * scale
-    ra, rb, rc = rows[a], rows[b], rows[c]
-    px = first * ra[0] + second * rb[0] + third * rc[0]
-    py = first * ra[1] + second * rb[1] + third * rc[1]
-    pz = first * ra[2] + second * rb[2] + third * rc[2]
+    px = first * rows[a, 0] + second * rows[b, 0] + third * rows[c, 0]
+    py = first * rows[a, 1] + second * rows[b, 1] + third * rows[c, 1]
+    pz = first * rows[a, 2] + second * rows[b, 2] + third * rows[c, 2]
     spots[spot, POSITION], spots[spot, POSITION + 1], spots[spot, POSITION + 2] = px, py, pz
     for i in range(3):
-        spots[spot, NORMAL + i] = first * ra[3 + i] + second * rb[3 + i] + third * rc[3 + i]
-        spots[spot, TINT + i] = first * ra[6 + i] + second * rb[6 + i] + third * rc[6 + i]
+        spots[spot, NORMAL + i] = first * rows[a, 3 + i] + second * rows[b, 3 + i] + third * rows[c, 3 + i]
+        spots[spot, TINT + i] = first * rows[a, 6 + i] + second * rows[b, 6 + i] + third * rows[c, 6 + i]
     red, green, blue, rough = finish[0], finish[1], finish[2], finish[3]
     if len(texels):
-        u = first * ra[9] + second * rb[9] + third * rc[9]
-        v = first * ra[10] + second * rb[10] + third * rc[10]
+        u = first * rows[a, 9] + second * rows[b, 9] + third * rows[c, 9]
+        v = first * rows[a, 10] + second * rows[b, 10] + third * rows[c, 10]
         r, g, b_, shine, across, up, out = read_texels(texels, to_linear, u, v)
         red, green, blue, rough = red * r, green * g, blue * b_, rough * shine
         spots[spot, BUMP], spots[spot, BUMP + 1], spots[spot, BUMP + 2] = across, up, out
-        bu, bv = rb[9] - ra[9], rb[10] - ra[10]
-        cu, cv = rc[9] - ra[9], rc[10] - ra[10]
+        bu, bv = rows[b, 9] - rows[a, 9], rows[b, 10] - rows[a, 10]
+        cu, cv = rows[c, 9] - rows[a, 9], rows[c, 10] - rows[a, 10]
         sign = 1.0 if bu * cv - cu * bv >= 0.0 else -1.0
         for i in range(3):
-            spots[spot, TANGENT + i] = sign * (cv * (rb[i] - ra[i]) - bv * (rc[i] - ra[i]))
+            spots[spot, TANGENT + i] = sign * (cv * (rows[b, i] - rows[a, i]) - bv * (rows[c, i] - rows[a, i]))
     spots[spot, COLOR], spots[spot, COLOR + 1], spots[spot, COLOR + 2] = red, green, blue
     spots[spot, ROUGH] = max(rough, _ROUGHEST)

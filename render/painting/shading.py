@@ -69,19 +69,18 @@ def read_texels(texels: NDArray[np.uint8], table: NDArray[np.float32], u: float,
     across = min(max(u * columns - 0.5, 0.0), columns - 1.001)
     down = min(max((1.0 - v) * rows - 0.5, 0.0), rows - 1.001)
     column, row = int(across), int(down)
-    right, below = across - column, down - row
-    red = green = blue = rough = x = y = z = 0.0
+    right, below = np.float32(across - column), np.float32(down - row)
+    red = green = blue = rough = x = y = z = _ZERO
     for i in range(2):
         for j in range(2):
-            share = (below if i else 1.0 - below) * (right if j else 1.0 - right)
-            texel = texels[row + i, column + j]
-            red += share * table[texel[0]]
-            green += share * table[texel[1]]
-            blue += share * table[texel[2]]
-            rough += share * texel[3]
-            x += share * texel[4]
-            y += share * texel[5]
-            z += share * texel[6]
+            share = (below if i else _ONE - below) * (right if j else _ONE - right)
+            red += share * table[texels[row + i, column + j, 0]]
+            green += share * table[texels[row + i, column + j, 1]]
+            blue += share * table[texels[row + i, column + j, 2]]
+            rough += share * np.float32(texels[row + i, column + j, 3])
+            x += share * np.float32(texels[row + i, column + j, 4])
+            y += share * np.float32(texels[row + i, column + j, 5])
+            z += share * np.float32(texels[row + i, column + j, 6])
     return red, green, blue, rough / 255.0, x / 127.5 - 1.0, y / 127.5 - 1.0, z / 127.5 - 1.0
 
 

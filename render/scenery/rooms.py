@@ -1,7 +1,4 @@
-"""Ray-cast pictures of random rooms: walls, floor and ceiling with patterns, and boxes for furniture.
-
-Half of the picture's resolution is enough: a background is out of focus.
-"""
+"""Ray-cast pictures of random rooms: walls, floor and ceiling with patterns, and boxes for furniture."""
 
 from __future__ import annotations
 
@@ -16,7 +13,6 @@ from numpy.typing import NDArray
 from handsim.kernels.kernel import kernel
 from render.sensors.random_images import normal_numbers
 
-_REDUCED: Final = 2
 _FURNITURE: Final = (4, 14)
 _PLAIN, _STRIPES, _TILES, _BOARDS = 3, 0, 1, 2  # what is painted on walls
 _WALLS: Final = (0.12, 0.08, 0.12, 0.68)  # how often a wall has each of these
@@ -73,15 +69,14 @@ def draw_room(size: tuple[int, int], seed: int) -> Float32[np.ndarray, "H W 3"]:
         size: Width and height [pixels].
         seed: Seed of the random choices.
     """
-    width, height = (max(1, length // _REDUCED) for length in size)
+    width, height = size
     scene = _scene(seed)
     rays = _rays(width, height, *scene.lens)
     light = _cast_all(rays, scene.eye, scene.room, scene.walls, scene.boxes, scene.lamp, scene.strength).light
-    small = light.reshape(height, width, 3)
+    picture = light.reshape(height, width, 3)
     grain = normal_numbers((height, width, 1), rng=np.random.default_rng([seed, 1]))
-    small *= np.float32(1.0) + np.float32(0.05) * grain
-    small = cv2.GaussianBlur(small, (0, 0), 0.9)  # or edges would show the coarse pixels
-    drawn: NDArray[np.float32] = cv2.resize(small, size, interpolation=cv2.INTER_CUBIC)
+    picture *= np.float32(1.0) + np.float32(0.05) * grain
+    drawn: NDArray[np.float32] = cv2.GaussianBlur(picture, (0, 0), 0.9)  # rays have no width, pixels have
     return drawn
 
 
@@ -235,15 +230,17 @@ def _cast(
     axes: NDArray[np.int8],
 ) -> None:
     """Light (N, 3) that comes along each ray, from how far (N,) [m], and the normal's axis (N,) there."""
-    position, color = np.empty(3), np.empty(3)
+    position, color, inverse = np.empty(3), np.empty(3), np.empty(3)
+    offsets = corners - eye
     for ray in range(len(rays)):
         distance, wall = np.inf, 0
         for axis in range(3):
-            far = rays[ray, axis] > 0.0
-            way = ((room[axis] if far else 0.0) - eye[axis]) / rays[ray, axis]
+            inverse[axis] = 1.0 / rays[ray, axis]
+            far = inverse[axis] > 0.0
+            way = ((room[axis] if far else 0.0) - eye[axis]) * inverse[axis]
             if way < distance:
                 distance, wall = way, 2 * axis + int(far)
-        box, side, distance = _nearest_box(rays, ray, eye, corners, distance)
+        box, side, distance = _nearest_box(inverse, offsets, distance)
         distances[ray], axes[ray] = distance, side if box >= 0 else wall // 2
         light = 0.35
         for axis in range(3):
@@ -263,28 +260,19 @@ def _cast(
 
 
 @kernel
-def _nearest_box(
-    rays: NDArray[np.float32],
-    ray: int,
-    eye: NDArray[np.float64],
-    corners: NDArray[np.float64],
-    distance: float,
-) -> Any:
+def _nearest_box(inverse: NDArray[np.float64], offsets: NDArray[np.float64], distance: float) -> Any:
     """The first box along a ray within a distance, the axis of its face, and its distance; -1 for none.
 
     Args:
-        rays: Unit directions (R, 3).
-        ray: Index of the ray.
-        eye: Origin of the rays (3,) [m].
-        corners: Low and high corners of boxes (B, 2, 3) [m].
+        inverse: One over the ray's unit direction (3,).
+        offsets: Low and high corners of boxes (B, 2, 3) from the ray's origin [m].
         distance: Largest distance [m].
     """
     nearest, face = -1, 0
-    for box in range(len(corners)):
+    for box in range(len(offsets)):
         enter, leave, side = -np.inf, np.inf, 0
         for axis in range(3):
-            low = (corners[box, 0, axis] - eye[axis]) / rays[ray, axis]
-            high = (corners[box, 1, axis] - eye[axis]) / rays[ray, axis]
+            low, high = offsets[box, 0, axis] * inverse[axis], offsets[box, 1, axis] * inverse[axis]
             if min(low, high) > enter:
                 enter, side = min(low, high), axis
             leave = min(leave, max(low, high))

@@ -152,15 +152,14 @@ def bent_rings(
     ways = np.cos(angles)[:, None] * ahead + np.sin(angles)[:, None] * aside
     course = np.zeros((len(fine), 3))
     course[1:] = np.cumsum(0.5 * (ways[1:] + ways[:-1]) * np.diff(fine)[:, None], axis=0)
+    angle = np.interp(beyond[turned], fine, angles)[:, None]
+    places = start + np.stack([np.interp(beyond[turned], fine, course[:, i]) for i in range(3)], axis=1)
+    offsets = rings[turned] - middles[turned, None]
+    across, along = (offsets @ aside)[..., None], (offsets @ ahead)[..., None]
+    offsets += across * ((np.cos(angle) - 1.0) * aside - np.sin(angle) * ahead)[:, None]
+    offsets += along * ((np.cos(angle) - 1.0) * ahead + np.sin(angle) * aside)[:, None]
     bent = rings.copy()
-    for ring in turned:
-        angle = np.interp(beyond[ring], fine, angles)
-        offsets = rings[ring] - middles[ring]
-        across, along = offsets @ aside, offsets @ ahead
-        offsets = offsets + np.outer(across, (np.cos(angle) - 1.0) * aside - np.sin(angle) * ahead)
-        offsets += np.outer(along, (np.cos(angle) - 1.0) * ahead + np.sin(angle) * aside)
-        place = [np.interp(beyond[ring], fine, course[:, i]) for i in range(3)]
-        bent[ring] = start + place + offsets
+    bent[turned] = places[:, None] + offsets
     return bent
 
 

@@ -37,10 +37,29 @@ def test_a_hand_that_is_not_there(tracked):
     status[:, 0], qpos[:, 0], rms[:, 0] = LOST, np.nan, np.nan
     take = dataclasses.replace(tracked, status=status, qpos=qpos, rms=rms)
     side, other = tracked.sides
-    assert suspicions(take) == [
-        f"the {side} hand was seen in 0.0 % of the frames; name the glove worn (--glove), or track the other "
-        f"hand alone (--hands {other})"
+    assert suspicions(take) == [], "one hand is there"
+    assert summarize(take)[0] == f"{side} hand: not there"
+    status[:, 1], qpos[:, 1], rms[:, 1] = LOST, np.nan, np.nan
+    assert suspicions(dataclasses.replace(take, status=status, qpos=qpos, rms=rms)) == [
+        f"the {one} hand was seen in 0.0 % of the frames; name the glove worn (--glove) and the hands "
+        "(--hands)"
+        for one in (side, other)
     ]
+
+
+def test_points_of_others_are_counted_apart(tracked):
+    count = tracked.points.shape[1]
+    far = np.full((FRAMES, count, 3), 3.0) + np.arange(count)[:, None]
+    blank = np.full((FRAMES, count), -1)
+    take = dataclasses.replace(
+        tracked,
+        points=np.concatenate([tracked.points, far], axis=1),
+        labels=np.concatenate([tracked.labels, blank], axis=1),
+        ids=np.concatenate([tracked.ids, blank], axis=1),
+        confidence=np.concatenate([tracked.confidence, np.ones(blank.shape)], axis=1),
+    )
+    assert suspicions(take) == []
+    assert summarize(take)[-1].endswith("points are not markers, 0 of them at the hands")
 
 
 def test_markers_that_were_not_seen_and_markers_off_the_pose(tracked):
@@ -62,7 +81,7 @@ def test_the_command_tells_of_a_wrong_glove(truth, tmp_path, capsys):
     assert main(["track", str(tmp_path / "take.c3d"), "--glove", "sparse13", "--out", out]) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
     assert told and all(line.startswith("handsim track: warning: ") for line in told)
-    assert any(" of the points are not markers of what was tracked; name the glove" in line for line in told)
+    assert any(" of the points at the hands are not markers of what was tracked" in line for line in told)
 
 
 def test_points_that_are_none_are_told_alone(tracked):

@@ -10,7 +10,7 @@ import pytest
 from gloves.fit import GloveFit, nominal_fit
 from gloves.layout import load_layout
 from gloves.takes.take import Take
-from handsim.errors import ArgumentError
+from handsim.errors import ArgumentError, HandSimError
 from handsim.hand.model import HandModel
 from track.tracked_frame import Status, TrackedFrame
 from track.tracker import Tracker
@@ -149,13 +149,13 @@ def test_a_frame_of_another_type_is_refused_in_one_sentence(take, labeler, point
 def test_hands_labelers_and_settings_of_another_type_are_refused(take, labeler):
     hands = users(take)
     for given, sentence in (
-        ((3, labeler), "hands is 3, expected a User, or hands"),
-        (("right", labeler), "a hand is 'r', expected one in its glove"),
+        ((3, labeler), "hands is 3, expected a User, hands in their gloves"),
+        (("right", labeler), "right: cannot be read"),
         (([], labeler), "hands are [], expected a left hand"),
         (([hands[0]] * 2, labeler), "expected a left hand, a right hand, or one of each"),
         ((hands, 3), "labeler is 3, expected a MarkerLayout, the name or path of one, a Labeler"),
         ((hands, labeler, (), {}), "config is {}, expected a TrackerConfig"),
     ):
-        with pytest.raises(ArgumentError) as error:
+        with pytest.raises(HandSimError) as error:
             Tracker(*given)
         assert sentence in str(error.value)

@@ -88,6 +88,7 @@ def try_layout(
     *,
     work: Sequence[str] = tuple(WORK),
     count: int = CAPTURES,
+    first: int = 0,
     frames: int = FRAMES,
     told: Callable[[str], None] = lambda words: None,
 ) -> dict[str, Trial]:
@@ -99,6 +100,7 @@ def try_layout(
         labeler: A labeler of the glove.
         work: Kinds of work, of `WORK`.
         count: Captures of each kind, each of another person.
+        first: Number of the first capture.
         frames: Of each capture.
         told: Called before each capture with what it is.
     """
@@ -113,15 +115,23 @@ def try_layout(
         for number in range(1, count + 1):
             told(f"{name}, capture {number} of {count}")
             kind = WORK[name].kind
-            take = simulate_take(kind, glove=layout, num_frames=frames, rig=rig, seed=number, hands=sides)
-            tried.append(try_take(take, labeler))
+            take = simulate_take(
+                kind, glove=layout, num_frames=frames, rig=rig, seed=first + number, hands=sides
+            )
+            tried.append(try_take(take, layout, labeler))
         found[name] = _mean(tried)
     return found
 
 
-def try_take(truth: Take, labeler: Labeler) -> Trial:
-    """Label and track the points of a simulated capture whose hands are not known."""
-    layout, capture = truth.hands[0].layout, truth.capture()
+def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
+    """Label and track the points of a simulated capture whose hands are not known.
+
+    Args:
+        truth: The capture, whose gloves have slipped a little.
+        layout: The glove as designed.
+        labeler: A labeler of it.
+    """
+    capture = truth.capture()
     sides = [side for side in BOTH if side in layout.sides]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", HandSimWarning)

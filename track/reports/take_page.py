@@ -113,8 +113,11 @@ def _calibration_section(take: Take) -> Section:
             f"The hands are not calibrated: they are the mean hands of size {notes}, in a glove as designed. "
         )
         text += _UNCALIBRATED + _CALIBRATE
+    elif notes:
+        text = f"The hands are a user's ({escape(notes)}), as calibrated or given."
     else:
-        text = f"The hands are a user's{f' ({escape(notes)})' if notes else ''}, as calibrated or given."
+        text = "The hands were given, and the take does not say whether they are calibrated. "
+        text += "If they are not: " + _UNCALIBRATED[0].lower() + _UNCALIBRATED[1:]
     return Section("Calibration", text)
 
 

@@ -21,11 +21,10 @@ from handsim.space.transforms import pose_matrices
 from train.rig_advice.rig_faults import HALF_SIDE
 from train.simulation.motion import MovingObject, SceneMotion
 from train.simulation.real_like import sample_real_like_scene
-from train.simulation.room_settings import KINDS, RoomConfig, SimulatedKind, usual_room
+from train.simulation.room_settings import KINDS, SIMULATED_KINDS, RoomConfig, SimulatedKind, usual_room
 from train.simulation.takes import sample_scene
 
 _REAL_LIKE: Final = "real-like"
-_OF_TAKE: Final = "the take"
 _MAX_PEOPLE: Final = 10
 _FEWEST: Final = 12  # frames of a stretch of a take without a break
 _ROUND: Final = (11.0, 14.0, 9.0)  # through the volume and back along each axis [s]
@@ -119,14 +118,14 @@ def work_of_take(take: Take, layout: MarkerLayout | None, num_frames: int) -> di
         raise CaptureError(
             f"the take has no {_FEWEST} frames in a row in which every hand has a pose, expected some"
         )
-    return {_OF_TAKE: scenes}
+    return {"the take": scenes}
 
 
 def room_of_work(kind: str, scene: SceneMotion) -> RoomConfig:
-    """The room of simulated takes of this kind of work; of a take that of the kind most like it."""
-    if kind == _OF_TAKE:
-        both = "hand-hand" if len(scene.hands) > 1 else "single-hand"
-        kind = both if scene.moving_object is None else "hand-pen"
+    """The room of simulated takes of this kind of work, or of the kind most like it, as for a take."""
+    if kind not in SIMULATED_KINDS:
+        free = "hand-hand" if len(scene.hands) > 1 else "single-hand"
+        kind = free if scene.moving_object is None else "hand-pen"
     return usual_room(cast("SimulatedKind", kind))
 
 

@@ -59,6 +59,7 @@ def sample_light_sources(sight: SceneSight, config: RoomConfig, *, rng: np.rando
         LightSources(markers, visible, labels, radii),
         *mirror_images(sight, radii, config.reflectance, rng=rng),
         *stray_reflections(sight, config, rng=rng),
+        *markers_of_others(sight),
     ]
     all_positions, all_visible, all_labels, all_radii = zip(*parts, strict=True)
     return LightSources(
@@ -110,6 +111,16 @@ def mirror_images(
         labels = np.full(int(ever.sum()), -1)
         parts.append(LightSources(images[:, ever], visible[:, ever], labels, radii[bright][ever]))
     return parts
+
+
+def markers_of_others(sight: SceneSight) -> list[LightSources]:
+    """Markers that belong to no hand, where no hand stands between them and a camera."""
+    others, rig = sight.scene.others, sight.rig
+    if others is None:
+        return []
+    visible = rig.in_view(others) & free_rays(others, rig.positions, *sight.capsules)
+    count = others.shape[1]
+    return [LightSources(others, visible, np.full(count, -1), np.full(count, MARKER_RADIUS))]
 
 
 def stray_reflections(

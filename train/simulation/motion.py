@@ -49,6 +49,8 @@ class SceneMotion:
     """Frames per second [Hz]."""
     skin: tuple[Float[np.ndarray, "T M 3"], ...] = ()
     """Displacement of each hand's markers by its skin, in the world [m]; none when empty."""
+    others: Float[np.ndarray, "T Q 3"] | None = None
+    """Markers that belong to no hand and to no tracked object [m]."""
 
     @property
     def num_frames(self) -> int:
@@ -58,7 +60,7 @@ class SceneMotion:
     def faster(self, times: int) -> SceneMotion:
         """The same motion this many times as fast: of so many frames only the first is kept.
 
-        Displacements by the skin are not kept: they belong to single frames.
+        Displacements by the skin and markers of others are not kept.
 
         Args:
             times: Whole number from 1.

@@ -23,6 +23,7 @@ from handsim.hand.topology import SIDES, Side
 from handsim.space.cameras import ROOM_CENTER, CameraRig, as_rig, check_outside_volume, list_rigs, rig_setting
 from train.simulation.calibration_take import CalibrationTakeConfig, sample_calibration_scene
 from train.simulation.motion import RATE, SceneMotion, sample_scene_motion
+from train.simulation.other_markers import MOST_OTHERS, other_markers
 from train.simulation.people import sample_adult_hands, wear_gloves
 from train.simulation.real_like import NUM_FRAMES, sample_real_like_scene
 from train.simulation.room import record_take
@@ -63,6 +64,9 @@ class TakeConfig:
     hands: tuple[Side, ...] = BOTH
     """Hands to simulate: right, left, or both, which meet or hold an object together in the kinds hand-hand,
     hand-pen, hand-controller and real-like. Of a glove for one hand that hand alone."""
+    others: int = 0
+    """Markers that are not the hands', up to 60: those nearest to them first: on the wearer's arms, a thing
+    in a hand, the wearer's head and back, and a person beside."""
 
     def __post_init__(self) -> None:
         check_type("kind", self.kind, str, "the name of a kind of capture", SIMULATED_KINDS)
@@ -80,6 +84,9 @@ class TakeConfig:
             raise ArgumentError(choices(self.kind, SIMULATED_KINDS, noun="kind of capture"))
         if self.num_frames is not None and self.num_frames < 1:
             raise ArgumentError(f"num_frames is {self.num_frames}, expected at least 1")
+        check_type("others", self.others, int, "a whole number")
+        if not 0 <= self.others <= MOST_OTHERS:
+            raise ArgumentError(f"others is {self.others}, expected 0 to {MOST_OTHERS} markers")
         if self.seed < 0:
             raise ArgumentError(f"seed is {self.seed}, expected 0 or more")
         for side in self.hands:
@@ -107,6 +114,7 @@ def simulate_take(
     seed: int = 0,
     hands: Sequence[Side] = BOTH,
     optics: Mapping[str, Any] | None = None,
+    others: int = 0,
 ) -> Take:
     """A simulated capture of one hand or two with its truth: points (T, N, 3) [m], labels, IDs and motion.
 
@@ -121,6 +129,8 @@ def simulate_take(
         hands: Both, or for single-hand, calibration and free one of them; of a glove for one hand that hand.
         optics: What differs from the optical system fitted to this kind, as `handsim simulate --help` lists
             it: `{"blob_loss": 0.1}`.
+        others: Markers that are not the hands', up to 60: on the wearer's arms, a thing in a hand, the
+            wearer's head and back, and a person beside. Their label is -1.
 
     Returns:
         A take at 120 [Hz]; the same arguments give the same take.
@@ -132,7 +142,7 @@ def simulate_take(
         PoseError: None of the people drawn can do what this kind of capture asks for.
     """
     options: Any = {} if optics is None else optics
-    return record_config(TakeConfig(kind, num_frames, glove, rig, seed, options, hands))  # type: ignore[arg-type]
+    return record_config(TakeConfig(kind, num_frames, glove, rig, seed, options, hands, others))  # type: ignore[arg-type]
 
 
 def record_config(config: TakeConfig) -> Take:
@@ -156,6 +166,8 @@ def record_config(config: TakeConfig) -> Take:
     config = dataclasses.replace(config, hands=_worn_hands(config, layout))
     check_outside_volume(rig, np.array(ROOM_CENTER), WRIST_VOLUME)
     scene = _sample_scene(config, layout, rng)
+    if config.others:
+        scene = dataclasses.replace(scene, others=other_markers(scene, config.others, rng=rng))
     optics = config.optics.applied(config.room.optics).worn(layout.radius)
     room = dataclasses.replace(config.room, optics=optics)
     named = dataclasses.replace(
@@ -167,6 +179,8 @@ def record_config(config: TakeConfig) -> Take:
     del settings["optics"]  # the room has all of them
     if set(config.hands) == set(BOTH):
         del settings["hands"]
+    if not config.others:
+        del settings["others"]
     return record_take(scene, rig, room, settings, rng=rng)
 
 

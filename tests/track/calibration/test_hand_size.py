@@ -7,13 +7,15 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from gloves.fit import attach
-from gloves.layout import load_layout
+from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.hand.model import HandModel, join_qpos
 from handsim.hand.shape import ADULTS, SIZES, sample_shape, shape_from_measures
+from handsim.hand.topology import DIGITS
 from poses.motion.motions import sample_motion
 from track.calibration.hand_size import _PRECISION, _least, fit_size, sample_frames, usual_breadth
-from track.streams.frame_source import StreamedFrame
+from track.streams.frame_source import StreamedFrame, checked_frames
 from train.glove_labeler import load_labeler
+from train.simulation.takes import simulate_take
 
 RATE = 120.0
 
@@ -106,3 +108,19 @@ def test_the_search_makes_scipys_steps(seed):
     mine, tried[:] = tried.copy(), []
     scipys = minimize_scalar(function, bounds=(0.125, 0.225), method="bounded", options={"xatol": _PRECISION})
     assert found == scipys.x and mine == tried
+
+
+@pytest.mark.slow
+def test_hands_of_few_markers_are_measured_though_no_usual_hand_fits_them():
+    """A long, narrow hand that touches another one, in a slipped glove with ten markers."""
+    tips = [MarkerPlace(digit, f"{digit}_distal", 0.7, 0.0) for digit in DIGITS]
+    middles = [MarkerPlace(f"{digit}_middle", f"{digit}_middle", 0.5, 0.0) for digit in ("index", "ring")]
+    across = ((0.3, 0.25), (0.5, -0.2), (0.7, 0.0))
+    back = [MarkerPlace(f"back{along}", "palm", along, 0.0, across) for along, across in across]
+    layout = MarkerLayout("ten", (*tips, *middles, *back), 0.0032)
+    take = simulate_take("hand-hand", glove=layout, num_frames=240, seed=53)
+    frames = sample_frames(checked_frames(take.capture()))
+    found = fit_size(frames, layout, ("right", "left"), load_labeler(layout))
+    assert found is not None
+    true = take.hands[0].shape.length
+    assert abs(found.hand.shape.length - true) < 3.0 * found.spread and "unsure" in str(found)

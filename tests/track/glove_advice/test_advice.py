@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from handsim.hand.topology import JOINT_NAMES
+from gloves.layout import MarkerPlace
+from handsim.hand.topology import BONE_NAMES, JOINT_NAMES
 from track.glove_advice.advice import advice
 from track.glove_advice.joint_spread import untold_spreads
+from track.glove_advice.trials import METHODS, Trial
 
 
 @pytest.fixture
@@ -51,14 +53,38 @@ def test_a_joint_of_which_nothing_is_told_asks_for_a_marker_on_its_bone(good):
     assert sentence.startswith("Add a marker on index_middle")
 
 
+def test_no_marker_is_asked_for_where_every_bone_has_one(good):
+    joints = good.joints.copy()
+    joints[JOINT_NAMES.index("middle_DIP_flexion")] = untold_spreads()[0]
+    (sentence,) = advice(dataclasses.replace(good, joints=joints))
+    assert sentence.startswith("Add a marker on middle_middle")  # the tip has one
+    bones = [bone for bone in BONE_NAMES if bone.startswith("middle")]
+    first, *_, second = good.layout.markers[:4]  # of other digits
+    moved = {
+        one.name: MarkerPlace(one.name, bone, 0.5, 0.0)
+        for one, bone in zip((first, second), bones, strict=False)
+    }
+    markers = tuple(moved.get(one.name, one) for one in good.layout.markers)
+    layout = dataclasses.replace(good.layout, markers=markers)
+    assert advice(dataclasses.replace(good, joints=joints, layout=layout)) == []
+
+
+def test_the_worst_marker_of_captures_is_named(good):
+    slots = np.ones(good.layout.num_markers)
+    slots[4] = 0.8
+    found = Trial(dict.fromkeys(METHODS, slots), dict.fromkeys(METHODS, 0.9), np.zeros(20), 0.0)
+    (sentence,) = advice(dataclasses.replace(good, trials={"two touching": found}))
+    assert sentence.startswith(f"With two touching {good.layout.names[4]} is labeled worst: right in 80 %")
+
+
 def test_hidden_touching_and_symmetric_markers_are_told(good):
     seen, near = good.seen.copy(), good.near.copy()
-    seen[3], near[0, 1], near[1, 0] = 0.4, 0.1, 0.1
+    seen[3], near[5, 6], near[0, 1] = 0.4, 0.1, 0.3  # tips touch, too, because fingers do
     sentences = advice(dataclasses.replace(good, seen=seen, near=near, sides_right=0.7))
     assert len(sentences) == 3
     assert sentences[0].startswith(f"Move {good.layout.names[3]} towards the back") and "40 %" in sentences[0]
     assert sentences[1].startswith("Make the back of the hand less symmetric") and "30 %" in sentences[1]
-    assert sentences[2].startswith(f"Move {good.layout.names[0]} and {good.layout.names[1]} apart")
+    assert sentences[2].startswith(f"Move {good.layout.names[5]} and {good.layout.names[6]} apart")
 
 
 def test_a_marker_that_tells_nothing_can_be_dropped(good):

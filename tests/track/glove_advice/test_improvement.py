@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from gloves.layout import MarkerLayout, MarkerPlace, load_layout
 from handsim.errors import LayoutError
+from handsim.hand.model import HandModel
+from handsim.hand.topology import BONE_NAMES
 from handsim.space.cameras import load_rig
 from track.glove_advice import improvement
 from track.glove_advice.improvement import Improvement
+from track.glove_advice.joint_spread import palm_spread
 
 
 @pytest.fixture(autouse=True)
@@ -49,6 +54,49 @@ def test_markers_are_added_and_dropped():
     assert [count for count, _ in smaller] == [7, 6] and len(search.layout.markers) == 8
     search.resize(9)
     assert len(search.layout.markers) == 9
+
+
+def test_places_are_found_with_a_ruler_and_names_say_the_bone():
+    layout = load_layout("tips8")
+    search = search_of(layout)
+    search.resize(11)
+    search.search(6.0, lambda worth: None)
+    found, old = search.layout, {marker.name: marker for marker in layout.markers}
+    model = HandModel.named("M")
+    for marker in found.markers:
+        if marker == old.get(marker.name):
+            continue
+        for value, step in ((marker.along, 0.05), (np.rad2deg(marker.around), 15.0), (marker.across, 0.05)):
+            assert value / step == pytest.approx(round(value / step), abs=1e-3)
+        if marker.name in old:
+            assert marker.bone == old[marker.name].bone
+        else:
+            assert marker.name.lower().startswith(marker.bone.replace("_", ""))
+        if marker.bone != "palm":
+            length = model.skeleton.lengths[BONE_NAMES.index(marker.bone)]
+            assert marker.along * length >= 0.005
+            assert marker.bone.endswith("distal") or (1.0 - marker.along) * length >= 0.005
+
+
+def test_a_search_keeps_every_digit_no_crowd_and_the_palm():
+    layout = load_layout("tips8")
+    search, places = search_of(layout), layout.markers
+    assert search._is_wearable(places)
+    assert not search._is_wearable(places[1:])  # the thumb has none
+    assert not search._is_wearable(places[:-1])  # two on the palm
+    second = dataclasses.replace(places[1], name="second", along=0.3)
+    assert not search._is_wearable((*places, second))
+    in_line = [dataclasses.replace(one, across=0.0, along=0.1 * n) for n, one in enumerate(places[-3:], 2)]
+    assert not search._is_wearable((*places[:-3], *in_line))
+
+
+def test_the_palms_rotation_is_told_by_a_triangle():
+    model = HandModel.named("M")
+    places = load_layout("tips8").markers
+    spread = palm_spread(places, model)
+    assert np.deg2rad(1.0) < spread < np.deg2rad(4.0)
+    assert palm_spread(load_layout("starter30").markers, model) < spread
+    assert palm_spread(places[:-1], model) == np.inf
 
 
 def test_wrong_names_and_too_many_to_keep_are_refused():

@@ -143,7 +143,7 @@ def test_whose_hands_they_are(take, tmp_path):
     for user, words in {
         "S": "mean hands of size S, in a glove as designed",
         "user.json": "a user&#x27;s (user.json), as calibrated or given",
-        "": "a user's, as calibrated or given",
+        "": "the take does not say whether they are calibrated",
     }.items():
         page, _ = written(tmp_path, dataclasses.replace(take, settings={**take.settings, "user": user}))
         assert words.replace("user&#x27;s", "user's") in page

@@ -1,0 +1,72 @@
+"""Captures of another hand, glove or unit than was asked for: what fits is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import pytest
+
+from handsim.errors import ArgumentError, HandSimWarning
+from track.capture_labeling import label_capture
+from track.capture_tracking import track_capture
+from track.setup import measure_hands
+from train.simulation.takes import simulate_take
+
+FRAMES = 90
+
+
+@pytest.fixture(scope="module")
+def capture():
+    """A right hand in dense19."""
+    return simulate_take("free", num_frames=FRAMES, hands="right", seed=3).capture()
+
+
+def test_hands_that_fit_are_told_nothing_of_the_one_that_is_not_there(capture):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        take = track_capture(capture)
+    right, left = (take.status[:, take.hand(side)] for side in ("right", "left"))
+    assert (right > 0).mean() > 0.99 and (left > 0).mean() <= 0.005
+
+
+def test_the_other_side_is_named(capture):
+    with pytest.warns(HandSimWarning, match=r"the points fit a right hand better .* \(--hands right\)"):
+        track_capture(capture, hands="left")
+
+
+def test_the_glove_that_is_worn_is_named(capture):
+    with pytest.warns(HandSimWarning, match=r"a right hand in glove 'dense19' better .*--glove dense19"):
+        label_capture(capture, "sparse13")
+
+
+def test_an_own_glove_in_the_working_folder_is_named(capture, tmp_path, monkeypatch):
+    from gloves.layout import load_layout, save_layout
+
+    own = dataclasses.replace(
+        load_layout("dense19"), name="mine", markers=load_layout("dense19").markers[:-3]
+    )
+    save_layout(tmp_path / "mine.toml", own)
+    monkeypatch.chdir(tmp_path)
+    worn = simulate_take("free", glove=own, num_frames=FRAMES, hands="left", seed=4).capture()
+    with pytest.warns(HandSimWarning, match="a left hand in glove 'mine' better"):
+        track_capture(worn, "sparse13")
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [
+        (0.1, "at 0.1 of their size: the file is probably in centimeters, read as millimeters"),
+        (3.2808, "at 3.28 of their size"),
+    ],
+)
+def test_another_unit_is_named(scale, said):
+    both = simulate_take("single-hand", num_frames=FRAMES).capture()
+    with pytest.raises(ArgumentError, match=said):
+        track_capture(dataclasses.replace(both, positions=scale * both.positions))
+
+
+def test_measured_hands_are_not_told_of_what_they_lack(capture):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        measure_hands(capture)

@@ -1,0 +1,195 @@
+"""Whether hands fit the points of a capture, and what fits better: another side, glove or unit of length.
+
+Where the hands that are asked for fit a sample of frames badly, those of other gloves, sides and scales are
+measured and tracked in the same frames; the likeliest are named if they are clearly likelier.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from gloves.fit import GloveFit
+from gloves.layout import MarkerLayout, list_layouts, load_layout
+from handsim.errors import ArgumentError, HandSimError, HandSimWarning
+from handsim.hand.topology import Side
+from track.association.hand_state import HandState
+from track.association.initialization import FEWEST_POINTS, HandInitializer
+from track.association.point_groups import distances_to_nearest
+from track.calibration.hand_size import fit_size
+from track.given import designed_glove
+from track.streams.frame_source import StreamedFrame
+from track.tracked_frame import Status
+from track.tracker import Tracker
+from train.glove_labeler import labeler_at_once
+from train.labelers.protocol import Labeler
+
+_WINDOW: Final = 30  # frames of each of two parts in which hands are compared
+_LEAST_FRAMES: Final = 10  # that tell anything
+_NEAR: Final = 0.04  # [m] from a hand's points, where a point without a label counts against it
+_PENALTY: Final = 3.0  # log-odds of such a point, and of a marker that is not seen
+_FOUND: Final = 0.6  # share of the frames in which hands are found that fit
+_MOST_MISSING, _MOST_NEAR = 0.15, 0.2  # of such hands, for each of their markers
+_MOST_RMS: Final = 0.004  # [m] of such hands
+_LEAST_FOUND: Final = 0.5  # share of the frames in which what is named is found
+_BETTER: Final = 1.15  # as large must its log-odds be
+_MUCH_BETTER: Final = 2.0  # and where the scale is another
+_UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
+_READ: Final = ("millimeters", "centimeters", "meters")  # units that files state
+_WANDS: Final = (2.0, 0.5)  # scales of a system whose calibration wand had another length than it was told
+_MOST_OWN: Final = 16  # gloves of the working folder that are tried
+
+
+class _Fit(NamedTuple):
+    """How well hands fit some frames."""
+
+    log_odds: float = 0.0
+    """Mean over the frames of that of hands, less what speaks against them."""
+    found: dict[Side, int] = {}  # noqa: RUF012
+    """Number of frames in which each hand is found."""
+    count: int = 0
+    """Number of frames in which any is."""
+    is_good: bool = False
+    """Whether nothing tells of a mistake."""
+
+
+class _Other(NamedTuple):
+    """What may fit better."""
+
+    layout: MarkerLayout
+    scale: float
+    """Factor that makes the points ones in meters."""
+    fit: _Fit
+
+
+def check_hands(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> None:
+    """Tell of hands that do not fit, where another side, glove or unit fits clearly better.
+
+    That takes seconds, where something is wrong; the shipped gloves are tried, and those of .toml files in
+    the working folder.
+
+    Args:
+        frames: Frames of unlabeled points [m], as `sample_frames` gives.
+        hands: The hands that are asked for.
+        labeler: Labeler of their glove.
+
+    Raises:
+        ArgumentError: The points fit hands at another scale alone.
+
+    Warns:
+        HandSimWarning: They fit another hand or glove clearly better.
+    """
+    shown = [frame for frame in frames if len(frame.points) >= FEWEST_POINTS]
+    half = max(_WINDOW, len(shown) // (2 * _WINDOW) * _WINDOW)
+    some = [*shown[:_WINDOW], *shown[half : half + _WINDOW]]
+    if len(some) < _LEAST_FRAMES:
+        return
+    asked = _fit(some, hands, labeler)
+    if asked.is_good:
+        return
+    glove = designed_glove(hands[0].layout)
+    best = max(_others(some, glove, labeler), key=lambda other: other.fit.log_odds)
+    fit, factor = best.fit, _BETTER if best.scale == 1.0 else _MUCH_BETTER
+    if fit.count < _LEAST_FOUND * len(some) or fit.log_odds <= factor * asked.log_odds:
+        return
+    if best.scale != 1.0:
+        raise ArgumentError(_of_scale(1.0 / best.scale))
+    there = [side for side, count in fit.found.items() if count >= _LEAST_FOUND * fit.count]
+    remedy = [] if set(there) <= {hand.side for hand in hands} else [f"--hands {' '.join(there)}"]
+    named = "two hands" if len(there) == 2 else f"a {there[0]} hand"
+    if best.layout != glove:
+        named += f" in glove '{best.layout.name}'"
+        remedy.append(f"--glove {best.layout.name}")
+    if remedy:
+        shares = f"{fit.count} of {len(some)} frames, what is asked for {asked.count}"
+        warnings.warn(
+            f"the points fit {named} better ({shares}); name it ({' '.join(remedy)})",
+            HandSimWarning,
+            stacklevel=3,
+        )
+
+
+def _others(frames: Sequence[StreamedFrame], glove: MarkerLayout, labeler: Labeler) -> list[_Other]:
+    """Hands of both sides in the glove that is asked for, in other gloves, and at other scales."""
+    others = [_Other(glove, 1.0, _measured_fit(frames, glove, labeler))]
+    if others[0].fit.is_good:
+        return others
+    for layout in _gloves():
+        if layout != glove:
+            others.append(_Other(layout, 1.0, _measured_fit(frames, layout, labeler_at_once(layout))))
+        if others[-1].fit.is_good:
+            return others
+    if max(other.fit.count for other in others) < _LEAST_FOUND * len(frames):
+        for scale in _scales():
+            scaled = [dataclasses.replace(frame, points=scale * frame.points) for frame in frames]
+            others.append(_Other(glove, scale, _measured_fit(scaled, glove, labeler)))
+    return others
+
+
+def _measured_fit(frames: Sequence[StreamedFrame], layout: MarkerLayout, labeler: Labeler) -> _Fit:
+    """How well the hands of a glove fit some frames that they are measured in."""
+    size = fit_size(frames, layout, layout.sides, labeler)
+    return _Fit() if size is None else _fit(frames, size.hands(layout.sides), labeler)
+
+
+def _fit(frames: Sequence[StreamedFrame], hands: Sequence[GloveFit], labeler: Labeler) -> _Fit:
+    """How well hands fit some frames."""
+    tracker, markers = Tracker(hands, labeler), hands[0].layout.num_markers
+    score = HandInitializer([HandState(hands[0])], labeler).score
+    found = {hand.side: 0 for hand in hands}
+    rms, missing, near, count, log_odds = [], [], [], 0, 0.0
+    for frame in frames:
+        tracked = tracker.step(frame.points, frame.ids, frame.time)
+        there = [one for one in tracked.hands if one.status in (Status.TRACKED, Status.INITIALIZED)]
+        count += bool(there)
+        free = frame.points[tracked.labels < 0]
+        for hand in there:
+            found[hand.side] += 1
+            rms.append(hand.rms)
+            missing.append(len(hand.filled))
+            near.append(int((distances_to_nearest(free, hand.markers) < _NEAR).sum()))
+            odds = score(markers - missing[-1], hand.rms)
+            log_odds += max(0.0, odds - _PENALTY * (missing[-1] + near[-1]))
+    is_good = (
+        count >= _FOUND * len(frames)
+        and float(np.median(rms)) <= _MOST_RMS
+        and float(np.mean(missing)) <= _MOST_MISSING * markers
+        and float(np.mean(near)) <= _MOST_NEAR * markers
+    )
+    return _Fit(log_odds / len(frames), found, count, is_good)
+
+
+def _gloves() -> list[MarkerLayout]:
+    """The shipped gloves and those in the working folder, those with more markers before parts of them."""
+    found = [load_layout(name) for name in list_layouts()]
+    for path in sorted(Path().glob("*.toml"))[:_MOST_OWN]:
+        with contextlib.suppress(HandSimError):  # a file of another kind
+            found.append(load_layout(path))
+    return sorted(found, key=lambda layout: -layout.num_markers)
+
+
+def _scales() -> list[float]:
+    """Factors that correct a unit of length that was mistaken for another, or a wand's length."""
+    pairs = {_UNITS[true] / _UNITS[read] for read in _READ for true in _UNITS if true != read}
+    return [*sorted(pairs), *_WANDS]
+
+
+def _of_scale(times: float) -> str:
+    """The sentence about points that fit hands at so many times their size."""
+    units = [
+        f"in {true}, read as {read}"
+        for read in _READ
+        for true in _UNITS
+        if np.isclose(_UNITS[true] / _UNITS[read] * times, 1.0)
+    ]
+    cause = f"the file is probably {' or '.join(units)}" if units else "had the calibration wand its length?"
+    return (
+        f"the points fit hands at {times:.3g} of their size: {cause}; correct the unit that the file states, "
+        f"or multiply its positions by {1.0 / times:.4g}"
+    )
